@@ -1,0 +1,40 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+In-motion alignment: roll, pitch and true heading from an IMU and a GNSS receiver.
+
+Frames
+------
+``e``
+    Earth-centred Earth-fixed.
+``n``
+    Local level at the antenna, east-north-up (ENU).
+``n0``
+    ``n`` frozen at the start t0; does not rotate.
+``b``
+    IMU body frame, forward-left-up (FLU).
+``b0``
+    ``b`` frozen at t0; does not rotate.
+
+Names
+-----
+``C_xy`` takes components in y to components in x: ``C_nb`` is the attitude, ``C_n0n`` and
+``C_b0b`` are how far the two frames have turned since t0. A vector carries its frame as a suffix:
+``v_n``, ``f_b``, ``omega_ib_b``, ``lever_b``. Quaternions are (x, y, z, w) with w >= 0. Stamps
+are integer nanoseconds. Attitude errors are small rotations about the axes of ENU (left errors):
+``C_nb = exp_so3(phi) C_nb_estimated``.
+
+Chain rule: ``C_nb(t) = C_n0n(t)^T C_nb(0) C_b0b(t)``; the one unknown is ``C_nb(0)``, the
+initial attitude.
+"""
