@@ -1,0 +1,381 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""One typed, validated configuration for the node and for replay."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+import dataclasses
+from dataclasses import dataclass
+import difflib
+import math
+from numbers import Real
+import os
+import re
+import reprlib
+from typing import Any, NamedTuple
+
+NODE_NAME = 'ins_align'
+STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
+MAX_PARAMS_BYTES = 1 << 20
+
+AUTO_OR_BOOL = ('auto', True, False)
+# Declared by rclpy itself on every node: legal in a parameter file, none of our business.
+_RCLPY_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
+
+
+class ConfigError(ValueError):
+    """A setting is wrong; the text says which one, why, and what would be right."""
+
+
+class ImuNoise(NamedTuple):
+    """Noise of an IMU in SI units, 1 sigma per axis."""
+
+    angle_random_walk: float  # rad/sqrt(s)
+    velocity_random_walk: float  # m/s/sqrt(s)
+    gyro_bias_std: float  # rad/s
+    accel_bias_std: float  # m/s^2
+
+
+def _imu_noise(arw: float, vrw: float, gyro_bias: float, accel_bias: float) -> ImuNoise:
+    """Convert deg/sqrt(h), m/s/sqrt(h), deg/s, m/s^2 to SI."""
+    return ImuNoise(math.radians(arw) / 60.0, vrw / 60.0, math.radians(gyro_bias), accel_bias)
+
+
+PRESETS = {
+    'navigation': _imu_noise(0.002, 0.003, 0.01 / 3600.0, 50e-6 * STANDARD_GRAVITY),
+    'tactical': _imu_noise(0.05, 0.03, 1.0 / 3600.0, 1e-3 * STANDARD_GRAVITY),
+    'mems': _imu_noise(0.3, 0.09, 0.1, 0.05),
+}
+
+
+def _parameter(default: Any, description: str, unit: str = '', *, minimum: float | None = None,
+               maximum: float | None = None, choices: tuple = (), runtime: bool = False) -> Any:
+    return dataclasses.field(default=default, metadata={
+        'description': description, 'unit': unit, 'minimum': minimum, 'maximum': maximum,
+        'choices': choices, 'read_only': not runtime})
+
+
+@dataclass(frozen=True)
+class Config:
+    """
+    Everything that a user can set, checked.
+
+    Each field's metadata holds ``description``, ``unit``, ``minimum`` and ``maximum`` (inclusive,
+    None: no limit or not a number), ``choices`` and ``read_only``; `parameters` lists them.
+
+    Raises
+    ------
+    ConfigError
+        If a value has the wrong type, lies outside its range or contradicts another one.
+    """
+
+    lever_arm: tuple[float, float, float] = _parameter(
+        (0.0, 0.0, 0.0), 'lever arm from the IMU to the GNSS antenna, in the IMU frame '
+        '(x forward, y left, z up)', 'm', minimum=-1000.0, maximum=1000.0)
+    lever_arm_std: float = _parameter(
+        0.0, 'how well the lever arm is known, 1 sigma per axis; above 0 it is estimated too',
+        'm', minimum=0.0, maximum=100.0)
+    use_velocity: str | bool = _parameter(
+        'auto', 'align with GNSS velocities; auto: when they arrive', choices=AUTO_OR_BOOL)
+    use_position: str | bool = _parameter(
+        'auto', 'align with GNSS positions; auto: when no velocity arrives or when their '
+        'covariance is of centimetre grade', choices=AUTO_OR_BOOL)
+    velocity_type: str = _parameter(
+        'TwistWithCovarianceStamped', 'message type of the velocity topic',
+        choices=('TwistWithCovarianceStamped', 'TwistStamped', 'Odometry'))
+    velocity_frame: str = _parameter(
+        'enu', 'world frame in which the antenna velocity is given: east-north-up or '
+        'north-east-down', choices=('enu', 'ned'))
+    velocity_vertical: str = _parameter(
+        'measured', 'absent: the receiver does not measure the vertical velocity and sends 0, as '
+        'NMEA drivers do', choices=('measured', 'absent'))
+    gnss_delay: float = _parameter(
+        0.0, 'a GNSS measurement is older than its stamp by this much', 's',
+        minimum=-10.0, maximum=10.0)
+    gnss_delay_std: float = _parameter(
+        0.0, 'how well the delay is known, 1 sigma; above 0 it is estimated too', 's',
+        minimum=0.0, maximum=10.0)
+    gnss_lateness: float = _parameter(
+        1.0, 'how much later than newer IMU samples a GNSS or IMU message may arrive and '
+        'still be used', 's', minimum=0.0, maximum=60.0)
+    imu_grade: str = _parameter(
+        'mems', 'preset of the four figures below; custom: all four must be given',
+        choices=(*PRESETS, 'custom'))
+    angle_random_walk: float = _parameter(
+        0.0, "angle random walk of the gyroscopes; 0: the preset's", 'deg/sqrt(h)',
+        minimum=0.0, maximum=1000.0)
+    velocity_random_walk: float = _parameter(
+        0.0, "velocity random walk of the accelerometers; 0: the preset's", 'm/s/sqrt(h)',
+        minimum=0.0, maximum=1000.0)
+    gyro_bias_std: float = _parameter(
+        0.0, "gyroscope bias, 1 sigma per axis; 0: the preset's", 'deg/s',
+        minimum=0.0, maximum=100.0)
+    accel_bias_std: float = _parameter(
+        0.0, "accelerometer bias, 1 sigma per axis; 0: the preset's", 'm/s^2',
+        minimum=0.0, maximum=10.0)
+    velocity_std: float = _parameter(
+        0.1, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none', 'm/s',
+        minimum=1e-4, maximum=100.0)
+    velocity_std_vertical: float = _parameter(
+        0.2, 'vertical GNSS velocity, 1 sigma, where messages carry none', 'm/s',
+        minimum=1e-4, maximum=100.0)
+    position_std: float = _parameter(
+        2.5, 'horizontal GNSS position, 1 sigma per axis, where messages carry none', 'm',
+        minimum=1e-4, maximum=1000.0)
+    position_std_vertical: float = _parameter(
+        5.0, 'vertical GNSS position, 1 sigma, where messages carry none', 'm',
+        minimum=1e-4, maximum=1000.0)
+    heading_std_threshold: float = _parameter(
+        1.0, 'declare the heading when its sigma is below', 'deg',
+        minimum=1e-4, maximum=180.0, runtime=True)
+    tilt_std_threshold: float = _parameter(
+        0.5, 'declare roll and pitch when their sigmas are below', 'deg',
+        minimum=1e-4, maximum=90.0, runtime=True)
+    hold_time: float = _parameter(
+        2.0, 'every condition must have held for this long before a declaration', 's',
+        minimum=0.0, maximum=3600.0, runtime=True)
+    method: str = _parameter(
+        'map', 'vif, pif: velocity and position integration formula as published; '
+        "map: the estimator that also knows the IMU's errors", choices=('vif', 'pif', 'map'))
+    free_start: bool = _parameter(
+        True, 'vif and pif: leave the noisy first velocity and rate out of every later vector; '
+        'false: the published formula to the letter', choices=(True, False))
+    world_frame_id: str = _parameter('map', 'frame_id of published attitudes: the ENU frame')
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = _checked(field, getattr(self, field.name))
+            object.__setattr__(self, field.name, value)
+        if self.use_velocity is False and self.use_position is False:
+            raise ConfigError('use_velocity and use_position are both false: nothing is left to '
+                              'align with, set one of them to auto or true')
+        if self.method == 'vif' and self.use_velocity is False:
+            raise ConfigError('method vif needs velocities, but use_velocity is false: set it to '
+                              'auto or true, or use the method pif or map')
+        if self.imu_grade == 'custom':
+            missing = [name for name in ImuNoise._fields if getattr(self, name) == 0.0]
+            if missing:
+                raise ConfigError('imu_grade custom needs all four figures of the IMU above 0, '
+                                  f'missing: {", ".join(missing)}')
+
+    @property
+    def imu_noise(self) -> ImuNoise:
+        """The IMU's noise in SI units: the preset's, where a figure is given that one."""
+        own = _imu_noise(self.angle_random_walk, self.velocity_random_walk,
+                         self.gyro_bias_std, self.accel_bias_std)
+        if self.imu_grade == 'custom':
+            return own
+        return ImuNoise(*(given or preset for given, preset
+                          in zip(own, PRESETS[self.imu_grade])))
+
+
+class Parameter(NamedTuple):
+    """One field of `Config` as a ROS parameter is described."""
+
+    name: str
+    default: Any
+    description: str
+    unit: str
+    minimum: float | None
+    maximum: float | None
+    choices: tuple
+    read_only: bool
+
+
+def parameters() -> tuple[Parameter, ...]:
+    """List the parameters in the order of the documentation."""
+    return tuple(Parameter(field.name, field.default, **field.metadata)
+                 for field in dataclasses.fields(Config))
+
+
+def config_from_mapping(values: Mapping[str, Any]) -> Config:
+    """
+    Make a configuration from names and values, the defaults for the rest.
+
+    Raises
+    ------
+    ConfigError
+        If a name is not known, with the names that come close, or a value is wrong.
+    """
+    known = [field.name for field in dataclasses.fields(Config)]
+    for name in values:
+        if name not in known:
+            close = difflib.get_close_matches(str(name), known)
+            hint = f'did you mean {" or ".join(close)}?' if close else \
+                f'the parameters are {", ".join(known)}'
+            raise ConfigError(f'unknown parameter {reprlib.repr(name)}: {hint}')
+    return Config(**values)
+
+
+def load_params(path: str | os.PathLike) -> dict[str, Any]:
+    """
+    Read the values for this node from a ROS 2 parameter file.
+
+    Parameters
+    ----------
+    path : path
+        YAML with ``ros__parameters`` below the node's name or a wildcard (``/**``).
+
+    Returns
+    -------
+    dict
+        Values by name, not checked: `config_from_mapping` does that.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read or holds no parameters for this node.
+    """
+    try:
+        with open(path, 'rb') as file:
+            text = file.read(MAX_PARAMS_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(f'cannot read the parameter file {path}: {error.strerror}') from None
+    if len(text) > MAX_PARAMS_BYTES:
+        raise ConfigError(f'{path} is larger than {MAX_PARAMS_BYTES >> 20} MiB: '
+                          'that is no parameter file')
+    values: dict[str, Any] = {}
+    found = False
+    for node, content in _node_sections(_parse_yaml(text, str(path)), ''):
+        if not _is_this_node(node):
+            continue
+        if not isinstance(content, dict):
+            raise ConfigError(f'{path}: ros__parameters of {node} must be a mapping of names '
+                              'to values')
+        found = True
+        values.update((name, value) for name, value in content.items()
+                      if str(name).split('.')[0] not in _RCLPY_PARAMETERS)
+    if not found:
+        raise ConfigError(f'{path} holds no parameters for this node: expected '
+                          f'"{NODE_NAME}:" or "/**:" with "ros__parameters:" below')
+    return values
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """
+    Split ``name=value``, the value written as in YAML.
+
+    Raises
+    ------
+    ConfigError
+        If there is no ``=`` or the value cannot be read.
+    """
+    name, equals, value = text.partition('=')
+    if not equals or not name.strip():
+        raise ConfigError(f'expected NAME=VALUE, got {reprlib.repr(text)}')
+    name = name.strip()
+    return name, _parse_yaml(value, f'the value of {name}')
+
+
+def _parse_yaml(text: str | bytes, source: str) -> Any:
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        """Reads 1e-3 as a number and refuses aliases, both as ROS does."""
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise yaml.composer.ComposerError(
+                    None, None, 'aliases are not allowed', self.peek_event().start_mark)
+            return super().compose_node(parent, index)
+
+    Loader.add_implicit_resolver(
+        'tag:yaml.org,2002:float', re.compile(r'^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$'),
+        list('-+.0123456789'))
+    try:
+        return yaml.load(text, Loader=Loader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, 'problem_mark', None)
+        where = f', line {mark.line + 1}' if mark else ''
+        problem = getattr(error, 'problem', None) or 'not text'
+        raise ConfigError(f'{source} is not valid YAML{where}: {problem}') from None
+    except (RecursionError, ValueError, TypeError, OverflowError):
+        raise ConfigError(f'{source} is not valid YAML') from None
+
+
+def _node_sections(tree: Any, prefix: str, depth: int = 8) -> Iterable[tuple[str, Any]]:
+    """Find each ``ros__parameters`` with the full name of the node that it is for."""
+    if not isinstance(tree, dict) or depth == 0:
+        return
+    for key, content in tree.items():
+        if key == 'ros__parameters':
+            yield prefix or '/', content
+        else:
+            yield from _node_sections(content, f'{prefix}/{str(key).strip("/")}', depth - 1)
+
+
+def _is_this_node(name: str) -> bool:
+    """Whether the last part of a full node name is ours or a wildcard."""
+    return name.rsplit('/', 1)[-1] in (NODE_NAME, '*', '**')
+
+
+def _checked(field: dataclasses.Field, value: Any) -> Any:
+    """Return the value in the field's own type or raise ConfigError."""
+    choices = field.metadata['choices']
+    if choices:
+        return _checked_choice(field.name, value, choices)
+    if isinstance(field.default, str):
+        if not isinstance(value, str) or not re.fullmatch(r'[^\s/][^\s]{0,255}', value):
+            raise ConfigError(f'{field.name} must be a name without spaces and without a leading '
+                              f'slash, got {reprlib.repr(value)}')
+        return value
+    if isinstance(field.default, tuple):
+        return _checked_vector(field, value)
+    return _checked_number(field.name, value, field)
+
+
+def _checked_choice(name: str, value: Any, choices: tuple) -> Any:
+    # A parameter that may be a word or a truth value arrives as "true" where only words fit.
+    if isinstance(value, str) and value.lower() in ('true', 'false') and True in choices:
+        value = value.lower() == 'true'
+    for choice in choices:
+        # 1 == True, but a number is neither a word nor a truth value.
+        if type(value) is type(choice) and value == choice:
+            return choice
+    words = ', '.join(str(choice).lower() if isinstance(choice, bool) else choice
+                      for choice in choices)
+    raise ConfigError(f'{name} must be one of {words}, got {reprlib.repr(value)}')
+
+
+def _checked_vector(field: dataclasses.Field, value: Any) -> tuple[float, float, float]:
+    try:
+        elements = None if isinstance(value, (str, bytes, Mapping)) else list(value)
+    except TypeError:
+        elements = None
+    if elements is None or len(elements) != 3:
+        got = reprlib.repr(value) if elements is None else f'{len(elements)}'
+        raise ConfigError(f'{field.name} must be three numbers '
+                          f'({field.metadata["unit"]}), got {got}')
+    x, y, z = (_checked_number(f'{field.name}[{index}]', element, field)
+               for index, element in enumerate(elements))
+    return x, y, z
+
+
+def _checked_number(name: str, value: Any, field: dataclasses.Field) -> float:
+    unit = f' {field.metadata["unit"]}'
+    minimum, maximum = field.metadata['minimum'], field.metadata['maximum']
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise ConfigError(f'{name} must be a number{unit and f" ({unit.strip()})"}, '
+                          f'got {reprlib.repr(value)}')
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise ConfigError(f'{name} must be finite, got {reprlib.repr(value)}')
+    if not minimum <= number <= maximum:
+        raise ConfigError(f'{name} must lie between {minimum:g} and {maximum:g}{unit}, '
+                          f'got {number:g}')
+    return number
