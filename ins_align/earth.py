@@ -1,0 +1,147 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+The Earth: WGS-84 ellipsoid, normal gravity, and how the local level turns (C_n0n).
+
+Latitude and longitude are radians, altitude is metres above the ellipsoid; every function works
+over leading axes.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ins_align.rotation import Array
+
+# WGS-84 defining and derived constants (NGA.STND.0036_1.0.0_WGS84, 2014).
+SEMI_MAJOR_AXIS = 6378137.0            # m
+FLATTENING = 1 / 298.257223563
+ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
+EARTH_RATE = 7.292115e-5               # rad/s
+GRAVITY_EQUATOR = 9.7803253359         # m/s^2
+SOMIGLIANA_K = 0.00193185265241
+# omega^2 a^2 b / GM, the ratio of centrifugal to gravitational acceleration at the equator.
+GRAVITY_RATIO = 0.00344978650684
+
+EARTH_RATE_E = np.array([0.0, 0.0, EARTH_RATE])
+
+
+def normal_gravity(latitude: ArrayLike, altitude: ArrayLike) -> Array:
+    """
+    Magnitude of normal gravity, m/s^2 (Somigliana, second order in altitude).
+
+    Source: WGS 84 standard, equations 4-1 and 4-3. The direction is taken along -up; below 20 km
+    the deflection with altitude is under 2e-5 rad at 45 degrees and is left out.
+    """
+    altitude = np.asarray(altitude, dtype=float)
+    sin2 = np.sin(latitude) ** 2
+    surface = (GRAVITY_EQUATOR * (1 + SOMIGLIANA_K * sin2)
+               / np.sqrt(1 - ECCENTRICITY2 * sin2))
+    ratio = altitude / SEMI_MAJOR_AXIS
+    return surface * (1 - 2 * (1 + FLATTENING + GRAVITY_RATIO - 2 * FLATTENING * sin2) * ratio
+                      + 3 * ratio ** 2)
+
+
+def ecef_from_lla(latitude: ArrayLike, longitude: ArrayLike, altitude: ArrayLike) -> Array:
+    """Position ``r_e``, shape (..., 3), metres."""
+    sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
+    prime_vertical = SEMI_MAJOR_AXIS / np.sqrt(1 - ECCENTRICITY2 * sin_lat ** 2)
+    equatorial = (prime_vertical + altitude) * cos_lat
+    return np.stack(np.broadcast_arrays(
+        equatorial * np.cos(longitude), equatorial * np.sin(longitude),
+        (prime_vertical * (1 - ECCENTRICITY2) + altitude) * sin_lat), axis=-1)
+
+
+def matrix_en(latitude: ArrayLike, longitude: ArrayLike) -> Array:
+    """``C_en``, shape (..., 3, 3): columns are east, north and up in the Earth-fixed frame."""
+    sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
+    sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)
+    zero = np.zeros_like(sin_lat + sin_lon)
+    rows = [[-sin_lon + zero, -sin_lat * cos_lon, cos_lat * cos_lon],
+            [cos_lon + zero, -sin_lat * sin_lon, cos_lat * sin_lon],
+            [zero, cos_lat + zero, sin_lat + zero]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def matrix_earth_turned(time: ArrayLike) -> Array:
+    """
+    ``Rz(W t)``, shape (..., 3, 3): from the Earth-fixed frame after `time` to the one before.
+
+    Parameters
+    ----------
+    time : array_like, shape (...)
+        Seconds since the frames coincided.
+    """
+    angle = EARTH_RATE * np.asarray(time, dtype=float)
+    matrix = np.zeros(angle.shape + (3, 3))
+    matrix[..., 0, 0] = matrix[..., 1, 1] = np.cos(angle)
+    matrix[..., 1, 0] = np.sin(angle)
+    matrix[..., 0, 1] = -matrix[..., 1, 0]
+    matrix[..., 2, 2] = 1.0
+    return matrix
+
+
+def gravity_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
+    """Normal gravity ``g_n`` in ENU, shape (..., 3), m/s^2."""
+    magnitude = normal_gravity(latitude, altitude)
+    return np.stack([np.zeros_like(magnitude), np.zeros_like(magnitude), -magnitude], axis=-1)
+
+
+def earth_rate_n(latitude: ArrayLike) -> Array:
+    """Earth rate ``omega_ie_n`` in ENU, shape (..., 3), rad/s."""
+    latitude = np.asarray(latitude, dtype=float)
+    return EARTH_RATE * np.stack(
+        [np.zeros_like(latitude), np.cos(latitude), np.sin(latitude)], axis=-1)
+
+
+class LocalLevel:
+    """
+    The non-rotating frame n0: the local level frozen at a start position and instant.
+
+    ``C_n0n(t) = C_en(0)^T Rz(W t) C_en(t)`` needs no integration (method.md, section 1).
+
+    Parameters
+    ----------
+    latitude, longitude : float
+        Radians, of the antenna at t0.
+    """
+
+    def __init__(self, latitude: float, longitude: float) -> None:
+        """Freeze the local level."""
+        self._C_n0e = matrix_en(latitude, longitude).T
+
+    def matrix(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike) -> Array:
+        """``C_n0n``, shape (..., 3, 3), at `time` seconds since t0."""
+        return self._C_n0e @ matrix_earth_turned(time) @ matrix_en(latitude, longitude)
+
+    def position(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike,
+                 altitude: ArrayLike) -> Array:
+        """Position from the Earth's centre in n0 axes, shape (..., 3), metres."""
+        r_e = ecef_from_lla(latitude, longitude, altitude)
+        return (self._C_n0e @ matrix_earth_turned(time) @ r_e[..., None])[..., 0]
+
+    def velocity(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike,
+                 altitude: ArrayLike, v_n: ArrayLike) -> Array:
+        """Inertial velocity in n0 axes, shape (..., 3), m/s: ``C_n0n (v_n + omega_ie x r)``."""
+        r_e = ecef_from_lla(latitude, longitude, altitude)
+        v_e = (matrix_en(latitude, longitude) @ np.asarray(v_n, dtype=float)[..., None])
+        inertial = v_e[..., 0] + np.cross(EARTH_RATE_E, r_e)
+        return (self._C_n0e @ matrix_earth_turned(time) @ inertial[..., None])[..., 0]
+
+    def gravitation(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike,
+                    altitude: ArrayLike) -> Array:
+        """Gravitation ``g + W x (W x r)`` in n0 axes, shape (..., 3), m/s^2."""
+        r_e = ecef_from_lla(latitude, longitude, altitude)
+        g_e = (matrix_en(latitude, longitude) @ gravity_n(latitude, altitude)[..., None])[..., 0]
+        gravitation = g_e + np.cross(EARTH_RATE_E, np.cross(EARTH_RATE_E, r_e))
+        return (self._C_n0e @ matrix_earth_turned(time) @ gravitation[..., None])[..., 0]

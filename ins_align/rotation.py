@@ -1,0 +1,271 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Rotations: vectors, matrices, quaternions; every function works over leading axes.
+
+Matrices are ``C_xy`` (components in y to components in x), quaternions are (x, y, z, w) of the
+same rotation with w >= 0, angles are radians.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+# Below this angle (rad) the Taylor series of sin(x)/x and friends are exact to rounding.
+_SMALL_ANGLE = 1e-3
+
+
+def skew(vector: ArrayLike) -> Array:
+    """
+    Cross-product matrix ``[v x]``.
+
+    Parameters
+    ----------
+    vector : array_like, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        ``skew(a) @ b == cross(a, b)``.
+    """
+    v = np.asarray(vector, dtype=float)
+    matrix = np.zeros(v.shape + (3,))
+    matrix[..., 0, 1] = -v[..., 2]
+    matrix[..., 0, 2] = v[..., 1]
+    matrix[..., 1, 0] = v[..., 2]
+    matrix[..., 1, 2] = -v[..., 0]
+    matrix[..., 2, 0] = -v[..., 1]
+    matrix[..., 2, 1] = v[..., 0]
+    return matrix
+
+
+def cross(a: ArrayLike, b: ArrayLike) -> Array:
+    """
+    Cross product over the last axis; leading axes broadcast.
+
+    Several times faster than numpy.cross on the small arrays of one GNSS interval.
+    """
+    a = np.asarray(a, dtype=float)
+    b = np.asarray(b, dtype=float)
+    result = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    result[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    result[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    result[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return result
+
+
+def _trigonometric_factors(angle2: Array) -> tuple[Array, Array, Array]:
+    """sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 of x^2."""
+    small = angle2 < _SMALL_ANGLE ** 2
+    x2 = np.where(small, 1.0, angle2)
+    x = np.sqrt(x2)
+    sine = np.sin(x)
+    a = np.where(small, 1 - angle2 / 6, sine / x)
+    b = np.where(small, 0.5 - angle2 / 24, 2 * np.sin(x / 2) ** 2 / x2)
+    c = np.where(small, 1 / 6 - angle2 / 120, (x - sine) / (x * x2))
+    return a, b, c
+
+
+def _rodrigues(vector: ArrayLike, first: int) -> Array:
+    v = np.asarray(vector, dtype=float)
+    factors = _trigonometric_factors(np.sum(v * v, axis=-1))
+    s = skew(v)
+    return (np.eye(3) + factors[first][..., None, None] * s
+            + factors[first + 1][..., None, None] * (s @ s))
+
+
+def exp_so3(vector: ArrayLike) -> Array:
+    """
+    Rotation matrix of a rotation vector (Rodrigues' formula).
+
+    Parameters
+    ----------
+    vector : array_like, shape (..., 3)
+        Radians.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+    """
+    return _rodrigues(vector, 0)
+
+
+def left_jacobian(vector: ArrayLike) -> Array:
+    """
+    Left Jacobian of SO(3): ``exp_so3(v + d) ~ exp_so3(left_jacobian(v) d) exp_so3(v)``.
+
+    Parameters
+    ----------
+    vector : array_like, shape (..., 3)
+        Radians.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+    """
+    return _rodrigues(vector, 1)
+
+
+def log_so3(matrix: ArrayLike) -> Array:
+    """
+    Rotation vector of a rotation matrix, angle in [0, pi].
+
+    Goes through the quaternion, which keeps full precision at small angles and near pi.
+
+    Parameters
+    ----------
+    matrix : array_like, shape (..., 3, 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Radians.
+    """
+    q = quaternion_from_matrix(matrix)
+    sine = np.sqrt(np.sum(q[..., :3] ** 2, axis=-1))
+    angle = 2 * np.arctan2(sine, q[..., 3])
+    small = sine < 1e-12
+    scale = np.where(small, 2.0, angle / np.where(small, 1.0, sine))
+    return q[..., :3] * scale[..., None]
+
+
+def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
+    """
+    Rotation matrix of a quaternion, which is normalised first.
+
+    Parameters
+    ----------
+    quaternion : array_like, shape (..., 4)
+        (x, y, z, w).
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+    """
+    q = np.asarray(quaternion, dtype=float)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    s = skew(q[..., :3])
+    return np.eye(3) + 2 * (q[..., 3, None, None] * s + s @ s)
+
+
+def quaternion_from_matrix(matrix: ArrayLike) -> Array:
+    """
+    Quaternion of a rotation matrix, w >= 0.
+
+    Shepperd's method, which divides by the largest of the four components (S. W. Shepperd,
+    "Quaternion from rotation matrix", J. Guidance and Control 1(3), 1978).
+
+    Parameters
+    ----------
+    matrix : array_like, shape (..., 3, 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 4)
+        (x, y, z, w).
+    """
+    m = np.asarray(matrix, dtype=float)
+    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    # Row i of this symmetric matrix is 4 q_i q.
+    k = np.empty(m.shape[:-2] + (4, 4))
+    for i in range(3):
+        k[..., i, i] = 1 + 2 * m[..., i, i] - trace
+    k[..., 3, 3] = 1 + trace
+    k[..., 0, 1] = k[..., 1, 0] = m[..., 1, 0] + m[..., 0, 1]
+    k[..., 0, 2] = k[..., 2, 0] = m[..., 2, 0] + m[..., 0, 2]
+    k[..., 1, 2] = k[..., 2, 1] = m[..., 2, 1] + m[..., 1, 2]
+    k[..., 0, 3] = k[..., 3, 0] = m[..., 2, 1] - m[..., 1, 2]
+    k[..., 1, 3] = k[..., 3, 1] = m[..., 0, 2] - m[..., 2, 0]
+    k[..., 2, 3] = k[..., 3, 2] = m[..., 1, 0] - m[..., 0, 1]
+    largest = np.argmax(np.diagonal(k, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(k, largest[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., 3:] < 0, -q, q)
+
+
+def matrix_from_rpy(rpy: ArrayLike) -> Array:
+    """
+    ``C_nb = Rz(yaw) Ry(pitch) Rx(roll)`` (REP-103).
+
+    Parameters
+    ----------
+    rpy : array_like, shape (..., 3)
+        Roll, pitch, yaw in radians; yaw is counter-clockwise from east.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+    """
+    rpy = np.asarray(rpy, dtype=float)
+    x, y, z = np.eye(3)
+    return (exp_so3(rpy[..., 2, None] * z) @ exp_so3(rpy[..., 1, None] * y)
+            @ exp_so3(rpy[..., 0, None] * x))
+
+
+def roll_pitch_yaw(matrix: ArrayLike) -> Array:
+    """
+    Roll, pitch and yaw of ``C_nb``: the inverse of `matrix_from_rpy`.
+
+    Parameters
+    ----------
+    matrix : array_like, shape (..., 3, 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Radians; pitch in [-pi/2, pi/2], the others in (-pi, pi].
+    """
+    m = np.asarray(matrix, dtype=float)
+    return np.stack([np.arctan2(m[..., 2, 1], m[..., 2, 2]),
+                     np.arctan2(-m[..., 2, 0], np.hypot(m[..., 0, 0], m[..., 1, 0])),
+                     np.arctan2(m[..., 1, 0], m[..., 0, 0])], axis=-1)
+
+
+def orthonormalized(matrix: Array) -> Array:
+    """
+    Nearest rotation matrix to first order, against drift of long products.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (3, 3)
+        A rotation matrix up to rounding.
+
+    Returns
+    -------
+    ndarray, shape (3, 3)
+    """
+    return 1.5 * matrix - 0.5 * matrix @ (matrix.T @ matrix)
+
+
+def cumulative_rotations(steps: Array) -> Array:
+    """
+    Prefix products ``steps[0] @ steps[1] @ ... @ steps[k]`` for every k.
+
+    Doubling scan: log2(n) vectorised products instead of a loop over n.
+
+    Parameters
+    ----------
+    steps : ndarray, shape (..., n, 3, 3)
+
+    Returns
+    -------
+    ndarray, shape (..., n, 3, 3)
+    """
+    total = steps.copy()
+    reach = 1
+    while reach < steps.shape[-3]:
+        total[..., reach:, :, :] = total[..., :-reach, :, :] @ total[..., reach:, :, :]
+        reach *= 2
+    return total
