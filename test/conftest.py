@@ -1,0 +1,29 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Keeps ROS graphs of the tests apart from everything else and names the versions in use."""
+
+import os
+import random
+
+import numpy
+import scipy
+
+# Before any test starts a node: its own domain, this machine only, so that neither a robot on
+# the network nor a second run of the tests is heard.
+os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randint(1, 101))
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+
+
+def pytest_report_header():
+    return f'numpy {numpy.__version__}, scipy {scipy.__version__}'
