@@ -1,0 +1,274 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Motion of simulated vehicles in closed form: smooth, so that truth is known at any instant.
+
+Every scenario is a function of time that gives velocity and attitude; positions come from
+integrating the velocity. All motion has a continuous angular acceleration and jerk. Bodies are
+FLU, axes ENU, angles radians, yaw counter-clockwise from east.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from ins_align.rotation import Array, matrix_from_rpy
+import numpy as np
+
+_GRAVITY = 9.81     # m/s^2, for banking only
+_LEAD_IN = 1000.0   # s of motion before t = 0 that a profile can be asked for
+
+# Rows of (duration in s, acceleration in m/s^2, turn rate in rad/s); a block ends at rest.
+_CITY = ((1.0, 0.0, 0.0), (6.0, 2.0, 0.0), (5.0, 0.0, 0.0), (3.0, -2.0, 0.0),
+         (5.2, 0.0, 0.3), (4.0, 2.0, 0.0), (6.0, 0.0, 0.05), (4.0, -2.0, 0.0),
+         (4.5, 0.0, -0.35), (4.0, 1.5, 0.0), (5.0, 0.0, -0.06), (6.0, -2.0, 0.0),
+         (4.0, 0.0, 0.0))
+_BACK_OUT = ((2.0, 0.0, 0.0), (2.0, -0.75, 0.0), (5.0, 0.0, 0.25), (2.0, 0.75, 0.0),
+             (1.0, 0.0, 0.0))
+_THROW = ((2.0, 0.5, 3.5), (0.0, 30.0, 0.0))  # durations, accelerations
+_CIRCUIT = ((7.0, 0.0, 0.35), (3.0, 0.0, 0.0), (7.0, 0.0, -0.35), (4.0, 0.0, 0.1))
+
+
+class Motion(NamedTuple):
+    """Velocity of the IMU and attitude of the vehicle at n instants."""
+
+    velocity: Array  # (n, 3), ENU, m/s
+    rpy: Array       # (n, 3), roll, pitch, yaw
+
+
+class Scenario(NamedTuple):
+    """One kind of motion."""
+
+    motion: Callable[[float], Callable[[Array], Motion]]  # of the time that it must last, s
+    duration: float  # s, unless told otherwise
+    set_off: float   # s from a stand still to full motion
+
+
+def motion_function(name: str, duration: float, heading: float = 0.0, crab: float = 0.0,
+                    stand_still: float = 0.0) -> Callable[[Array], Motion]:
+    """
+    Motion of a scenario as a function of time.
+
+    Parameters
+    ----------
+    name : str
+        One of `SCENARIOS`.
+    duration : float
+        Seconds that the motion is asked for.
+    heading : float
+        Turns the whole trajectory about the vertical.
+    crab : float
+        Angle of the vehicle's nose from where its course would have it.
+    stand_still : float
+        Seconds at rest before the motion begins.
+
+    Returns
+    -------
+    callable
+        Takes times (n,) in seconds, gives a `Motion`.
+    """
+    scenario = SCENARIOS[name]
+    motion = scenario.motion(duration)
+    turn = matrix_from_rpy([0.0, 0.0, heading])
+
+    def at(time: Array) -> Motion:
+        pace = np.ones_like(time)
+        if stand_still > 0:
+            # The same path, passed along slowly at first.
+            pace = _step(time, stand_still, scenario.set_off)
+            time = _step_integral(time, stand_still, scenario.set_off)
+        velocity, rpy = motion(time)
+        return Motion(velocity * pace[:, None] @ turn.T, rpy + [0.0, 0.0, heading + crab])
+
+    return at
+
+
+def _step(time: Array, start: float, width: float) -> Array:
+    """Go from 0 to 1 with two continuous derivatives."""
+    x = np.clip((time - start) / width, 0.0, 1.0)
+    return x ** 3 * (10 - 15 * x + 6 * x ** 2)
+
+
+def _step_integral(time: Array, start: float, width: float) -> Array:
+    x = np.clip((time - start) / width, 0.0, 1.0)
+    return width * x ** 4 * (2.5 - 3 * x + x ** 2) + np.maximum(time - start - width, 0.0)
+
+
+def _profile(durations: Sequence[float], values: Sequence[float], width: float):
+    """
+    Piecewise constant with a smooth step of `width` at the start of every piece.
+
+    Returns
+    -------
+    scipy.interpolate.PPoly
+        Twice continuously differentiable, with exact antiderivatives.
+    """
+    from scipy.interpolate import PPoly
+
+    ends = np.cumsum(durations)
+    starts = np.concatenate([[0.0], ends[:-1]])
+    values = np.asarray(values, dtype=float)
+    steps = np.diff(values, prepend=0.0)
+    breaks = np.concatenate([[-_LEAD_IN], np.column_stack([starts, starts + width]).ravel(),
+                             [ends[-1] + _LEAD_IN]])
+    coefficients = np.zeros((6, len(breaks) - 1))
+    smooth = slice(1, None, 2)
+    coefficients[0, smooth] = 6 * steps / width ** 5
+    coefficients[1, smooth] = -15 * steps / width ** 4
+    coefficients[2, smooth] = 10 * steps / width ** 3
+    coefficients[5, smooth] = values - steps
+    coefficients[5, 2::2] = values
+    return PPoly(coefficients, breaks)
+
+
+def _course(first: Sequence, block: Sequence, duration: float, width: float) -> tuple:
+    """Acceleration and turn rate of `first` and then `block` again and again."""
+    rows = list(first)
+    length = sum(row[0] for row in first)
+    while length < duration:
+        rows.extend(block)
+        length += sum(row[0] for row in block)
+    durations, accelerations, rates = zip(*rows)
+    return _profile(durations, accelerations, width), _profile(durations, rates, width)
+
+
+def _along(speed: Array, yaw: Array, climb: Array) -> Array:
+    """Velocity of `speed` along a course and a climb angle."""
+    level = speed * np.cos(climb)
+    return np.stack([level * np.cos(yaw), level * np.sin(yaw), speed * np.sin(climb)], axis=-1)
+
+
+def _wave(time: Array, amplitude: float, period: float, phase: float = 0.0) -> Array:
+    return amplitude * np.sin(2 * np.pi * time / period + phase)
+
+
+def _flight(duration: float) -> Callable[[Array], Motion]:
+    """Fly S-turns at 100 m/s, banked, with oscillations of a few degrees about all axes."""
+    turn, period = np.radians(25.0), 40.0
+
+    def motion(time: Array) -> Motion:
+        speed = 100.0 + _wave(time, 3.0, 61.0)
+        course = turn * (1 - np.cos(2 * np.pi * time / period))
+        rate = _wave(time, turn * 2 * np.pi / period, period)
+        climb = _wave(time, 0.03, 27.0)
+        roll = -np.arctan(speed * rate / _GRAVITY) + _wave(time, 0.05, 4.3)
+        pitch = -climb - 0.03 + _wave(time, 0.05, 5.7, 1.0)
+        yaw = course + _wave(time, 0.035, 7.1, 2.0)
+        return Motion(_along(speed, course, climb), np.stack([roll, pitch, yaw], axis=-1))
+
+    return motion
+
+
+def _road(first: Sequence, duration: float) -> Callable[[Array], Motion]:
+    acceleration, rate = _course(first, _CITY, duration, 0.8)
+    speed_along, heading = acceleration.antiderivative(), rate.antiderivative()
+    distance = speed_along.antiderivative()
+
+    def motion(time: Array) -> Motion:
+        speed, d, turn = speed_along(time), distance(time), rate(time)
+        yaw = heading(time)
+        # Slopes and bumps belong to places: a car at rest does not move on them.
+        slope = _wave(d, 0.03, 310.0) + _wave(d, 0.004, 9.7)
+        roll = 0.006 * speed * turn + _wave(d, 0.02, 170.0) + _wave(d, 0.005, 8.3)
+        pitch = -slope - 0.006 * acceleration(time) + _wave(d, 0.003, 11.9)
+        return Motion(_along(speed, yaw, slope), np.stack([roll, pitch, yaw], axis=-1))
+
+    return motion
+
+
+def _car(duration: float) -> Callable[[Array], Motion]:
+    """Drive through streets: corners, bends, traffic lights."""
+    return _road((), duration)
+
+
+def _reverse(duration: float) -> Callable[[Array], Motion]:
+    """Back out of a parking space, then drive through streets."""
+    return _road(_BACK_OUT, duration)
+
+
+def _launch(duration: float) -> Callable[[Array], Motion]:
+    """Rest in a hand, be thrown with 3 g for half a second, climb and turn."""
+    acceleration = _profile(*_THROW, 0.1)
+    _, rate = _course(((6.0, 0.0, 0.0),), _CIRCUIT, duration, 1.5)
+    speed_along, heading = acceleration.antiderivative(), rate.antiderivative()
+
+    def motion(time: Array) -> Motion:
+        speed = speed_along(time)
+        free = _step(time, 2.6, 3.0)
+        yaw = heading(time)
+        climb = 0.2 - 0.15 * _step(time, 6.0, 6.0)
+        roll = -np.arctan(speed * rate(time) / _GRAVITY) + free * _wave(time, 0.05, 2.9)
+        pitch = -climb - free * (0.05 + _wave(time, 0.04, 3.7))
+        yaw_body = yaw + free * _wave(time, 0.03, 4.9)
+        return Motion(_along(speed, yaw, climb), np.stack([roll, pitch, yaw_body], axis=-1))
+
+    return motion
+
+
+def _hover(duration: float) -> Callable[[Array], Motion]:
+    """Wander about a point as a quadrotor does: it leans where it accelerates, yaws slowly."""
+    waves = ((0, 0.7, 7.3, 0.3), (0, 0.5, 12.1, 1.1), (1, 0.8, 9.1, 2.0), (1, 0.4, 5.9, 0.0),
+             (2, 0.2, 8.3, 0.7))
+
+    def motion(time: Array) -> Motion:
+        velocity = np.zeros((len(time), 3))
+        lift = np.tile([0.0, 0.0, _GRAVITY], (len(time), 1))
+        for axis, amplitude, period, phase in waves:
+            velocity[:, axis] += _wave(time, amplitude, period, phase)
+            lift[:, axis] += _wave(time, amplitude * 2 * np.pi / period, period,
+                                   phase + np.pi / 2)
+        yaw = _wave(time, 0.35, 53.0)
+        ahead = np.cos(yaw) * lift[:, 0] + np.sin(yaw) * lift[:, 1]
+        left = np.cos(yaw) * lift[:, 1] - np.sin(yaw) * lift[:, 0]
+        pitch = np.arctan2(ahead, lift[:, 2])
+        roll = -np.arctan2(left, np.hypot(ahead, lift[:, 2]))
+        return Motion(velocity, np.stack([roll, pitch, yaw], axis=-1))
+
+    return motion
+
+
+def _straight(duration: float) -> Callable[[Array], Motion]:
+    """Hold speed, course and attitude: heading cannot be observed."""
+    def motion(time: Array) -> Motion:
+        zero = np.zeros_like(time)
+        return Motion(_along(zero + 30.0, zero, zero), np.zeros((len(time), 3)))
+
+    return motion
+
+
+def _static(duration: float) -> Callable[[Array], Motion]:
+    """Stand."""
+    return lambda time: Motion(np.zeros((len(time), 3)), np.zeros((len(time), 3)))
+
+
+def _swing(duration: float) -> Callable[[Array], Motion]:
+    """Hold a course as a boat does in waves, the heading swinging about it."""
+    def motion(time: Array) -> Motion:
+        zero = np.zeros_like(time)
+        rpy = np.stack([_wave(time, 0.05, 4.7), _wave(time, 0.03, 6.1),
+                        _wave(time, np.radians(20.0), 11.0)], axis=-1)
+        return Motion(_along(zero + 5.0, zero, zero), rpy)
+
+    return motion
+
+
+SCENARIOS = {
+    'flight': Scenario(_flight, 100.0, 40.0),
+    'car': Scenario(_car, 100.0, 1.0),
+    'straight': Scenario(_straight, 100.0, 15.0),
+    'static': Scenario(_static, 60.0, 1.0),
+    'hover': Scenario(_hover, 60.0, 2.0),
+    'launch': Scenario(_launch, 60.0, 2.0),
+    'reverse': Scenario(_reverse, 100.0, 1.0),
+    'swing': Scenario(_swing, 100.0, 5.0),
+}

@@ -1,0 +1,525 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Simulated recordings: sensors of a moving vehicle with truth.
+
+Perfect sensors come from `ins_align.trajectory`; here they get their errors, the GNSS receiver its
+rate, latency, outages and outliers, and the whole becomes a recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+import json
+import math
+import os
+from pathlib import Path
+import tempfile
+from typing import Any
+
+from ins_align import scenarios
+from ins_align.config import ImuNoise, PRESETS
+from ins_align.messages import ENU_FROM_NED, Fix, Velocity
+from ins_align.rotation import Array, matrix_from_rpy, quaternion_from_matrix
+from ins_align.trajectory import displaced, START_NS, Trajectory, trajectory_of, wrapped
+import numpy as np
+
+SCENARIOS = tuple(scenarios.SCENARIOS)
+STORAGES = ('mcap', 'sqlite3')
+
+_MAX_SAMPLES = 20_000_000
+_TRUTH_STD = 1e-6  # rad, stated on the reference topic: zero would mean unknown
+_VELOCITY_FRAMES = ('enu', 'ned')
+_AXES = {'': (1.0, 1.0, 1.0), 'x': (-1.0, 1.0, 1.0), 'y': (1.0, -1.0, 1.0),
+         'z': (1.0, 1.0, -1.0)}
+
+
+class SimulationError(ValueError):
+    """A simulation cannot be made as asked; the text says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """
+    A simulated recording with truth; N IMU samples, K GNSS epochs.
+
+    Velocities are ENU (unless the receiver was told to send NED), attitudes take the IMU frame
+    to ENU, positions are degrees, degrees, metres above the ellipsoid.
+    """
+
+    imu_stamps_ns: np.ndarray       # (N,) int64
+    gyro: Array                     # (N, 3), rad/s
+    accel: Array                    # (N, 3), specific force, m/s^2
+    gnss_stamps_ns: np.ndarray      # (K,) int64
+    gnss_arrival_ns: np.ndarray     # (K,) int64
+    lla_deg: Array                  # (K, 3), antenna
+    velocity: Array                 # (K, 3), antenna, m/s
+    velocity_covariance: Array      # (3, 3), in the frame of `velocity`
+    position_covariance: Array      # (3, 3), ENU, m^2
+    outlier: np.ndarray             # (K,) bool: this epoch was spoilt on purpose
+    truth_stamps_ns: np.ndarray     # (N,) int64
+    truth_C_nb: Array               # (N, 3, 3)
+    truth_velocity: Array           # (N, 3), IMU, ENU, m/s
+    truth_lla: Array                # (N, 3), IMU, degrees and metres
+    truth_gyro: Array               # (N, 3), rad/s
+    truth_accel: Array              # (N, 3), m/s^2
+    gyro_bias: Array                # (3,), rad/s
+    accel_bias: Array               # (3,), m/s^2
+    lever_arm: Array                # (3,), IMU to antenna in the IMU frame, m
+    imu_noise: ImuNoise             # what the errors are drawn from
+    gyro_std: float                 # rad/s per sample
+    accel_std: float                # m/s^2 per sample
+    meta: dict[str, Any]            # the arguments of `simulate`
+    _trajectory: Trajectory
+    _C_vb: Array
+
+    def attitude_at(self, stamps_ns: int | np.ndarray) -> Array:
+        """
+        True ``C_nb`` at any stamps, exact between the samples.
+
+        Parameters
+        ----------
+        stamps_ns : int or ndarray, shape (...)
+
+        Returns
+        -------
+        ndarray, shape (..., 3, 3)
+        """
+        stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
+        time = (stamps_ns.ravel() - START_NS) * 1e-9
+        C_nb = matrix_from_rpy(self._trajectory.motion(time).rpy) @ self._C_vb
+        return C_nb.reshape(stamps_ns.shape + (3, 3))
+
+    def messages(self) -> Iterator[tuple[str, Any]]:
+        """
+        Yield what a subscriber gets, in the order of arrival.
+
+        Yields
+        ------
+        kind : str
+            'imu', 'fix' or 'velocity'.
+        payload : tuple
+            For 'imu' the samples since the message before: stamps (n,), gyro (n, 3),
+            accel (n, 3). Otherwise a `Fix` or a `Velocity`.
+        """
+        upto = np.searchsorted(self.imu_stamps_ns, self.gnss_arrival_ns, side='right')
+        start = 0
+        for k, end in enumerate(upto):
+            if end > start:
+                yield 'imu', self._imu(start, end)
+                start = end
+            yield 'fix', self.fix(k)
+            yield 'velocity', self.velocity_measurement(k)
+        if start < len(self.imu_stamps_ns):
+            yield 'imu', self._imu(start, len(self.imu_stamps_ns))
+
+    def _imu(self, start: int, end: int) -> tuple[np.ndarray, Array, Array]:
+        return self.imu_stamps_ns[start:end], self.gyro[start:end], self.accel[start:end]
+
+    def fix(self, k: int) -> Fix:
+        """Return the position of GNSS epoch k as a message."""
+        return Fix(int(self.gnss_stamps_ns[k]), *map(float, self.lla_deg[k]),
+                   self.position_covariance, 0)
+
+    def velocity_measurement(self, k: int) -> Velocity:
+        """Return the velocity of GNSS epoch k as a message, whatever its frame taken for ENU."""
+        return Velocity(int(self.gnss_stamps_ns[k]), self.velocity[k], self.velocity_covariance)
+
+
+def feed(aligner: Any, simulation: Simulation, *, fix: bool = True,
+         velocity: bool = True) -> list:
+    """
+    Give a whole recording to an aligner in the order of arrival.
+
+    Parameters
+    ----------
+    aligner : Aligner
+    simulation : Simulation
+    fix, velocity : bool
+        Leave out positions or velocities.
+
+    Returns
+    -------
+    list of Epoch
+        Of every update and the final flush.
+    """
+    epochs = []
+    for kind, payload in simulation.messages():
+        if kind == 'imu':
+            aligner.add_imu(*payload)
+            epochs.extend(aligner.update())
+        elif kind == 'fix' and fix:
+            aligner.add_fix(payload)
+        elif kind == 'velocity' and velocity:
+            aligner.add_velocity(payload)
+    epochs.extend(aligner.flush())
+    return epochs
+
+
+def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0,
+             duration: float | None = None, ideal: bool = False,
+             imu_rate: float = 100.0, imu_jitter: float = 0.0,
+             gyro_bias_std: float | None = None, accel_bias_std: float | None = None,
+             gyro_scale_std: float = 0.0,
+             lever_arm: Sequence[float] = (1.0, 1.0, 1.0),
+             mount_rpy_deg: Sequence[float] = (0.0, 0.0, 0.0),
+             gnss_rate: float = 5.0, gnss_phase: float = 0.0137,
+             gnss_latency: float = 0.0, gnss_delay: float = 0.0,
+             velocity_std: float = 0.1, velocity_std_vertical: float | None = None,
+             position_std: float = 2.5, position_std_vertical: float | None = None,
+             position_drift_std: float = 0.0, position_drift_time: float = 60.0,
+             outages: Sequence[tuple[float, float]] = (),
+             outlier_rate: float = 0.0, outlier_velocity: float = 5.0,
+             outlier_position: float = 50.0,
+             latitude_deg: float = 48.0, longitude_deg: float = 11.0, altitude: float = 300.0,
+             heading_deg: float = 0.0, crab_deg: float = 0.0, stand_still: float = 0.0,
+             velocity_frame: str = 'enu', flip_axis: str = '',
+             accel_sign: int = 1) -> Simulation:
+    """
+    Simulate the sensors of a moving vehicle.
+
+    Parameters
+    ----------
+    scenario : str
+        One of `SCENARIOS`.
+    imu_grade : str or ImuNoise
+        Preset of `ins_align.config` or the four figures themselves.
+    seed : int
+        Of everything random; the same seed gives the same recording. Each sensor has its own
+        stream: another GNSS rate leaves the IMU as it was.
+    duration : float, optional
+        Seconds; by default what suits the scenario, after `stand_still`.
+    ideal : bool
+        Leave out noise, biases, scale factors, drift. Stated covariances stay.
+    imu_rate, gnss_rate : float
+        Hz.
+    imu_jitter : float
+        Largest displacement of a sampling instant in parts of the interval, below 0.5. Stamps
+        tell the displaced instants.
+    gyro_bias_std, accel_bias_std : float, optional
+        rad/s and m/s^2 per axis in place of the grade's.
+    gyro_scale_std : float
+        Scale-factor error of each gyro (0.01 is one percent).
+    lever_arm : three floats
+        IMU to antenna in the IMU frame, m.
+    mount_rpy_deg : three floats
+        Attitude of the IMU in the vehicle: roll, pitch, yaw.
+    gnss_phase : float
+        Stamp of the first epoch, s; by default no IMU sample is at a GNSS stamp.
+    gnss_latency : float
+        Arrival after the stamp, s.
+    gnss_delay : float
+        The measurement is older than its stamp by this, s.
+    velocity_std, position_std : float
+        Horizontal noise, m/s and m. Vertical: by default the same for velocity, twice that for
+        position.
+    position_drift_std, position_drift_time : float
+        First-order Gauss-Markov error on top of the white noise, m and s; not in the covariance.
+    outages : sequence of (start, end)
+        Seconds without GNSS.
+    outlier_rate, outlier_velocity, outlier_position : float
+        Part of the epochs that are spoilt, and by how many m/s and m in a random direction.
+    latitude_deg, longitude_deg, altitude : float
+        Where the motion starts.
+    heading_deg : float
+        Turns the trajectory: course of the start, counter-clockwise from east.
+    crab_deg : float
+        The vehicle's nose points so far left of its course.
+    stand_still : float
+        Seconds at rest before the vehicle sets off.
+    velocity_frame : str
+        'ned': the receiver sends north-east-down.
+    flip_axis : str
+        'x', 'y' or 'z': this axis of the IMU has the wrong sign.
+    accel_sign : int
+        -1: the accelerometer has the sign of gravity.
+
+    Returns
+    -------
+    Simulation
+
+    Raises
+    ------
+    SimulationError
+        If an argument makes no sense.
+    """
+    meta = {name: value for name, value in locals().items()}
+    noise = _checked_arguments(meta)
+    if gyro_bias_std is not None:
+        noise = noise._replace(gyro_bias_std=gyro_bias_std)
+    if accel_bias_std is not None:
+        noise = noise._replace(accel_bias_std=accel_bias_std)
+    if duration is None:
+        duration = scenarios.SCENARIOS[scenario].duration + stand_still
+        meta['duration'] = duration
+    trajectory = trajectory_of(scenario, float(duration), float(imu_rate), float(imu_jitter),
+                             float(latitude_deg), float(longitude_deg), float(altitude),
+                             float(heading_deg), float(crab_deg), float(stand_still))
+    streams = [np.random.default_rng(child)
+               for child in np.random.SeedSequence(int(seed)).spawn(5)]
+    scale = 0.0 if ideal else 1.0
+    C_vb = matrix_from_rpy(np.radians(mount_rpy_deg))
+    lever_arm = np.array(lever_arm, dtype=float)
+
+    truth_gyro, truth_accel = trajectory.gyro @ C_vb, trajectory.accel @ C_vb
+    gyro_bias = scale * noise.gyro_bias_std * streams[0].standard_normal(3)
+    accel_bias = scale * noise.accel_bias_std * streams[0].standard_normal(3)
+    gyro_scale = 1 + scale * gyro_scale_std * streams[0].standard_normal(3)
+    gyro_std = scale * noise.angle_random_walk * math.sqrt(imu_rate)
+    accel_std = scale * noise.velocity_random_walk * math.sqrt(imu_rate)
+    sign = np.array(_AXES[flip_axis])
+    shape = truth_gyro.shape
+    gyro = sign * (truth_gyro * gyro_scale + gyro_bias
+                   + gyro_std * streams[1].standard_normal(shape))
+    accel = accel_sign * sign * (truth_accel + accel_bias
+                                 + accel_std * streams[2].standard_normal(shape))
+
+    stamps, time = _gnss_epochs(duration, gnss_rate, gnss_phase, gnss_delay, outages)
+    lla, velocity = trajectory.antenna(time, C_vb, lever_arm)
+    velocity_sigma = _per_axis(velocity_std, velocity_std_vertical, 1.0)
+    position_sigma = _per_axis(position_std, position_std_vertical, 2.0)
+    outlier = streams[4].random(len(time)) < outlier_rate
+    direction = streams[4].standard_normal((len(time), 3))
+    direction *= (outlier / np.linalg.norm(direction, axis=1))[:, None]
+    velocity = (velocity + scale * velocity_sigma * streams[3].standard_normal(velocity.shape)
+                + outlier_velocity * direction)
+    offset = (scale * position_sigma * streams[3].standard_normal(lla.shape)
+              + outlier_position * direction)
+    if position_drift_std > 0 and not ideal:
+        offset += _gauss_markov(stamps * 1e-9, position_drift_std, position_drift_time,
+                                streams[3])
+    lla = wrapped(displaced(lla, offset))
+    velocity_covariance = np.diag(velocity_sigma ** 2)
+    if velocity_frame == 'ned':
+        velocity = velocity @ ENU_FROM_NED
+        velocity_covariance = ENU_FROM_NED @ velocity_covariance @ ENU_FROM_NED
+
+    gnss_stamps_ns = START_NS + stamps
+    return Simulation(
+        imu_stamps_ns=trajectory.stamps_ns, gyro=gyro, accel=accel,
+        gnss_stamps_ns=gnss_stamps_ns,
+        gnss_arrival_ns=gnss_stamps_ns + round(gnss_latency * 1e9),
+        lla_deg=lla, velocity=velocity, velocity_covariance=velocity_covariance,
+        position_covariance=np.diag(position_sigma ** 2), outlier=outlier,
+        truth_stamps_ns=trajectory.stamps_ns, truth_C_nb=trajectory.C_nv @ C_vb,
+        truth_velocity=trajectory.velocity, truth_lla=trajectory.lla,
+        truth_gyro=truth_gyro, truth_accel=truth_accel, gyro_bias=gyro_bias,
+        accel_bias=accel_bias, lever_arm=lever_arm, imu_noise=noise, gyro_std=gyro_std,
+        accel_std=accel_std, meta=meta, _trajectory=trajectory, _C_vb=C_vb)
+
+
+def _per_axis(horizontal: float, vertical: float | None, ratio: float) -> Array:
+    return np.array([horizontal, horizontal, ratio * horizontal if vertical is None else vertical])
+
+
+def _gnss_epochs(duration: float, rate: float, phase: float, delay: float,
+                 outages: Sequence[tuple[float, float]]) -> tuple[np.ndarray, Array]:
+    """Stamps in ns and true instants of measurement in s since the start."""
+    count = max(int((duration - phase) * rate + 1e-6) + 1, 0)
+    stamps = np.rint((phase + np.arange(count) / rate) * 1e9).astype(np.int64)
+    seconds = stamps * 1e-9
+    received = seconds >= delay
+    for start, end in outages:
+        received &= (seconds < start) | (seconds >= end)
+    return stamps[received], seconds[received] - delay
+
+
+def _gauss_markov(time: Array, std: float, correlation_time: float,
+                  random: np.random.Generator) -> Array:
+    """First-order Gauss-Markov process (n, 3) of constant variance."""
+    decay = np.exp(-np.diff(time, prepend=-np.inf) / correlation_time)
+    drive = std * np.sqrt(1 - decay ** 2)[:, None] * random.standard_normal((len(time), 3))
+    for k in range(1, len(drive)):
+        drive[k] += decay[k] * drive[k - 1]
+    return drive
+
+
+def _checked_arguments(arguments: dict[str, Any]) -> ImuNoise:
+    """Raise SimulationError for an argument without sense; return the IMU's noise."""
+    def refuse(name: str, expected: str) -> None:
+        raise SimulationError(f'{name} must be {expected}, got {arguments[name]!r}')
+
+    def number(value: Any) -> bool:
+        return isinstance(value, (int, float, np.number)) and not isinstance(value, bool) \
+            and math.isfinite(value)
+
+    def check(names: str, expected: str, fits: Callable[[Any], bool]) -> None:
+        for name in names.split():
+            if not fits(arguments[name]):
+                refuse(name, expected)
+
+    check('scenario', f'one of {", ".join(SCENARIOS)}', lambda value: value in SCENARIOS)
+    check('imu_grade', f'one of {", ".join(PRESETS)} or an ImuNoise with figures above 0',
+          lambda value: all(number(figure) and figure > 0 for figure in value)
+          if isinstance(value, ImuNoise) else value in PRESETS)
+    check('seed', 'an integer, 0 or above',
+          lambda value: isinstance(value, (int, np.integer)) and value >= 0)
+    check('imu_rate gnss_rate', 'a number of Hz above 0 and up to 10000',
+          lambda value: number(value) and 0 < value <= 10000)
+    check('duration', 'a number of seconds above 0',
+          lambda value: value is None or number(value) and value > 0)
+    check('velocity_std position_std position_drift_std outlier_velocity outlier_position '
+          'gyro_scale_std gnss_phase gnss_latency gnss_delay stand_still', 'a number, 0 or above',
+          lambda value: number(value) and value >= 0)
+    check('velocity_std_vertical position_std_vertical gyro_bias_std accel_bias_std',
+          'a number, 0 or above', lambda value: value is None or number(value) and value >= 0)
+    check('position_drift_time', 'a number of seconds above 0',
+          lambda value: number(value) and value > 0)
+    check('imu_jitter', 'a number from 0 to below 0.5',
+          lambda value: number(value) and 0 <= value < 0.5)
+    check('outlier_rate', 'a number from 0 to 1', lambda value: number(value) and 0 <= value <= 1)
+    check('latitude_deg', 'a number of degrees between -89 and 89',
+          lambda value: number(value) and -89 <= value <= 89)
+    check('longitude_deg altitude heading_deg crab_deg', 'a finite number', number)
+    check('lever_arm mount_rpy_deg', 'three finite numbers',
+          lambda value: len(value) == 3 and all(map(number, value)))
+    check('outages', 'pairs of a start and a later end in seconds',
+          lambda value: all(len(pair) == 2 and pair[0] < pair[1] for pair in value))
+    check('velocity_frame', 'enu or ned', lambda value: value in _VELOCITY_FRAMES)
+    check('flip_axis', 'x, y, z or empty', lambda value: value in _AXES)
+    check('accel_sign', '1 or -1', lambda value: value in (1, -1))
+    duration = arguments['duration'] or 0.0
+    if duration * arguments['imu_rate'] > _MAX_SAMPLES:
+        raise SimulationError(f'{duration:g} s at {arguments["imu_rate"]:g} Hz are too many '
+                              f'samples, the limit is {_MAX_SAMPLES}')
+    grade = arguments['imu_grade']
+    return grade if isinstance(grade, ImuNoise) else PRESETS[grade]
+
+
+def write_bag(simulation: Simulation, path: str | os.PathLike, storage: str = 'mcap') -> None:
+    """
+    Write a rosbag2 of what a vehicle would have recorded, with truth on `/reference/imu`.
+
+    Messages are in the order of arrival, the receive time being the arrival. Beside the data the
+    bag's directory gets ``ins_align.yaml``, the parameters that suit the recording; the arguments
+    of the simulation and the drawn biases are in the bag's custom data.
+
+    Parameters
+    ----------
+    simulation : Simulation
+    path : path
+        Directory to be made; written whole or not at all.
+    storage : str
+        One of `STORAGES`.
+
+    Raises
+    ------
+    SimulationError
+        If the path exists or the storage is not known.
+    """
+    path = Path(path)
+    if storage not in STORAGES:
+        raise SimulationError(f'storage must be one of {", ".join(STORAGES)}, got {storage!r}')
+    if path.exists():
+        raise SimulationError(f'{path} exists already: choose another name or remove it')
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f'.{path.name}.', dir=path.parent) as directory:
+        unfinished = Path(directory) / path.name
+        _write_messages(simulation, unfinished, storage)
+        (unfinished / 'ins_align.yaml').write_text(_parameter_file(simulation), 'utf-8')
+        unfinished.rename(path)
+
+
+def _write_messages(simulation: Simulation, path: Path, storage: str) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import get_typestore, Stores
+
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+        writer.set_custom_data('ins_align', json.dumps(
+            {**simulation.meta, 'gyro_bias': simulation.gyro_bias,
+             'accel_bias': simulation.accel_bias}, default=lambda value: value.tolist()))
+        connections = {}
+        for topic, message_type, stamp, message in _ros_messages(simulation, typestore.types):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, message_type,
+                                                           typestore=typestore)
+            writer.write(connections[topic], stamp,
+                         typestore.serialize_cdr(message, message_type))
+
+
+def _ros_messages(simulation: Simulation, types: Any) -> Iterator[tuple[str, str, int, Any]]:
+    """Yield topic, type, time of arrival and message in the order of arrival."""
+    imu_type, fix_type = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
+    velocity_type = 'geometry_msgs/msg/TwistWithCovarianceStamped'
+    make_imu, make_fix, make_velocity = types[imu_type], types[fix_type], types[velocity_type]
+    make_vector = types['geometry_msgs/msg/Vector3']
+    make_quaternion = types['geometry_msgs/msg/Quaternion']
+    make_status = types['sensor_msgs/msg/NavSatStatus']
+    make_twist = types['geometry_msgs/msg/Twist']
+    make_twist_covariance = types['geometry_msgs/msg/TwistWithCovariance']
+
+    def header(stamp: int, frame: str) -> Any:
+        seconds, nanoseconds = divmod(stamp, 1_000_000_000)
+        return types['std_msgs/msg/Header'](
+            types['builtin_interfaces/msg/Time'](seconds, nanoseconds), frame)
+
+    unknown = np.array([-1.0] + 8 * [0.0])
+    exact = np.zeros(9)
+    gyro_covariance = (simulation.gyro_std ** 2 * np.eye(3)).ravel()
+    accel_covariance = (simulation.accel_std ** 2 * np.eye(3)).ravel()
+    truth_covariance = (_TRUTH_STD ** 2 * np.eye(3)).ravel()
+    no_attitude, no_vector = make_quaternion(0.0, 0.0, 0.0, 1.0), make_vector(0.0, 0.0, 0.0)
+    quaternions = quaternion_from_matrix(simulation.truth_C_nb)
+    twist_covariance = np.zeros((6, 6))
+    twist_covariance[:3, :3] = simulation.velocity_covariance
+    velocity_frame = simulation.meta['velocity_frame']
+
+    sample = epoch = 0
+    for kind, payload in simulation.messages():
+        if kind == 'imu':
+            for stamp, gyro, accel in zip(*map(np.ndarray.tolist, payload)):
+                yield '/imu/data_raw', imu_type, stamp, make_imu(
+                    header(stamp, 'imu'), no_attitude, unknown, make_vector(*gyro),
+                    gyro_covariance, make_vector(*accel), accel_covariance)
+                yield '/reference/imu', imu_type, stamp, make_imu(
+                    header(stamp, 'imu'), make_quaternion(*quaternions[sample].tolist()),
+                    truth_covariance, make_vector(*simulation.truth_gyro[sample].tolist()), exact,
+                    make_vector(*simulation.truth_accel[sample].tolist()), exact)
+                sample += 1
+            continue
+        arrival = int(simulation.gnss_arrival_ns[epoch])
+        if kind == 'fix':
+            yield '/fix', fix_type, arrival, make_fix(
+                header(payload.stamp_ns, 'gnss'), make_status(payload.status, 1),
+                payload.latitude_deg, payload.longitude_deg, payload.altitude_m,
+                payload.covariance.ravel(), make_fix.COVARIANCE_TYPE_KNOWN)
+        else:
+            yield '/fix_velocity', velocity_type, arrival, make_velocity(
+                header(payload.stamp_ns, velocity_frame), make_twist_covariance(
+                    make_twist(make_vector(*payload.velocity.tolist()), no_vector),
+                    twist_covariance.ravel()))
+            epoch += 1
+
+
+def _parameter_file(simulation: Simulation) -> str:
+    """Return the node's YAML with what is known of the recording."""
+    meta, noise = simulation.meta, simulation.imu_noise
+    values = {
+        'lever_arm': simulation.lever_arm.tolist(),
+        'gnss_delay': float(meta['gnss_delay']),
+        'velocity_frame': meta['velocity_frame'],
+    }
+    if meta['imu_grade'] in PRESETS:
+        values['imu_grade'] = meta['imu_grade']
+    else:
+        values['imu_grade'] = 'custom'
+        values['angle_random_walk'] = math.degrees(noise.angle_random_walk) * 60
+        values['velocity_random_walk'] = noise.velocity_random_walk * 60
+    if noise != PRESETS.get(meta['imu_grade']):
+        values['gyro_bias_std'] = math.degrees(noise.gyro_bias_std)
+        values['accel_bias_std'] = float(noise.accel_bias_std)
+    return ''.join(['ins_align:\n  ros__parameters:\n',
+                    *(f'    {name}: {value}\n' for name, value in values.items())])
