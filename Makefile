@@ -88,9 +88,9 @@ $(VENV)/requirements $(OLDEST)/requirements:
 	    'Python 3.10 or newer is needed; PYTHON=path names one'; exit 1; }
 	@echo 'Installing $(REQUIREMENTS) into $(@D), once ...'
 	@$(PYTHON) -m venv --clear $(@D)
-	@$(@D)/bin/python -m pip install -q --no-deps -r $(REQUIREMENTS)
+	@$(@D)/bin/python -m pip install -qq --no-deps -r $(REQUIREMENTS)
 	@touch $@
 
 %/ready: %/requirements setup.py setup.cfg
-	@$*/bin/python -m pip install -q --no-deps --no-build-isolation -e .
+	@$*/bin/python -m pip install -qq --no-deps --no-build-isolation -e .
 	@touch $@

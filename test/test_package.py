@@ -1,0 +1,109 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The package as it is installed: complete, consistent, and light where the robot needs it."""
+
+import ast
+import configparser
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+from catkin_pkg.package import parse_package
+from ins_align.config import parameters
+import pytest
+
+ROOT = Path(__file__).parents[1]
+CORE = ('rotation', 'earth', 'preintegration', 'formula', 'estimator', 'aligner', 'config',
+        'messages')
+
+
+def read(name):
+    return (ROOT / name).read_text(encoding='utf-8')
+
+
+@pytest.fixture(scope='module')
+def installed(tmp_path_factory):
+    """Install the modules and the data into an empty directory."""
+    place = tmp_path_factory.mktemp('installed')
+    subprocess.run(
+        [sys.executable, 'setup.py', '-q', 'build', '--build-base', str(place / 'build'),
+         'install_lib', '--install-dir', str(place / 'lib'), '--no-compile',
+         'install_data', '--install-dir', str(place)],
+        cwd=ROOT, check=True, capture_output=True)
+    return place
+
+
+def test_every_module_is_installed(installed):
+    wanted = {path.relative_to(ROOT) for path in (ROOT / 'ins_align').rglob('*.py')}
+    got = {path.relative_to(installed / 'lib') for path in (installed / 'lib').rglob('*.py')}
+    assert got == wanted
+
+
+def test_share_holds_what_ros_looks_for(installed):
+    share = installed / 'share'
+    assert (share / 'ament_index/resource_index/packages/ins_align').is_file()
+    assert (share / 'ins_align/package.xml').read_text() == read('package.xml')
+    for folder, pattern in (('config', '*.yaml'), ('launch', '*.launch.*')):
+        wanted = {path.name for path in (ROOT / folder).glob(pattern)}
+        assert wanted
+        assert {path.name for path in (share / 'ins_align' / folder).iterdir()} == wanted
+
+
+def test_one_version():
+    version = parse_package(ROOT / 'package.xml').version
+    assert f"version='{version}'" in read('setup.py')
+    assert re.search(rf'^{re.escape(version)} \(', read('CHANGELOG.rst'), re.MULTILINE)
+
+
+def test_commands_are_where_ros2_run_looks():
+    config = configparser.ConfigParser(delimiters='=')
+    config.read_string(read('setup.cfg'))
+    assert config['install']['install_scripts'] == '$base/lib/ins_align'
+    assert config['develop']['script_dir'] == '$base/lib/ins_align'
+
+
+@pytest.mark.parametrize('command', ['ins_align', 'ins_align_node'])
+def test_entry_point_exists(command):
+    module, function = re.search(rf"'{command} = ([\w.]+):(\w+)'", read('setup.py')).groups()
+    tree = ast.parse(read(module.replace('.', '/') + '.py'))
+    assert function in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+
+
+def test_core_needs_numpy_and_scipy_only():
+    """A robot without rosbags, matplotlib, python-ins; a laptop without ROS."""
+    imports = '; '.join(f'import ins_align.{name}' for name in CORE)
+    forbidden = ('rclpy', 'rosbags', 'matplotlib', 'pyins', 'pandas', 'numba', 'tqdm',
+                 'sensor_msgs')
+    code = (f'import sys; {imports}; '
+            f'print([name for name in {forbidden!r} if name in sys.modules])')
+    run = subprocess.run([sys.executable, '-c', code], cwd=ROOT, check=True,
+                         capture_output=True, text=True)
+    assert run.stdout.strip() == '[]'
+
+
+def test_readme_lists_every_parameter_with_its_default():
+    rows = dict(re.findall(r'^\| `(\w+)` \| `([^`]+)` \|', read('README.md'), re.MULTILINE))
+    defaults = {}
+    for parameter in parameters():
+        value = list(parameter.default) if isinstance(parameter.default, tuple) \
+            else parameter.default
+        defaults[parameter.name] = str(value).lower() if isinstance(value, bool) else str(value)
+    assert rows == defaults
+
+
+def test_readme_names_no_file_that_is_not_there():
+    links = re.findall(r'\]\((?!https?:|#)([^)#]+)', read('README.md'))
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
