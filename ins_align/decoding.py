@@ -1,0 +1,130 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Serialised ROS messages to arrays, IMU messages many at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+from ins_align.bag_files import Topic
+from ins_align.messages import imu_from_msg, MessageError
+import numpy as np
+
+# sensor_msgs/Imu behind its header: orientation 4 and its covariance 9, angular velocity 3 and 9,
+# linear acceleration 3 and 9, all float64 without gaps in both serialisations.
+_BODY_BYTES = 8 * (4 + 9 + 3 + 9 + 3 + 9)
+_RATE_OFFSET = 8 * (4 + 9)
+_FORCE_OFFSET = _RATE_OFFSET + 8 * (3 + 9)
+_CDR_LITTLE_ENDIAN = b'\x00\x01'  # OMG DDSI-RTPS 2.3, 10.2: encapsulation of plain CDR
+_FRAME_LENGTH = slice(12, 16)  # of the frame_id, in both serialisations
+
+
+class ImuSamples(NamedTuple):
+    """IMU samples in the order of their messages."""
+
+    stamps_ns: np.ndarray  # (N,) int64
+    gyro: np.ndarray  # (N, 3), rad/s
+    accel: np.ndarray  # (N, 3), m/s^2
+
+
+@lru_cache(maxsize=None)
+def _typestore(encoding: str) -> Any:
+    from rosbags.typesys import get_typestore, Stores
+    return get_typestore(Stores.ROS1_NOETIC if encoding == 'ros1' else Stores.ROS2_JAZZY)
+
+
+def deserialize(data: bytes, topic: Topic) -> Any:
+    """
+    Deserialise one message with the rosbags library.
+
+    Raises
+    ------
+    MessageError
+        If the bytes are no message of the topic's type.
+    """
+    store = _typestore(topic.encoding)
+    try:
+        if topic.encoding == 'ros1':
+            return store.deserialize_ros1(data, topic.msgtype)
+        return store.deserialize_cdr(data, topic.msgtype)
+    except Exception:  # generated code: damaged bytes end in whatever they run into
+        raise MessageError(f'a message of {len(data)} bytes on {topic.name} is no '
+                           f'{topic.msgtype}') from None
+
+
+def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
+    """
+    Decode serialised sensor_msgs/Imu; messages that cannot be decoded are left out.
+
+    Messages of one layout are taken from their bytes all at once; the rosbags library decodes
+    those that differ from the layout that this module knows.
+    """
+    count = len(messages)
+    samples = ImuSamples(np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros((count, 3)))
+    decoded = np.ones(count, bool)
+    layouts: dict[tuple, list[int]] = {}
+    for index, message in enumerate(messages):
+        layouts.setdefault((len(message), message[:2], message[_FRAME_LENGTH]), []).append(index)
+    for indices in layouts.values():
+        start = body_start(messages[indices[0]], topic.encoding)
+        if start is not None:
+            part = _decode_alike([messages[index] for index in indices], start, topic.encoding)
+            for whole, values in zip(samples, part):
+                whole[indices] = values
+            continue
+        for index in indices:
+            try:
+                sample = imu_from_msg(deserialize(messages[index], topic))
+                for whole, value in zip(samples, sample):
+                    whole[index] = value
+            except (MessageError, OverflowError):
+                decoded[index] = False
+    if decoded.all():
+        return samples
+    return ImuSamples(*(whole[decoded] for whole in samples))
+
+
+def body_start(message: bytes, encoding: str) -> int | None:
+    """
+    Return where the numbers of a sensor_msgs/Imu start, behind its header.
+
+    None: this is not the known layout, by its encapsulation or because header and numbers do not
+    add up to its length.
+    """
+    if len(message) < 16:
+        return None
+    frame_length = int.from_bytes(message[_FRAME_LENGTH], 'little')
+    start = 16 + frame_length
+    if encoding == 'cdr':
+        if message[:2] != _CDR_LITTLE_ENDIAN:
+            return None
+        start += -(start - 4) % 8  # float64 is aligned from behind the encapsulation
+    return start if len(message) == start + _BODY_BYTES else None
+
+
+def _decode_alike(messages: Sequence[bytes], start: int, encoding: str) -> ImuSamples:
+    """Decode messages of one length whose numbers start at one place."""
+    raw = np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), -1)
+
+    def column(offset: int, size: int, kind: str) -> np.ndarray:
+        return np.ascontiguousarray(raw[:, offset:offset + size]).view(kind)
+
+    # Both begin with four other bytes: the encapsulation, or the sequence number of ROS 1.
+    seconds = column(4, 4, '<u4' if encoding == 'ros1' else '<i4')[:, 0].astype(np.int64)
+    nanoseconds = column(8, 4, '<u4')[:, 0]
+    return ImuSamples(seconds * 1_000_000_000 + nanoseconds,
+                      column(start + _RATE_OFFSET, 24, '<f8'),
+                      column(start + _FORCE_OFFSET, 24, '<f8'))
