@@ -22,6 +22,7 @@ interpolation. All samples of an interval, and all intervals of a batch, are han
 from dataclasses import dataclass, fields
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ins_align.rotation import (Array, cross, cumulative_rotations, exp_so3, left_jacobian, skew)
 
@@ -43,10 +44,8 @@ class Intervals:
         Derivatives to the gyro bias (g) and accelerometer bias (a): of the rotation as a left
         error (``R <- exp_so3(J_Rg d) R``), of v, of p. That of v to the accelerometer bias is the
         same integral as J_Rg.
-    gyro_moments : ndarray, shape (K, 9, 9)
-        Covariance of the errors (rotation, v, p) for unit angle random walk, rad/sqrt(s).
-    accel_moments : ndarray, shape (K, 9, 9)
-        The same for unit velocity random walk, m/s/sqrt(s).
+    Q : ndarray, shape (K, 9, 9)
+        Covariance of the errors (rotation at the start, v, p) that the sensors' noise leaves.
     omega, f : ndarray, shape (K, 3)
         Angular rate and specific force at the end of the interval.
     """
@@ -59,16 +58,14 @@ class Intervals:
     J_vg: Array
     J_pg: Array
     J_pa: Array
-    gyro_moments: Array
-    accel_moments: Array
+    Q: Array
     omega: Array
     f: Array
 
     @staticmethod
     def empty(capacity: int) -> 'Intervals':
         """Room for `capacity` intervals, to be filled by `put`."""
-        shapes = {'duration': (), 'v': (3,), 'p': (3,), 'omega': (3,), 'f': (3,),
-                  'gyro_moments': (9, 9), 'accel_moments': (9, 9)}
+        shapes = {'duration': (), 'v': (3,), 'p': (3,), 'omega': (3,), 'f': (3,), 'Q': (9, 9)}
         return Intervals(**{field.name: np.zeros((capacity,) + shapes.get(field.name, (3, 3)))
                             for field in fields(Intervals)})
 
@@ -98,10 +95,33 @@ class Intervals:
             'omega': self.omega - gyro_bias, 'f': self.f - accel_bias})
 
 
-def split_at_epochs(stamps: Array, gyro: Array, accel: Array,
-                    epochs: Array) -> tuple[Array, Array, Array]:
+@dataclass(frozen=True)
+class Steps:
+    """
+    IMU samples cut into K intervals of n steps, and their derivatives to time.
+
+    Attributes
+    ----------
+    dt : ndarray, shape (K, n)
+        Seconds; shorter intervals are padded with steps of zero length.
+    omega, f : ndarray, shape (K, n + 1, 3)
+        Angular rate, rad/s, and specific force, m/s^2, at the ends of the steps.
+    omega_dot, f_dot : ndarray, shape (K, n + 1, 3)
+    """
+
+    dt: Array
+    omega: Array
+    f: Array
+    omega_dot: Array
+    f_dot: Array
+
+
+def split_at_epochs(stamps: Array, gyro: Array, accel: Array, epochs: Array) -> Steps:
     """
     Cut a run of samples into the intervals between epochs.
+
+    Values at an epoch are interpolated with the cubic of the neighbouring samples and their
+    central differences.
 
     Parameters
     ----------
@@ -113,41 +133,48 @@ def split_at_epochs(stamps: Array, gyro: Array, accel: Array,
 
     Returns
     -------
-    dt : ndarray, shape (K, n)
-        Steps of each interval; shorter intervals are padded with steps of zero length.
-    gyro, accel : ndarray, shape (K, n + 1, 3)
-        Values at the ends of the steps.
+    Steps
     """
     # Sample numbers inside each open interval (start, end).
     first = np.searchsorted(stamps, epochs[:-1], side='right')
     last = np.searchsorted(stamps, epochs[1:], side='left')
     width = int(np.max(last - first)) + 2
-    inner = first[:, None] + np.arange(-1, width - 1)
-    inner = np.minimum(inner, last[:, None])
-    knots = stamps[np.clip(inner, 0, stamps.size - 1)]
-    np.clip(knots, epochs[:-1, None], epochs[1:, None], out=knots)
+    inner = np.minimum(first[:, None] + np.arange(-1, width - 1), last[:, None])
+    knots = np.clip(stamps[np.clip(inner, 0, stamps.size - 1)],
+                    epochs[:-1, None], epochs[1:, None])
     knots[:, -1] = epochs[1:]
-    # Linear interpolation to the knots; a knot that is a sample gets weight 0 or 1.
+
+    samples = np.hstack([gyro, accel])
+    slopes = np.gradient(samples, stamps, axis=0)
     right = np.clip(np.searchsorted(stamps, knots, side='left'), 1, stamps.size - 1)
     left = right - 1
-    weight = ((knots - stamps[left]) / (stamps[right] - stamps[left]))[..., None]
-    return (np.diff(knots, axis=1), gyro[left] * (1 - weight) + gyro[right] * weight,
-            accel[left] * (1 - weight) + accel[right] * weight)
+    h = (stamps[right] - stamps[left])[..., None]
+    t = (knots - stamps[left])[..., None] / h
+    rise = samples[right] - samples[left]
+    bend0, bend1 = h * slopes[left] - rise, rise - h * slopes[right]
+    value = samples[left] + t * rise + t * (1 - t) * ((1 - t) * bend0 + t * bend1)
+    slope = (rise + (1 - 2 * t) * ((1 - t) * bend0 + t * bend1)
+             + t * (1 - t) * (bend1 - bend0)) / h
+    return Steps(np.diff(knots, axis=1), value[..., :3], value[..., 3:],
+                 slope[..., :3], slope[..., 3:])
 
 
-def preintegrate(dt: Array, omega: Array, f: Array) -> Intervals:
+def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array,
+                 angle_random_walk: ArrayLike, velocity_random_walk: ArrayLike) -> Intervals:
     """
     Integrate the steps of K intervals.
 
-    Within a step rate and force are linear in time, which gives the second-order coning and
-    sculling terms of [1]_ and [2]_ in the form that neighbouring samples allow.
+    Angle and velocity increments come from the cubic through both ends of a step (trapezoid with
+    end correction, whose noise telescopes); coning and sculling terms are of second order [1]_,
+    [2]_, in the form that rates at instants allow.
 
     Parameters
     ----------
-    dt : ndarray, shape (K, n)
-        Seconds; zero for padding.
-    omega, f : ndarray, shape (K, n + 1, 3)
-        Bias-corrected rate, rad/s, and specific force, m/s^2, at the ends of the steps.
+    steps : Steps
+    gyro_bias, accel_bias : ndarray, shape (3,)
+        Subtracted first.
+    angle_random_walk, velocity_random_walk : array_like, shape () or (K, n)
+        White noise of the sensors, rad/sqrt(s) and m/s/sqrt(s), in each step.
 
     Returns
     -------
@@ -159,13 +186,16 @@ def preintegrate(dt: Array, omega: Array, f: Array) -> Intervals:
        attitude algorithms", J. Guidance, Control, and Dynamics 21(1), 1998.
     .. [2] P. G. Savage, part 2: velocity and position algorithms, 21(2), 1998.
     """
+    dt = steps.dt
+    omega, f = steps.omega - gyro_bias, steps.f - accel_bias
     omega0, omega1 = omega[:, :-1], omega[:, 1:]
     f0, f1 = f[:, :-1], f[:, 1:]
     h = dt[..., None]
-    theta = 0.5 * h * (omega0 + omega1)
-    force = 0.5 * h * (f0 + f1)
-    coning = h * h / 12 * cross(omega0, omega1)
-    sculling = h * h / 12 * (cross(omega0, f1) + cross(f0, omega1))
+    h2_12 = h * h / 12
+    theta = h / 2 * (omega0 + omega1) - h2_12 * np.diff(steps.omega_dot, axis=1)
+    force = h / 2 * (f0 + f1) - h2_12 * np.diff(steps.f_dot, axis=1)
+    coning = h2_12 * cross(omega0, omega1)
+    sculling = h2_12 * (cross(omega0, f1) + cross(f0, omega1))
     jacobian = left_jacobian(theta)
     step_v = (jacobian @ force[..., None])[..., 0] + sculling
     step_p = h * h / 6 * (2 * f0 + f1) + h ** 3 / 6 * cross(omega0, 0.5 * (f0 + f1))
@@ -177,54 +207,52 @@ def preintegrate(dt: Array, omega: Array, f: Array) -> Intervals:
     u = (A @ step_v[..., None])[..., 0]
     v_end = np.cumsum(u, axis=1)
     v_start = v_end - u
+    v_mid = 0.5 * (v_start + v_end)
     p_step = h * v_start + (A @ step_p[..., None])[..., 0]
     p_end = np.cumsum(p_step, axis=1)
 
-    # Derivatives: the bias turns the rest of the interval by -integral of A.
-    A_step = A @ jacobian * dt[..., None, None]
-    A_sum = np.cumsum(A_step, axis=1)
-    turn_mid = A_sum - 0.5 * A_step
-    v_g_step = skew(u) @ turn_mid
-    v_g = np.cumsum(v_g_step, axis=1)
+    # Derivatives: a gyro bias turns the rest of the interval by minus the integral of A.
     hh = dt[..., None, None]
+    A_step = A @ jacobian * hh
+    A_sum = np.cumsum(A_step, axis=1)
+    A_mid = A_sum - 0.5 * A_step
+    v_g_step = skew(u) @ A_mid
+    v_g = np.cumsum(v_g_step, axis=1)
     p_g = np.sum(hh * (v_g - 0.5 * v_g_step), axis=1)
-    p_a = np.sum(hh * turn_mid, axis=1)
+    p_a = np.sum(hh * A_mid, axis=1)
 
     duration = np.sum(dt, axis=1)
     v, p = v_end[:, -1], p_end[:, -1]
     remaining = duration[:, None] - np.cumsum(dt, axis=1) + 0.5 * dt
-    v_rest = v[:, None] - 0.5 * (v_start + v_end)
-    v_mid = 0.5 * (v_start + v_end)
-    p_mid = p_end - 0.5 * p_step
-    p_rest = p[:, None] - p_mid - v_mid * remaining[..., None]
-    gyro_moments, accel_moments = _noise_moments(dt, remaining, v_rest, p_rest)
-    return Intervals(duration, turned[:, -1], v, p, -A_sum[:, -1], v_g[:, -1], p_g, -p_a,
-                     gyro_moments, accel_moments, omega[:, -1], f[:, -1])
+    v_rest = v[:, None] - v_mid
+    p_rest = p[:, None] - (p_end - 0.5 * p_step) - v_mid * remaining[..., None]
+    Q = _noise(dt * np.square(angle_random_walk), dt * np.square(velocity_random_walk),
+               dt, remaining, v_rest, p_rest)
+    return Intervals(duration, turned[:, -1], v, p, -A_sum[:, -1], v_g[:, -1], p_g, -p_a, Q,
+                     omega[:, -1], f[:, -1])
 
 
-def _noise_moments(dt: Array, remaining: Array, v_rest: Array,
-                   p_rest: Array) -> tuple[Array, Array]:
+def _noise(gyro_variance: Array, accel_variance: Array, dt: Array, remaining: Array,
+           v_rest: Array, p_rest: Array) -> Array:
     """
-    Covariance of the errors (rotation, v, p) for unit white noise in each sensor.
+    Covariance of the errors (rotation, v, p) at the end, shape (K, 9, 9).
 
-    Isotropic noise stays isotropic under the rotation of the body, so that only the velocity and
-    distance still to come after each step (v_rest, p_rest) matter.
+    Isotropic noise stays isotropic under the rotation of the body, so that only the time, velocity
+    and distance still to come after each step (remaining, v_rest, p_rest) matter. The variances
+    are those of each step's angle and velocity increment, shape (K, n).
     """
-    count = dt.shape[0]
     eye = np.eye(3)
-    # Steps as columns: the rotation error of a step, seen in rotation, v and p at the end.
-    lever = np.zeros((count, dt.shape[1], 9, 3))
-    lever[:, :, :3] = eye
-    lever[:, :, 3:6] = -skew(v_rest)
-    lever[:, :, 6:] = -skew(p_rest)
-    lever *= np.sqrt(dt)[..., None, None]
-    columns = lever.transpose(0, 2, 1, 3).reshape(count, 9, -1)
-    gyro = columns @ columns.transpose(0, 2, 1)
-    accel = np.zeros((count, 9, 9))
-    for row, col, power in ((3, 3, 0), (3, 6, 1), (6, 3, 1), (6, 6, 2)):
-        # The variance of a step's own mid-point rule, dt^3 / 12, keeps a single step regular.
-        moment = np.sum(dt * remaining ** power, axis=1)
-        if power == 2:
-            moment = moment + np.sum(dt ** 3, axis=1) / 12
-        accel[:, row:row + 3, col:col + 3] = moment[:, None, None] * eye
-    return gyro, accel
+    lever = np.zeros(dt.shape + (9, 3))           # error at the end per error of a step's angle
+    lever[..., :3, :] = eye
+    lever[..., 3:6, :] = -skew(v_rest)
+    lever[..., 6:, :] = -skew(p_rest)
+    lever *= np.sqrt(gyro_variance)[..., None, None]
+    columns = lever.transpose(0, 2, 1, 3).reshape(dt.shape[0], 9, -1)
+    Q = columns @ columns.transpose(0, 2, 1)
+    for rows, columns, weight in ((slice(3, 6), slice(3, 6), 1.0),
+                                  (slice(3, 6), slice(6, 9), remaining),
+                                  (slice(6, 9), slice(3, 6), remaining),
+                                  # dt^2 / 12 is the variance within the step itself
+                                  (slice(6, 9), slice(6, 9), remaining ** 2 + dt ** 2 / 12)):
+        Q[:, rows, columns] += np.sum(accel_variance * weight, axis=1)[:, None, None] * eye
+    return Q
