@@ -363,9 +363,9 @@ def _checked_arguments(arguments: dict[str, Any]) -> ImuNoise:
     check('scenario', f'one of {", ".join(SCENARIOS)}', lambda value: value in SCENARIOS)
     check('imu_grade', f'one of {", ".join(PRESETS)} or an ImuNoise with figures above 0',
           lambda value: all(number(figure) and figure > 0 for figure in value)
-          if isinstance(value, ImuNoise) else value in PRESETS)
+          if isinstance(value, ImuNoise) else value in tuple(PRESETS))
     check('seed', 'an integer, 0 or above',
-          lambda value: isinstance(value, (int, np.integer)) and value >= 0)
+          lambda value: number(value) and value == int(value) and value >= 0)
     check('imu_rate gnss_rate', 'a number of Hz above 0 and up to 10000',
           lambda value: number(value) and 0 < value <= 10000)
     check('duration', 'a number of seconds above 0',
@@ -384,11 +384,11 @@ def _checked_arguments(arguments: dict[str, Any]) -> ImuNoise:
           lambda value: number(value) and -89 <= value <= 89)
     check('longitude_deg altitude heading_deg crab_deg', 'a finite number', number)
     check('lever_arm mount_rpy_deg', 'three finite numbers',
-          lambda value: len(value) == 3 and all(map(number, value)))
+          lambda value: np.shape(value) == (3,) and all(map(number, value)))
     check('outages', 'pairs of a start and a later end in seconds',
-          lambda value: all(len(pair) == 2 and pair[0] < pair[1] for pair in value))
+          lambda value: all(np.shape(pair) == (2,) and pair[0] < pair[1] for pair in value))
     check('velocity_frame', 'enu or ned', lambda value: value in _VELOCITY_FRAMES)
-    check('flip_axis', 'x, y, z or empty', lambda value: value in _AXES)
+    check('flip_axis', 'x, y, z or empty', lambda value: value in tuple(_AXES))
     check('accel_sign', '1 or -1', lambda value: value in (1, -1))
     duration = arguments['duration'] or 0.0
     if duration * arguments['imu_rate'] > _MAX_SAMPLES:

@@ -128,7 +128,8 @@ def trajectory_of(scenario: str, duration: float, imu_rate: float, imu_jitter: f
     time = stamps * 1e-9
     velocity, rpy = motion(time)
     roll, pitch, yaw = np.degrees(rpy).T
-    start = displaced(np.array([[latitude_deg, longitude_deg, altitude]]), velocity[:1] * time[0])
+    before = velocity[:_PADDING + 1].mean(axis=0, keepdims=True) * time[0]
+    start = displaced(np.array([[latitude_deg, longitude_deg, altitude]]), before)
     truth, imu = generate_imu(time, start[0], np.stack([roll, -pitch, 90 - yaw], axis=-1),
                               velocity @ ENU_FROM_NED, 'rate')
     lla = truth[['lat', 'lon', 'alt']].to_numpy()
