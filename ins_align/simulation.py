@@ -87,7 +87,7 @@ class Simulation:
 
     def attitude_at(self, stamps_ns: int | np.ndarray) -> Array:
         """
-        True ``C_nb`` at any stamps, exact between the samples.
+        Return the true ``C_nb`` at any stamps, exact between the samples.
 
         Parameters
         ----------
@@ -255,7 +255,7 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
     SimulationError
         If an argument makes no sense.
     """
-    meta = {name: value for name, value in locals().items()}
+    meta = dict(locals())
     noise = _checked_arguments(meta)
     if gyro_bias_std is not None:
         noise = noise._replace(gyro_bias_std=gyro_bias_std)
@@ -264,9 +264,10 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
     if duration is None:
         duration = scenarios.SCENARIOS[scenario].duration + stand_still
         meta['duration'] = duration
-    trajectory = trajectory_of(scenario, float(duration), float(imu_rate), float(imu_jitter),
-                             float(latitude_deg), float(longitude_deg), float(altitude),
-                             float(heading_deg), float(crab_deg), float(stand_still))
+    trajectory = trajectory_of(
+        scenario, float(duration), float(imu_rate), float(imu_jitter), float(latitude_deg),
+        float(longitude_deg), float(altitude), float(heading_deg), float(crab_deg),
+        float(stand_still))
     streams = [np.random.default_rng(child)
                for child in np.random.SeedSequence(int(seed)).spawn(5)]
     scale = 0.0 if ideal else 1.0

@@ -87,15 +87,15 @@ class Trajectory(NamedTuple):
         lla = self.lla_spline(time)
         C_nb = matrix_from_rpy(rpy) @ C_vb
         # Five-point difference of the attitude about each instant.
-        near, far = (log_so3(np.swapaxes(self._attitude(time - step), 1, 2)
-                             @ self._attitude(time + step)) / (2 * step)
-                     for step in (_RATE_STEP, 2 * _RATE_STEP))
+        near, far = (log_so3(
+            np.swapaxes(self._attitude(time - step), 1, 2) @ self._attitude(time + step))
+            / (2 * step) for step in (_RATE_STEP, 2 * _RATE_STEP))
         omega_nb_b = (4 * near - far) / 3 @ C_vb
         latitude = np.radians(lla[:, 0])
         meridian, normal = _radii(latitude)
-        omega_en_n = np.stack([-velocity[:, 1] / (meridian + lla[:, 2]),
-                               velocity[:, 0] / (normal + lla[:, 2]),
-                               velocity[:, 0] / (normal + lla[:, 2]) * np.tan(latitude)], axis=-1)
+        turn = velocity[:, 0] / (normal + lla[:, 2])
+        omega_en_n = np.stack([-velocity[:, 1] / (meridian + lla[:, 2]), turn,
+                               turn * np.tan(latitude)], axis=-1)
         omega_eb_b = omega_nb_b + np.einsum('nji,nj->ni', C_nb, omega_en_n)
         lever_n = C_nb @ lever_arm
         velocity = velocity + np.einsum('nij,nj->ni', C_nb, cross(omega_eb_b, lever_arm))
