@@ -20,10 +20,12 @@ FLU, axes ENU, angles radians, yaw counter-clockwise from east.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ins_align.rotation import Array, matrix_from_rpy
 import numpy as np
+
+_Rows = Sequence[tuple[float, float, float]]
 
 _GRAVITY = 9.81     # m/s^2, for banking only
 _LEAD_IN = 1000.0   # s of motion before t = 0 that a profile can be asked for
@@ -104,7 +106,7 @@ def _step_integral(time: Array, start: float, width: float) -> Array:
     return width * x ** 4 * (2.5 - 3 * x + x ** 2) + np.maximum(time - start - width, 0.0)
 
 
-def _profile(durations: Sequence[float], values: Sequence[float], width: float):
+def _profile(durations: Sequence[float], values: Sequence[float], width: float) -> Any:
     """
     Piecewise constant with a smooth step of `width` at the start of every piece.
 
@@ -117,7 +119,6 @@ def _profile(durations: Sequence[float], values: Sequence[float], width: float):
 
     ends = np.cumsum(durations)
     starts = np.concatenate([[0.0], ends[:-1]])
-    values = np.asarray(values, dtype=float)
     steps = np.diff(values, prepend=0.0)
     breaks = np.concatenate([[-_LEAD_IN], np.column_stack([starts, starts + width]).ravel(),
                              [ends[-1] + _LEAD_IN]])
@@ -126,12 +127,12 @@ def _profile(durations: Sequence[float], values: Sequence[float], width: float):
     coefficients[0, smooth] = 6 * steps / width ** 5
     coefficients[1, smooth] = -15 * steps / width ** 4
     coefficients[2, smooth] = 10 * steps / width ** 3
-    coefficients[5, smooth] = values - steps
+    coefficients[5, smooth] = np.subtract(values, steps)
     coefficients[5, 2::2] = values
     return PPoly(coefficients, breaks)
 
 
-def _course(first: Sequence, block: Sequence, duration: float, width: float) -> tuple:
+def _course(first: _Rows, block: _Rows, duration: float, width: float) -> tuple[Any, Any]:
     """Acceleration and turn rate of `first` and then `block` again and again."""
     rows = list(first)
     length = sum(row[0] for row in first)
@@ -169,7 +170,7 @@ def _flight(duration: float) -> Callable[[Array], Motion]:
     return motion
 
 
-def _road(first: Sequence, duration: float) -> Callable[[Array], Motion]:
+def _road(first: _Rows, duration: float) -> Callable[[Array], Motion]:
     acceleration, rate = _course(first, _CITY, duration, 0.8)
     speed_along, heading = acceleration.antiderivative(), rate.antiderivative()
     distance = speed_along.antiderivative()

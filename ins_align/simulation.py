@@ -20,7 +20,7 @@ rate, latency, outages and outliers, and the whole becomes a recording.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import json
 import math
@@ -33,21 +33,14 @@ from ins_align import scenarios
 from ins_align.config import ImuNoise, PRESETS
 from ins_align.messages import ENU_FROM_NED, Fix, Velocity
 from ins_align.rotation import Array, matrix_from_rpy, quaternion_from_matrix
+from ins_align.simulation_arguments import checked_arguments, IMU_AXES, SimulationError
 from ins_align.trajectory import displaced, START_NS, Trajectory, trajectory_of, wrapped
 import numpy as np
 
 SCENARIOS = tuple(scenarios.SCENARIOS)
 STORAGES = ('mcap', 'sqlite3')
 
-_MAX_SAMPLES = 20_000_000
 _TRUTH_STD = 1e-6  # rad, stated on the reference topic: zero would mean unknown
-_VELOCITY_FRAMES = ('enu', 'ned')
-_AXES = {'': (1.0, 1.0, 1.0), 'x': (-1.0, 1.0, 1.0), 'y': (1.0, -1.0, 1.0),
-         'z': (1.0, 1.0, -1.0)}
-
-
-class SimulationError(ValueError):
-    """A simulation cannot be made as asked; the text says why."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +123,8 @@ class Simulation:
 
     def fix(self, k: int) -> Fix:
         """Return the position of GNSS epoch k as a message."""
-        return Fix(int(self.gnss_stamps_ns[k]), *map(float, self.lla_deg[k]),
+        latitude, longitude, altitude = self.lla_deg[k].tolist()
+        return Fix(int(self.gnss_stamps_ns[k]), latitude, longitude, altitude,
                    self.position_covariance, 0)
 
     def velocity_measurement(self, k: int) -> Velocity:
@@ -139,7 +133,7 @@ class Simulation:
 
 
 def feed(aligner: Any, simulation: Simulation, *, fix: bool = True,
-         velocity: bool = True) -> list:
+         velocity: bool = True) -> list[Any]:
     """
     Give a whole recording to an aligner in the order of arrival.
 
@@ -256,7 +250,7 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
         If an argument makes no sense.
     """
     meta = dict(locals())
-    noise = _checked_arguments(meta)
+    noise = checked_arguments(meta)
     if gyro_bias_std is not None:
         noise = noise._replace(gyro_bias_std=gyro_bias_std)
     if accel_bias_std is not None:
@@ -272,7 +266,7 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
                for child in np.random.SeedSequence(int(seed)).spawn(5)]
     scale = 0.0 if ideal else 1.0
     C_vb = matrix_from_rpy(np.radians(mount_rpy_deg))
-    lever_arm = np.array(lever_arm, dtype=float)
+    lever_b = np.array(lever_arm, dtype=float)
 
     truth_gyro, truth_accel = trajectory.gyro @ C_vb, trajectory.accel @ C_vb
     gyro_bias = scale * noise.gyro_bias_std * streams[0].standard_normal(3)
@@ -280,7 +274,7 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
     gyro_scale = 1 + scale * gyro_scale_std * streams[0].standard_normal(3)
     gyro_std = scale * noise.angle_random_walk * math.sqrt(imu_rate)
     accel_std = scale * noise.velocity_random_walk * math.sqrt(imu_rate)
-    sign = np.array(_AXES[flip_axis])
+    sign = np.array(IMU_AXES[flip_axis])
     shape = truth_gyro.shape
     gyro = sign * (truth_gyro * gyro_scale + gyro_bias
                    + gyro_std * streams[1].standard_normal(shape))
@@ -288,7 +282,7 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
                                  + accel_std * streams[2].standard_normal(shape))
 
     stamps, time = _gnss_epochs(duration, gnss_rate, gnss_phase, gnss_delay, outages)
-    lla, velocity = trajectory.antenna(time, C_vb, lever_arm)
+    lla, velocity = trajectory.antenna(time, C_vb, lever_b)
     velocity_sigma = _per_axis(velocity_std, velocity_std_vertical, 1.0)
     position_sigma = _per_axis(position_std, position_std_vertical, 2.0)
     outlier = streams[4].random(len(time)) < outlier_rate
@@ -317,7 +311,7 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
         truth_stamps_ns=trajectory.stamps_ns, truth_C_nb=trajectory.C_nv @ C_vb,
         truth_velocity=trajectory.velocity, truth_lla=trajectory.lla,
         truth_gyro=truth_gyro, truth_accel=truth_accel, gyro_bias=gyro_bias,
-        accel_bias=accel_bias, lever_arm=lever_arm, imu_noise=noise, gyro_std=gyro_std,
+        accel_bias=accel_bias, lever_arm=lever_b, imu_noise=noise, gyro_std=gyro_std,
         accel_std=accel_std, meta=meta, _trajectory=trajectory, _C_vb=C_vb)
 
 
@@ -345,58 +339,6 @@ def _gauss_markov(time: Array, std: float, correlation_time: float,
     for k in range(1, len(drive)):
         drive[k] += decay[k] * drive[k - 1]
     return drive
-
-
-def _checked_arguments(arguments: dict[str, Any]) -> ImuNoise:
-    """Raise SimulationError for an argument without sense; return the IMU's noise."""
-    def refuse(name: str, expected: str) -> None:
-        raise SimulationError(f'{name} must be {expected}, got {arguments[name]!r}')
-
-    def number(value: Any) -> bool:
-        return isinstance(value, (int, float, np.number)) and not isinstance(value, bool) \
-            and math.isfinite(value)
-
-    def check(names: str, expected: str, fits: Callable[[Any], bool]) -> None:
-        for name in names.split():
-            if not fits(arguments[name]):
-                refuse(name, expected)
-
-    check('scenario', f'one of {", ".join(SCENARIOS)}', lambda value: value in SCENARIOS)
-    check('imu_grade', f'one of {", ".join(PRESETS)} or an ImuNoise with figures above 0',
-          lambda value: all(number(figure) and figure > 0 for figure in value)
-          if isinstance(value, ImuNoise) else value in tuple(PRESETS))
-    check('seed', 'an integer, 0 or above',
-          lambda value: number(value) and value == int(value) and value >= 0)
-    check('imu_rate gnss_rate', 'a number of Hz above 0 and up to 10000',
-          lambda value: number(value) and 0 < value <= 10000)
-    check('duration', 'a number of seconds above 0',
-          lambda value: value is None or number(value) and value > 0)
-    check('velocity_std position_std position_drift_std outlier_velocity outlier_position '
-          'gyro_scale_std gnss_phase gnss_latency gnss_delay stand_still', 'a number, 0 or above',
-          lambda value: number(value) and value >= 0)
-    check('velocity_std_vertical position_std_vertical gyro_bias_std accel_bias_std',
-          'a number, 0 or above', lambda value: value is None or number(value) and value >= 0)
-    check('position_drift_time', 'a number of seconds above 0',
-          lambda value: number(value) and value > 0)
-    check('imu_jitter', 'a number from 0 to below 0.5',
-          lambda value: number(value) and 0 <= value < 0.5)
-    check('outlier_rate', 'a number from 0 to 1', lambda value: number(value) and 0 <= value <= 1)
-    check('latitude_deg', 'a number of degrees between -89 and 89',
-          lambda value: number(value) and -89 <= value <= 89)
-    check('longitude_deg altitude heading_deg crab_deg', 'a finite number', number)
-    check('lever_arm mount_rpy_deg', 'three finite numbers',
-          lambda value: np.shape(value) == (3,) and all(map(number, value)))
-    check('outages', 'pairs of a start and a later end in seconds',
-          lambda value: all(np.shape(pair) == (2,) and pair[0] < pair[1] for pair in value))
-    check('velocity_frame', 'enu or ned', lambda value: value in _VELOCITY_FRAMES)
-    check('flip_axis', 'x, y, z or empty', lambda value: value in tuple(_AXES))
-    check('accel_sign', '1 or -1', lambda value: value in (1, -1))
-    duration = arguments['duration'] or 0.0
-    if duration * arguments['imu_rate'] > _MAX_SAMPLES:
-        raise SimulationError(f'{duration:g} s at {arguments["imu_rate"]:g} Hz are too many '
-                              f'samples, the limit is {_MAX_SAMPLES}')
-    grade = arguments['imu_grade']
-    return grade if isinstance(grade, ImuNoise) else PRESETS[grade]
 
 
 def write_bag(simulation: Simulation, path: str | os.PathLike, storage: str = 'mcap') -> None:

@@ -110,9 +110,10 @@ class Trajectory(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def trajectory_of(scenario: str, duration: float, imu_rate: float, imu_jitter: float,
-                latitude_deg: float, longitude_deg: float, altitude: float,
-                heading_deg: float, crab_deg: float, stand_still: float) -> Trajectory:
+def trajectory_of(
+        scenario: str, duration: float, imu_rate: float, imu_jitter: float, latitude_deg: float,
+        longitude_deg: float, altitude: float, heading_deg: float, crab_deg: float,
+        stand_still: float) -> Trajectory:
     """Make the trajectory of `simulate`'s arguments; the last few are kept, read-only."""
     from pyins.sim import generate_imu
     from pyins.transform import mat_from_rph
