@@ -52,6 +52,7 @@ def angle_deg(C_1, C_2):
     ('flight', {'imu_jitter': 0.3}),
     ('car', {'stand_still': 5.0, 'crab_deg': 8.0}),
 ])
+@pytest.mark.filterwarnings('ignore:The copy keyword')  # of pandas, in python-ins
 def test_strapdown_integration_ends_at_the_truth(scenario, options):
     import pandas as pd
     from pyins import strapdown, transform, util
