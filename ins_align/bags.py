@@ -24,9 +24,10 @@ import shutil
 import tempfile
 from typing import Any, NamedTuple
 
+from ins_align import mcap_file, rosbag1_file, sqlite_file
 from ins_align.bag_files import (
-    BagError, ChunkedFile, decompress, decompressor, INT64_MAX, MAX_MESSAGE_BYTES, open_bag_file,
-    PIECE_BYTES, SqliteFile, Topic, ZSTD_MAGIC)
+    BagError, ChunkedFile, decompress, decompressor, INT64_MAX, MAX_MESSAGE_BYTES, PIECE_BYTES,
+    Topic, ZSTD_MAGIC)
 from ins_align.config import Config
 from ins_align.decoding import deserialize
 from ins_align.messages import MessageError, velocity_from_msg
@@ -131,13 +132,13 @@ class Bag:
                     data = decompress(data, 'zstd', MAX_MESSAGE_BYTES)
                 yield topic, time_ns, data
 
-    def _open_files(self, stack: ExitStack) -> list[ChunkedFile | SqliteFile]:
+    def _open_files(self, stack: ExitStack) -> list[ChunkedFile | sqlite_file.SqliteFile]:
         """Open those files that can be; an error only if there is none."""
         files = []
         errors = []
         for path in self._storage_files():
             try:
-                files.append(open_bag_file(_unpacked(path, stack, self._warnings)))
+                files.append(_open_file(_unpacked(path, stack, self._warnings)))
                 stack.callback(files[-1].close)
             except BagError as error:
                 errors.append(error)
@@ -298,3 +299,18 @@ def _unpacked(path: Path, stack: ExitStack, warnings: list[str]) -> Path:
                                    'which no recording of its size does')
                 output.write(piece)
     return target
+
+
+def _open_file(path: Path) -> ChunkedFile | sqlite_file.SqliteFile:
+    """Open one storage file, its format told by its first bytes."""
+    with open(path, 'rb') as file:
+        magic = file.read(16)
+    if not magic:
+        raise BagError(f'{path.name} is empty')
+    if magic.startswith(mcap_file.MAGIC):
+        return mcap_file.McapFile(path)
+    if magic.startswith(rosbag1_file.MAGIC):
+        return rosbag1_file.Rosbag1File(path)
+    if magic == sqlite_file.MAGIC:
+        return sqlite_file.SqliteFile(path)
+    raise BagError(f'{path.name} is no recording: neither mcap, sqlite3 nor ROS 1 bag')

@@ -1,0 +1,137 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Reads the sqlite3 files of rosbag2."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+import contextlib
+from pathlib import Path
+import sqlite3
+from typing import Any
+from urllib.parse import quote
+
+from ins_align.bag_files import BagError, MAX_MESSAGE_BYTES, ros2_type, Topic
+
+MAGIC = b'SQLite format 3\x00'
+
+
+class SqliteFile:
+    """A sqlite3 file of rosbag2."""
+
+    _SELECT = ('SELECT timestamp, topic_id, '
+               f'CASE WHEN length(data) <= {MAX_MESSAGE_BYTES} THEN data ELSE length(data) END, '
+               'rowid FROM messages ')
+
+    def __init__(self, path: Path) -> None:
+        self.warnings: list[str] = []
+        self._path = path
+        self._truncated = self._is_truncated()
+        # Immutable: neither locks nor journals are written beside somebody's recording. Only one
+        # that its recorder left behind has a write-ahead log that is worth reading.
+        log = path.with_name(path.name + '-wal')
+        options = 'mode=ro' if log.exists() and log.stat().st_size else 'mode=ro&immutable=1'
+        try:
+            self._database = sqlite3.connect(f'file:{quote(str(path.resolve()))}?{options}',
+                                             uri=True, check_same_thread=False)
+            self._open()
+        except sqlite3.Error as error:
+            raise BagError(f'{path.name} cannot be read: {error}') from None
+
+    def _is_truncated(self) -> bool:
+        with open(self._path, 'rb') as file:
+            head = file.read(100)
+        if len(head) < 100:
+            raise BagError(f'{self._path.name} was cut off within its first 100 bytes')
+        page_size = int.from_bytes(head[16:18], 'big')
+        page_size = 65536 if page_size == 1 else page_size  # sqlite.org/fileformat.html, 1.3.2
+        return self._path.stat().st_size < page_size * int.from_bytes(head[28:32], 'big')
+
+    def _open(self) -> None:
+        execute = self._database.execute
+        execute('PRAGMA trusted_schema=OFF')
+        if self._truncated:
+            self._warn('was cut off: it is read as far as it goes')
+            # The one way to make sqlite open a file that is shorter than its header says.
+            execute('PRAGMA writable_schema=ON')
+        tables = {name for name, in execute("SELECT name FROM sqlite_master WHERE type='table'")}
+        if not {'topics', 'messages'} <= tables:
+            raise BagError(f'{self._path.name} is a sqlite3 file but no recording: it has no '
+                           'tables of topics and messages')
+        self.topics: dict[int, Topic] = {
+            key: Topic(str(name), ros2_type(str(msgtype)), str(encoding))
+            for key, name, msgtype, encoding in execute(
+                'SELECT id, name, type, serialization_format FROM topics')}
+        self.start_ns: int | None = None
+        self.end_ns: int | None = None
+        if not self._truncated:
+            try:
+                self.start_ns = self._one_time('messages ORDER BY timestamp')
+                self.end_ns = self._one_time('messages ORDER BY timestamp DESC')
+                return
+            except sqlite3.Error as error:
+                self._warn_of_damage(error)
+        self.start_ns = self._one_time('messages NOT INDEXED ORDER BY rowid')
+
+    def _one_time(self, source: str) -> int | None:
+        row = self._database.execute(
+            f'SELECT timestamp FROM {source} LIMIT 1').fetchone()
+        return row[0] if row and type(row[0]) is int else None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._database.close()
+
+    def messages(self, ids: Collection[int], start_ns: int, stop_ns: int,
+                 ) -> Iterator[tuple[int, int, bytes]]:
+        """Yield recorded time, topic's id, message in the order of recorded time."""
+        if self.end_ns is not None:
+            try:
+                for row in self._database.execute(
+                        self._SELECT + f'WHERE topic_id IN ({",".join("?" * len(ids))}) '
+                        'AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, rowid',
+                        (*ids, start_ns, stop_ns)):
+                    if self._is_sound(row):
+                        yield row[:3]
+                        start_ns = row[0] + 1
+                return
+            except sqlite3.Error as error:
+                self._warn_of_damage(error)
+        # The order of time needs the index: without it in the order of recording, to the end or
+        # to the first page that is lost. A page that is lost in part has rows numbered 0.
+        last = 0
+        with contextlib.suppress(sqlite3.Error):
+            for row in self._database.execute(self._SELECT + 'NOT INDEXED ORDER BY rowid'):
+                if row[3] <= last:
+                    return
+                last = row[3]
+                if row[1] in ids and self._is_sound(row) and start_ns <= row[0] < stop_ns:
+                    yield row[:3]
+
+    def _is_sound(self, row: tuple[Any, int, Any, int]) -> bool:
+        if type(row[2]) is bytes and type(row[0]) is int:
+            return True
+        if type(row[2]) is int:
+            raise BagError(f'{self._path.name} has a message of {row[2]} bytes on '
+                           f'{self.topics[row[1]].name}, where {MAX_MESSAGE_BYTES} are allowed')
+        self._warn('has damaged messages, which are left out')
+        return False
+
+    def _warn_of_damage(self, error: sqlite3.Error) -> None:
+        self._warn(f'is damaged ({error}): it is read as far as it goes')
+
+    def _warn(self, text: str) -> None:
+        warning = f'{self._path.name} {text}'
+        if warning not in self.warnings:
+            self.warnings.append(warning)

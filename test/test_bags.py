@@ -1,0 +1,450 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Recordings of every format, whole, cut off, damaged and hostile, against the rosbags library."""
+
+import shutil
+import sqlite3
+import struct
+
+from ins_align.bag_files import decompress, ros2_type
+from ins_align.bags import Bag, BagError
+from ins_align.config import Config
+import pytest
+from recordings import (
+    FIX, FORMATS, IMU, make_twist, mcap_record, mcap_string, real_recording, START_NS, TWIST,
+    typestore, write_messages, write_recording)
+from rosbags.highlevel import AnyReader
+
+ODOMETRY, STAMPED = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/TwistStamped'
+
+
+def by_library(path):
+    with AnyReader([path]) as reader:
+        return [(connection.topic, time_ns, bytes(data))
+                for connection, time_ns, data in reader.messages()]
+
+
+def by_bag(path, **window):
+    with Bag(path) as bag:
+        records = [(topic.name, time_ns, data)
+                   for topic, time_ns, data in bag.messages(bag.topics, **window)]
+        return records, bag.warnings
+
+
+def storage_file(path):
+    return path if path.is_file() else next(p for p in path.iterdir() if p.suffix != '.yaml')
+
+
+@pytest.fixture(scope='module')
+def recordings(tmp_path_factory):
+    """One recording a format, to be copied by those who spoil it."""
+    folder = tmp_path_factory.mktemp('recordings')
+    names = {kind: kind.replace(' ', '_') + ('.bag' if kind.startswith('ros1') else '')
+             for kind in FORMATS}
+    return {kind: write_recording(folder / name, kind, 40.0) for kind, name in names.items()}
+
+
+@pytest.fixture
+def copy(recordings, tmp_path):
+    """Return a function that copies the recording of a format."""
+    def make(kind):
+        source = recordings[kind]
+        target = tmp_path / source.name
+        if source.is_dir():
+            shutil.copytree(source, target)
+        else:
+            shutil.copy(source, target)
+        return target
+    return make
+
+
+@pytest.mark.parametrize('kind', FORMATS)
+def test_same_messages_in_the_same_order_as_the_library(recordings, kind):
+    records, warnings = by_bag(recordings[kind])
+    assert warnings == []
+    assert records == by_library(recordings[kind])
+    assert len(records) == 4400
+
+
+@pytest.mark.parametrize('name', ['uav_thor75', 'car_drive0708', 'quad_dot08.bag'])
+def test_real_recordings(name):
+    path = real_recording(name)
+    records, warnings = by_bag(path)
+    assert warnings == []
+    assert records == by_library(path)
+    with Bag(path) as bag:
+        topics = bag.choose_topics(Config())
+        assert topics.imu.name == '/imu/data_raw'
+        assert topics.reference.name == '/reference/imu'
+        assert (topics.velocity is None) == name.startswith('quad')
+        assert bag.start_ns == records[0][1]
+        assert bag.end_ns == records[-1][1]
+
+
+@pytest.mark.parametrize('kind', FORMATS)
+def test_window_of_time(recordings, kind):
+    start, stop = START_NS + 10 ** 10, START_NS + 2 * 10 ** 10
+    records, _ = by_bag(recordings[kind], start_ns=start, stop_ns=stop)
+    assert records == [r for r in by_library(recordings[kind]) if start <= r[1] < stop]
+
+
+@pytest.mark.parametrize('kind', [kind for kind in FORMATS if not kind.startswith('ros1')])
+def test_without_metadata(copy, kind):
+    path = copy(kind)
+    expected = by_library(path)
+    (path / 'metadata.yaml').unlink()
+    records, warnings = by_bag(path)
+    assert records == expected
+    assert len(warnings) == 1 and 'metadata.yaml' in warnings[0]
+
+
+@pytest.mark.parametrize('text', ['', '[', 'a: 1', 'rosbag2_bagfile_information: 3',
+                                  'rosbag2_bagfile_information: {relative_file_paths: [1]}'])
+def test_damaged_metadata(copy, text):
+    path = copy('mcap')
+    expected = by_library(path)
+    (path / 'metadata.yaml').write_text(text)
+    records, warnings = by_bag(path)
+    assert records == expected
+    assert 'metadata.yaml' in warnings[0]
+
+
+@pytest.mark.parametrize('kind', FORMATS)
+def test_bare_file(recordings, kind):
+    expected = by_library(recordings[kind])
+    assert by_bag(storage_file(recordings[kind])) == (expected, [])
+
+
+@pytest.mark.parametrize('kind', FORMATS)
+@pytest.mark.parametrize('kept', [0.3, 0.6, 0.95])
+def test_cut_off_is_read_as_far_as_it_goes(copy, kind, kept):
+    path = copy(kind)
+    expected = by_library(path)
+    file = storage_file(path)
+    content = file.read_bytes()
+    file.write_bytes(content[:int(len(content) * kept)])
+    records, warnings = by_bag(path)
+    assert any('as far as it goes' in warning for warning in warnings)
+    # Exactly the front of the recording, and not less than what the format forces us to lose:
+    # a tenth, the last megabyte of a chunk where the packer keeps it (bz2: blocks of 900 kB).
+    assert records == expected[:len(records)]
+    if kind not in ('ros1 bz2', 'mcap chunks', 'mcap file', 'sqlite3 file'):
+        assert len(records) > (kept - 0.15) * len(expected)
+    elif kept > 0.9:
+        assert records
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'mcap chunks', 'sqlite3', 'ros1', 'ros1 lz4'])
+def test_damage_in_the_middle_is_survived(copy, kind):
+    path = copy(kind)
+    expected = by_library(path)
+    file = storage_file(path)
+    content = bytearray(file.read_bytes())
+    middle = len(content) // 2
+    content[middle:middle + 20000] = bytes([255]) * 20000
+    file.write_bytes(content)
+    records, warnings = by_bag(path)
+    assert warnings
+    assert set(records[:len(records) // 2]) <= set(expected)
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1', 'ros1 lz4'])
+def test_zero_bytes_at_the_end(copy, kind):
+    """A file system that lost power leaves a file of the right length filled with zeros."""
+    path = copy(kind)
+    expected = by_library(path)
+    file = storage_file(path)
+    content = file.read_bytes()
+    half = len(content) // 2
+    file.write_bytes(content[:half] + bytes(len(content) - half))
+    records, warnings = by_bag(path)
+    assert warnings
+    assert len(records) > 0.3 * len(expected)
+    # The last message may straddle the first zero.
+    assert records[:-1] == expected[:len(records) - 1]
+
+
+def test_ros1_not_indexed(copy):
+    path = copy('ros1 lz4')
+    expected = by_library(path)
+    content = bytearray(path.read_bytes())
+    at = content.index(b'index_pos=') + len(b'index_pos=')
+    content[at:at + 8] = bytes(8)
+    path.write_bytes(content)
+    records, warnings = by_bag(path)
+    assert records == expected
+    assert 'not closed' in warnings[0]
+
+
+def test_mcap_without_chunks(tmp_path, recordings):
+    content = b'\x89MCAP0\r\n' + mcap_record(1, mcap_string('ros2') + mcap_string('test'))
+    content += mcap_record(3, struct.pack('<H', 1) + mcap_string(IMU) + mcap_string('ros2msg')
+                           + mcap_string(''))
+    content += mcap_record(4, struct.pack('<HH', 7, 1) + mcap_string('/imu') + mcap_string('cdr')
+                           + mcap_string(''))
+    raws = [data for name, _, data in by_library(recordings['mcap']) if name == '/imu/data_raw']
+    for k, raw in enumerate(raws * 4):  # more than one segment
+        content += mcap_record(5, struct.pack('<HIQQ', 7, k, k + 1, k + 1) + raw)
+    closed = content + mcap_record(15, bytes(4)) + mcap_record(2, bytes(20)) + b'\x89MCAP0\r\n'
+    for name, data, warnings in (('open.mcap', content, 1), ('closed.mcap', closed, 0)):
+        (tmp_path / name).write_bytes(data)
+        records, warned = by_bag(tmp_path / name)
+        assert records == [('/imu', k + 1, raw) for k, raw in enumerate(raws * 4)]
+        assert len(warned) == warnings
+
+
+def test_messages_of_overlapping_chunks_come_in_order(tmp_path):
+    content = b'\x89MCAP0\r\n' + mcap_record(1, mcap_string('ros2') + mcap_string('test'))
+    definitions = mcap_record(4, struct.pack('<HH', 0, 0) + mcap_string('/a') + mcap_string('cdr')
+                              + mcap_string(''))
+    for times in ([1, 5, 3], [2, 9, 4], [6, 7, 8]):
+        chunk = definitions + b''.join(
+            mcap_record(5, struct.pack('<HIQQ', 0, 0, t, t) + b'%d' % t) for t in times)
+        content += mcap_record(6, struct.pack('<QQQII', min(times), max(times), len(chunk), 0, 0)
+                               + struct.pack('<Q', len(chunk)) + chunk)
+    (tmp_path / 'a.mcap').write_bytes(content)
+    assert [r[1] for r in by_bag(tmp_path / 'a.mcap')[0]] == list(range(1, 10))
+
+
+def test_directory_of_several_files(tmp_path, recordings):
+    path = tmp_path / 'split'
+    path.mkdir()
+    for number in (2, 10, 1):
+        source = write_recording(tmp_path / f's{number}', 'mcap', 0.1)
+        shutil.copy(source / f's{number}.mcap', path / f'split_{number}.mcap')
+    (path / 'split_3.mcap').touch()
+    records, warnings = by_bag(path)
+    assert len(records) == 3 * (10 + 2)
+    assert 'split_3.mcap is empty' in warnings
+    names = 'split_10.mcap, split_1.mcap, ../../split_2.mcap, gone.mcap'
+    (path / 'metadata.yaml').write_text(
+        f'rosbag2_bagfile_information: {{relative_file_paths: [{names}]}}')
+    records, warnings = by_bag(path)
+    assert len(records) == 3 * (10 + 2)
+    assert warnings == ['gone.mcap is missing from split']
+
+
+@pytest.mark.parametrize('content, message', [
+    (b'', 'is empty'), (b'hello', 'no recording'), (bytes(1000), 'no recording'),
+    (b'SQLite format 3\x00', 'cut off'), (b'SQLite format 3\x00' + bytes(200), 'a.bag'),
+    (b'#ROSBAG V1.2\n', 'version'), (b'\x28\xb5\x2f\xfdxx', 'a.bag')])
+def test_no_recording(tmp_path, content, message):
+    (tmp_path / 'a.bag').write_bytes(content)
+    with pytest.raises(BagError, match=message) as info:
+        Bag(tmp_path / 'a.bag')
+    assert '\n' not in str(info.value)
+
+
+@pytest.mark.parametrize('content', [b'\x89MCAP0\r\n', b'#ROSBAG V2.0\n',
+                                     b'#ROSBAG V2.0\n' + b'\xff' * 100,
+                                     b'\x89MCAP0\r\n' + b'\x05' + b'\xff' * 100,
+                                     b'\x89MCAP0\r\n' + b'\x06' + b'\xff' * 100])
+def test_nothing_behind_the_magic(tmp_path, content):
+    (tmp_path / 'a').write_bytes(content)
+    with pytest.raises(BagError) as info:
+        with Bag(tmp_path / 'a') as bag:
+            assert bag.topics == () and bag.start_ns is None
+            bag.choose_topics(Config())
+    assert '\n' not in str(info.value)
+
+
+def test_missing_and_empty_directory(tmp_path):
+    with pytest.raises(BagError, match='does not exist'):
+        Bag(tmp_path / 'none')
+    with pytest.raises(BagError, match='holds no recording'):
+        Bag(tmp_path)
+
+
+def test_other_database(tmp_path):
+    database = sqlite3.connect(tmp_path / 'a.db3')
+    database.execute('CREATE TABLE t(x)')
+    database.execute('CREATE VIEW messages AS SELECT 1')
+    database.execute('CREATE VIEW topics AS SELECT 1')
+    database.commit()
+    database.close()
+    with pytest.raises(BagError, match='no recording'):
+        Bag(tmp_path / 'a.db3')
+
+
+def test_database_left_behind_with_its_log(tmp_path, recordings):
+    """A recorder that was killed leaves messages in the write-ahead log."""
+    path = tmp_path / 'a.db3'
+    shutil.copy(storage_file(recordings['sqlite3']), path)
+    database = sqlite3.connect(path)
+    database.execute('PRAGMA journal_mode=WAL')
+    database.execute('INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, ?)',
+                     (START_NS + 10 ** 12, b'last'))
+    database.commit()
+    left = tmp_path / 'left'
+    left.mkdir()
+    for file in tmp_path.glob('a.db3*'):
+        shutil.copy(file, left)
+    database.close()
+    assert by_bag(left / 'a.db3')[0][-1][2] == b'last'
+
+
+def test_odd_rows_of_a_database(copy):
+    path = copy('sqlite3')
+    expected = by_library(path)
+    database = sqlite3.connect(storage_file(path))
+    database.executemany('INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)', [
+        (1, START_NS + 5, 'text'), (1, 'soon', b'x'), (1, 0.5, b'x'), (99, START_NS, b'x')])
+    database.commit()
+    database.close()
+    records, warnings = by_bag(path)
+    assert records == expected
+    assert 'left out' in warnings[0]
+
+
+@pytest.mark.parametrize('claim', [1 << 31, 1 << 62])
+def test_chunk_that_claims_too_much(copy, claim):
+    path = copy('mcap chunks')
+    file = storage_file(path)
+    content = bytearray(file.read_bytes())
+    at = content.index(b'\x04\x00\x00\x00zstd')
+    content[at - 12:at - 4] = struct.pack('<Q', claim)
+    file.write_bytes(content)
+    with pytest.raises(BagError, match='claims a chunk'):
+        Bag(path)
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'mcap chunks', 'sqlite3', 'ros1'])
+def test_message_that_is_too_long(tmp_path, kind):
+    path = tmp_path / ('a.bag' if kind == 'ros1' else 'a')
+    store = typestore(kind == 'ros1')
+    message = make_twist(store, START_NS, (1.0, 2.0, 3.0), 'x' * (1 << 21))
+    write_messages(path, kind, [('/fix_velocity', START_NS, message)], {'/fix_velocity': TWIST})
+    with pytest.raises(BagError, match='message of 2097'):
+        by_bag(path)
+
+
+def test_zip_bomb_as_a_message(tmp_path):
+    path = tmp_path / 'a'
+    store = typestore()
+    message = make_twist(store, START_NS, (1.0, 2.0, 3.0), 'x' * (1 << 24))
+    write_messages(path, 'mcap messages', [('/fix_velocity', START_NS, message)],
+                   {'/fix_velocity': TWIST})
+    records, _ = by_bag(path)
+    assert len(records[0][2]) <= 1 << 20
+
+
+def test_zip_bomb_as_a_file(tmp_path):
+    try:
+        from compression import zstd
+    except ImportError:
+        from backports import zstd
+    packer = zstd.ZstdCompressor()
+    with open(tmp_path / 'a.db3.zstd', 'wb') as file:
+        for _ in range(1100):
+            file.write(packer.compress(bytes(1 << 20)))
+        file.write(packer.flush())
+    with pytest.raises(BagError, match='unpacks to more than'):
+        Bag(tmp_path / 'a.db3.zstd')
+
+
+@pytest.mark.parametrize('name, pack', [('bz2', 'bz2'), ('lz4', 'lz4.frame'), ('zstd', None)])
+def test_decompress_stops_at_the_size(name, pack):
+    import importlib
+    try:
+        module = importlib.import_module(pack or 'compression.zstd')
+    except ImportError:
+        module = importlib.import_module('backports.zstd')
+    packed = module.compress(b'abc' * 1_000_000)
+    assert decompress(packed, name, 7) == b'abcabca'
+    assert decompress(packed, name, 0) == b''
+    assert decompress(packed, name, 3_000_000) == b'abc' * 1_000_000
+    assert decompress(b'xx' + packed, name, 100) == b''
+
+
+def test_compression_that_nobody_knows():
+    with pytest.raises(BagError, match='not supported'):
+        decompress(b'', 'rar', 3)
+
+
+@pytest.mark.parametrize('name, expected', [
+    ('sensor_msgs/Imu', IMU), (IMU, IMU), ('', ''), ('a/b/c/d', 'a/b/c/d')])
+def test_type_names(name, expected):
+    assert ros2_type(name) == expected
+
+
+def topics_of(tmp_path, topics, config=None, kind='mcap', **names):
+    path = tmp_path / ('a.bag' if kind == 'ros1' else 'a')
+    write_recording(path, kind, 0.3, topics)
+    with Bag(path) as bag:
+        return bag.choose_topics(config or Config(), **names)
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'ros1'])
+def test_reference_is_never_taken(tmp_path, kind):
+    with pytest.raises(BagError, match='no IMU topic'):
+        topics_of(tmp_path, {'/reference/imu': IMU, '/fix': FIX}, kind=kind)
+
+
+def test_reference_is_refused_by_name_too(tmp_path):
+    with pytest.raises(BagError, match='must not read it'):
+        topics_of(tmp_path, {'/reference/imu': IMU, '/imu': IMU, '/fix': FIX},
+                  imu='reference/imu')
+
+
+def test_several_candidates_are_listed(tmp_path):
+    topics = {'/a/imu': IMU, '/b/imu': IMU, '/fix': FIX}
+    with pytest.raises(BagError, match='/a/imu, /b/imu.*--imu-topic'):
+        topics_of(tmp_path, topics)
+    shutil.rmtree(tmp_path / 'a')
+    assert topics_of(tmp_path, topics, imu='b/imu').imu.name == '/b/imu'
+
+
+def test_missing_topics(tmp_path):
+    with pytest.raises(BagError, match='no position topic.*NavSatFix.*it has /imu'):
+        topics_of(tmp_path, {'/imu': IMU})
+    shutil.rmtree(tmp_path / 'a')
+    with pytest.raises(BagError, match='no topic /x; it has /fix, /imu'):
+        topics_of(tmp_path, {'/imu': IMU, '/fix': FIX}, imu='/x')
+    shutil.rmtree(tmp_path / 'a')
+    with pytest.raises(BagError, match='is of type sensor_msgs/NavSatFix, but IMU needs'):
+        topics_of(tmp_path, {'/imu': IMU, '/fix': FIX}, imu='/fix')
+
+
+def test_positions_only(tmp_path):
+    topics = topics_of(tmp_path, {'/imu': IMU, '/fix': FIX})
+    assert topics.velocity is None and topics.velocity_type is None
+
+
+def test_velocity_not_wanted(tmp_path):
+    topics = topics_of(tmp_path, {'/imu': IMU, '/fix': FIX, '/v': TWIST, '/w': TWIST},
+                       Config(use_velocity=False))
+    assert topics.velocity is None
+
+
+def velocity_bag(tmp_path, *, frames, name='/odom'):
+    store = typestore()
+    topics = {'/imu': IMU, '/fix': FIX, name: STAMPED}
+    twist = make_twist(store, START_NS, (1.0, 2.0, 3.0)).twist.twist
+    message = store.types[STAMPED](make_twist(store, START_NS, (0., 0., 0.), frames).header, twist)
+    write_messages(tmp_path / 'a', 'mcap', [(name, START_NS, message)], topics)
+    return Bag(tmp_path / 'a')
+
+
+def test_velocity_of_another_type_is_found(tmp_path):
+    with velocity_bag(tmp_path, frames='gps') as bag:
+        topics = bag.choose_topics(Config())
+    assert topics.velocity.name == '/odom'
+    assert topics.velocity_type == 'TwistStamped'
+
+
+@pytest.mark.parametrize('frames, name', [('base_link', '/odom'), ('', '/cmd_vel')])
+def test_velocity_that_is_none_of_an_antenna(tmp_path, frames, name):
+    with velocity_bag(tmp_path, frames=frames, name=name) as bag:
+        assert bag.choose_topics(Config()).velocity is None
+        assert bag.choose_topics(Config(), velocity=name).velocity.name == name
