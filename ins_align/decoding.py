@@ -81,7 +81,7 @@ def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
     for indices in layouts.values():
         start = body_start(messages[indices[0]], topic.encoding)
         if start is not None:
-            part = _decode_alike([messages[index] for index in indices], start, topic.encoding)
+            part = _decode_alike([messages[index] for index in indices], start)
             for whole, values in zip(samples, part):
                 whole[indices] = values
             continue
@@ -90,7 +90,7 @@ def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
                 sample = imu_from_msg(deserialize(messages[index], topic))
                 for whole, value in zip(samples, sample):
                     whole[index] = value
-            except (MessageError, OverflowError):
+            except MessageError:
                 decoded[index] = False
     if decoded.all():
         return samples
@@ -115,7 +115,7 @@ def body_start(message: bytes, encoding: str) -> int | None:
     return start if len(message) == start + _BODY_BYTES else None
 
 
-def _decode_alike(messages: Sequence[bytes], start: int, encoding: str) -> ImuSamples:
+def _decode_alike(messages: Sequence[bytes], start: int) -> ImuSamples:
     """Decode messages of one length whose numbers start at one place."""
     raw = np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), -1)
 
@@ -123,7 +123,7 @@ def _decode_alike(messages: Sequence[bytes], start: int, encoding: str) -> ImuSa
         return np.ascontiguousarray(raw[:, offset:offset + size]).view(kind)
 
     # Both begin with four other bytes: the encapsulation, or the sequence number of ROS 1.
-    seconds = column(4, 4, '<u4' if encoding == 'ros1' else '<i4')[:, 0].astype(np.int64)
+    seconds = column(4, 4, '<i4')[:, 0].astype(np.int64)
     nanoseconds = column(8, 4, '<u4')[:, 0]
     return ImuSamples(seconds * 1_000_000_000 + nanoseconds,
                       column(start + _RATE_OFFSET, 24, '<f8'),

@@ -1,0 +1,123 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Bulk decoding of IMU messages against the rosbags library."""
+
+from hypothesis import given, settings, strategies as st
+from ins_align import decoding
+from ins_align.bag_files import Topic
+from ins_align.decoding import body_start, decode_imu, deserialize
+from ins_align.messages import MessageError
+import numpy as np
+import pytest
+from recordings import IMU, make_imu, START_NS, typestore
+
+TOPICS = {'cdr': Topic('/imu', IMU, 'cdr'), 'ros1': Topic('/imu', IMU, 'ros1')}
+
+
+def serialized(encoding, count=5, frame_id='imu_link', little_endian=True, seed=0):
+    rng = np.random.default_rng(seed)
+    store = typestore(encoding == 'ros1')
+    raws = []
+    for k in range(count):
+        values = rng.normal(size=6)
+        message = make_imu(store, START_NS + k * 10_000_001, values[:3], values[3:], frame_id, k)
+        raws.append(bytes(store.serialize_ros1(message, IMU) if encoding == 'ros1' else
+                          store.serialize_cdr(message, IMU, little_endian=little_endian)))
+    return raws
+
+
+def by_library(raws, topic):
+    messages = [deserialize(raw, topic) for raw in raws]
+    stamps = [m.header.stamp.sec * 10 ** 9 + m.header.stamp.nanosec for m in messages]
+    gyro = [[getattr(m.angular_velocity, axis) for axis in 'xyz'] for m in messages]
+    accel = [[getattr(m.linear_acceleration, axis) for axis in 'xyz'] for m in messages]
+    return np.array(stamps), np.array(gyro), np.array(accel)
+
+
+def assert_same(samples, expected):
+    for mine, theirs in zip(samples, expected):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+@pytest.mark.parametrize('encoding', ['cdr', 'ros1'])
+@pytest.mark.parametrize('frame_id', ['', 'a', 'imu', 'imu_link', 'a/long/name/of/a/frame', 'ü'])
+def test_as_the_library(encoding, frame_id, monkeypatch):
+    raws = serialized(encoding, frame_id=frame_id)
+    expected = by_library(raws, TOPICS[encoding])
+    monkeypatch.setattr(decoding, 'deserialize', None)  # the bulk path needs no library
+    assert_same(decode_imu(raws, TOPICS[encoding]), expected)
+
+
+@pytest.mark.parametrize('encoding', ['cdr', 'ros1'])
+def test_mixed_layouts_keep_their_order(encoding):
+    raws = [raw for pair in zip(serialized(encoding, seed=1),
+                                serialized(encoding, frame_id='another_frame', seed=2),
+                                serialized(encoding, frame_id='imu_lin2', seed=3))
+            for raw in pair]
+    assert_same(decode_imu(raws, TOPICS[encoding]), by_library(raws, TOPICS[encoding]))
+
+
+def test_big_endian_and_padding_go_to_the_library():
+    raws = serialized('cdr', little_endian=False)
+    assert body_start(raws[0], 'cdr') is None
+    assert_same(decode_imu(raws, TOPICS['cdr']), by_library(raws, TOPICS['cdr']))
+
+
+@pytest.mark.parametrize('encoding', ['cdr', 'ros1'])
+def test_what_cannot_be_decoded_is_left_out(encoding):
+    raws = serialized(encoding)
+    spoilt = [b'', raws[0], b'\x00', raws[1][:100], raws[2], b'\xff' * 324, raws[3][:-1]]
+    assert_same(decode_imu(spoilt, TOPICS[encoding]),
+                by_library([raws[0], raws[2]], TOPICS[encoding]))
+
+
+def test_nothing():
+    samples = decode_imu([], TOPICS['cdr'])
+    assert [array.shape for array in samples] == [(0,), (0, 3), (0, 3)]
+
+
+@pytest.mark.parametrize('seconds', [-2 ** 31, -1, 2 ** 31 - 1])
+def test_stamps_at_the_ends_of_time(seconds):
+    raw = bytearray(serialized('cdr', 1)[0])
+    raw[4:8] = seconds.to_bytes(4, 'little', signed=True)
+    raw[8:12] = b'\xff' * 4
+    stamp = decode_imu([bytes(raw)], TOPICS['cdr']).stamps_ns[0]
+    assert stamp == seconds * 10 ** 9 + 2 ** 32 - 1
+
+
+def test_deserialize_refuses_in_a_sentence():
+    with pytest.raises(MessageError, match='5 bytes on /imu'):
+        deserialize(b'\x00\x01\x00\x00\x00', TOPICS['cdr'])
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from(['cdr', 'ros1']), st.lists(st.tuples(
+    st.integers(0, 4), st.integers(0, 330), st.binary(max_size=24)), max_size=6))
+def test_any_bytes(encoding, edits):
+    """Whatever the bytes: the same as the library makes of them, message by message."""
+    raws = serialized(encoding)
+    for index, at, replacement in edits:
+        raws[index] = raws[index][:at] + replacement + raws[index][at + len(replacement):]
+    decoded = decode_imu(raws, TOPICS[encoding])
+    expected = []
+    for raw in raws:
+        try:
+            expected.append(by_library([raw], TOPICS[encoding]))
+        except MessageError:
+            # A frame_id that is no text: the numbers behind it are good all the same.
+            if body_start(raw, encoding) is not None:
+                expected.append(decode_imu([raw], TOPICS[encoding]))
+    assert len(decoded.stamps_ns) == len(expected)
+    if expected:
+        assert_same(decoded, [np.concatenate(parts) for parts in zip(*expected)])
