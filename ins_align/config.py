@@ -61,7 +61,7 @@ PRESETS = {
 
 
 def _parameter(default: Any, description: str, unit: str = '', *, minimum: float | None = None,
-               maximum: float | None = None, choices: tuple = (), runtime: bool = False) -> Any:
+               maximum: float | None = None, choices: tuple[Any, ...] = (), runtime: bool = False) -> Any:
     return dataclasses.field(default=default, metadata={
         'description': description, 'unit': unit, 'minimum': minimum, 'maximum': maximum,
         'choices': choices, 'read_only': not runtime})
@@ -79,6 +79,7 @@ class Config:
     ------
     ConfigError
         If a value has the wrong type, lies outside its range or contradicts another one.
+
     """
 
     lever_arm: tuple[float, float, float] = _parameter(
@@ -172,7 +173,7 @@ class Config:
 
     @property
     def imu_noise(self) -> ImuNoise:
-        """The IMU's noise in SI units: the preset's, where a figure is given that one."""
+        """Noise of the IMU in SI units: the preset's, where a figure is given that one."""
         own = _imu_noise(self.angle_random_walk, self.velocity_random_walk,
                          self.gyro_bias_std, self.accel_bias_std)
         if self.imu_grade == 'custom':
@@ -190,7 +191,7 @@ class Parameter(NamedTuple):
     unit: str
     minimum: float | None
     maximum: float | None
-    choices: tuple
+    choices: tuple[Any, ...]
     read_only: bool
 
 
@@ -208,6 +209,7 @@ def config_from_mapping(values: Mapping[str, Any]) -> Config:
     ------
     ConfigError
         If a name is not known, with the names that come close, or a value is wrong.
+
     """
     known = [field.name for field in dataclasses.fields(Config)]
     for name in values:
@@ -219,7 +221,7 @@ def config_from_mapping(values: Mapping[str, Any]) -> Config:
     return Config(**values)
 
 
-def load_params(path: str | os.PathLike) -> dict[str, Any]:
+def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     Read the values for this node from a ROS 2 parameter file.
 
@@ -237,6 +239,7 @@ def load_params(path: str | os.PathLike) -> dict[str, Any]:
     ------
     ConfigError
         If the file cannot be read or holds no parameters for this node.
+
     """
     try:
         with open(path, 'rb') as file:
@@ -271,6 +274,7 @@ def parse_override(text: str) -> tuple[str, Any]:
     ------
     ConfigError
         If there is no ``=`` or the value cannot be read.
+
     """
     name, equals, value = text.partition('=')
     if not equals or not name.strip():
@@ -287,8 +291,8 @@ def _parse_yaml(text: str | bytes, source: str) -> Any:
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
-                raise yaml.composer.ComposerError(
-                    None, None, 'aliases are not allowed', self.peek_event().start_mark)
+                mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+                raise yaml.composer.ComposerError(None, None, 'aliases are not allowed', mark)
             return super().compose_node(parent, index)
 
     Loader.add_implicit_resolver(
@@ -321,7 +325,7 @@ def _is_this_node(name: str) -> bool:
     return name.rsplit('/', 1)[-1] in (NODE_NAME, '*', '**')
 
 
-def _checked(field: dataclasses.Field, value: Any) -> Any:
+def _checked(field: dataclasses.Field[Any], value: Any) -> Any:
     """Return the value in the field's own type or raise ConfigError."""
     choices = field.metadata['choices']
     if choices:
@@ -336,7 +340,7 @@ def _checked(field: dataclasses.Field, value: Any) -> Any:
     return _checked_number(field.name, value, field)
 
 
-def _checked_choice(name: str, value: Any, choices: tuple) -> Any:
+def _checked_choice(name: str, value: Any, choices: tuple[Any, ...]) -> Any:
     # A parameter that may be a word or a truth value arrives as "true" where only words fit.
     if isinstance(value, str) and value.lower() in ('true', 'false') and True in choices:
         value = value.lower() == 'true'
@@ -349,7 +353,7 @@ def _checked_choice(name: str, value: Any, choices: tuple) -> Any:
     raise ConfigError(f'{name} must be one of {words}, got {reprlib.repr(value)}')
 
 
-def _checked_vector(field: dataclasses.Field, value: Any) -> tuple[float, float, float]:
+def _checked_vector(field: dataclasses.Field[Any], value: Any) -> tuple[float, float, float]:
     try:
         elements = None if isinstance(value, (str, bytes, Mapping)) else list(value)
     except TypeError:
@@ -363,7 +367,7 @@ def _checked_vector(field: dataclasses.Field, value: Any) -> tuple[float, float,
     return x, y, z
 
 
-def _checked_number(name: str, value: Any, field: dataclasses.Field) -> float:
+def _checked_number(name: str, value: Any, field: dataclasses.Field[Any]) -> float:
     unit = f' {field.metadata["unit"]}'
     minimum, maximum = field.metadata['minimum'], field.metadata['maximum']
     if isinstance(value, bool) or not isinstance(value, Real):

@@ -18,10 +18,9 @@ Latitude and longitude are radians, altitude is metres above the ellipsoid; ever
 over leading axes.
 """
 
+from ins_align.rotation import Array
 import numpy as np
 from numpy.typing import ArrayLike
-
-from ins_align.rotation import Array
 
 # WGS-84 defining and derived constants (NGA.STND.0036_1.0.0_WGS84, 2014).
 SEMI_MAJOR_AXIS = 6378137.0            # m
@@ -56,10 +55,11 @@ def ecef_from_lla(latitude: ArrayLike, longitude: ArrayLike, altitude: ArrayLike
     """Position ``r_e``, shape (..., 3), metres."""
     sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
     prime_vertical = SEMI_MAJOR_AXIS / np.sqrt(1 - ECCENTRICITY2 * sin_lat ** 2)
-    equatorial = (prime_vertical + altitude) * cos_lat
+    height = np.asarray(altitude, dtype=float)
+    equatorial = (prime_vertical + height) * cos_lat
     return np.stack(np.broadcast_arrays(
         equatorial * np.cos(longitude), equatorial * np.sin(longitude),
-        (prime_vertical * (1 - ECCENTRICITY2) + altitude) * sin_lat), axis=-1)
+        (prime_vertical * (1 - ECCENTRICITY2) + height) * sin_lat), axis=-1)
 
 
 def matrix_en(latitude: ArrayLike, longitude: ArrayLike) -> Array:
@@ -81,6 +81,7 @@ def matrix_earth_turned(time: ArrayLike) -> Array:
     ----------
     time : array_like, shape (...)
         Seconds since the frames coincided.
+
     """
     angle = EARTH_RATE * np.asarray(time, dtype=float)
     matrix = np.zeros(angle.shape + (3, 3))
@@ -92,7 +93,7 @@ def matrix_earth_turned(time: ArrayLike) -> Array:
 
 
 def gravity_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
-    """Normal gravity ``g_n`` in ENU, shape (..., 3), m/s^2."""
+    """Gravity ``g_n`` (normal) in ENU, shape (..., 3), m/s^2."""
     magnitude = normal_gravity(latitude, altitude)
     return np.stack([np.zeros_like(magnitude), np.zeros_like(magnitude), -magnitude], axis=-1)
 
@@ -114,6 +115,7 @@ class LocalLevel:
     ----------
     latitude, longitude : float
         Radians, of the antenna at t0.
+
     """
 
     def __init__(self, latitude: float, longitude: float) -> None:

@@ -19,11 +19,10 @@ coarse alignment'", and the free start, the position form (Remark 2.3) and the f
 non-rotating frame that this package adds (docs, "Theory").
 """
 
-import numpy as np
-
 from ins_align.earth import earth_rate_n, gravity_n, LocalLevel
 from ins_align.preintegration import Intervals
 from ins_align.rotation import Array, cross, matrix_from_quaternion, orthonormalized, skew
+import numpy as np
 
 
 class BodyIntegrals:
@@ -39,6 +38,7 @@ class BodyIntegrals:
         Angular rate now; `omega_ib_b0` at t0.
     int_f, int_int_f : ndarray, shape (3,)
         Single and double integral of ``C_b0b f_b``.
+
     """
 
     def __init__(self, lever_b: Array, omega_ib_b0: Array) -> None:
@@ -97,6 +97,7 @@ class NavigationIntegrals:
         Of the antenna at t0, radians and metres.
     v_n : array_like, shape (3,)
         Antenna velocity at t0, ENU, m/s.
+
     """
 
     def __init__(self, latitude: float, longitude: float, altitude: float, v_n: Array) -> None:
@@ -174,6 +175,7 @@ class InertialTrack:
     ----------
     latitude, longitude, altitude : float
         Of the antenna at t0, radians and metres.
+
     """
 
     def __init__(self, latitude: float, longitude: float, altitude: float) -> None:
@@ -221,6 +223,7 @@ class AttitudeMoments:
     nuisance : int
         0: the note to the letter, nothing but C is unknown. 1: a free constant (velocity form).
         2: a free constant and a free slope (position form).
+
     """
 
     def __init__(self, nuisance: int) -> None:
@@ -247,6 +250,7 @@ class AttitudeMoments:
             Weighted residual sum of squares.
         A : ndarray, shape (3, 3)
             Moments of a about the regression.
+
         """
         m = self._moments[:6, :6]
         if self._nuisance:
@@ -273,6 +277,7 @@ def attitude_from_moments(B: Array, total: float) -> tuple[Array, float]:
     C : ndarray, shape (3, 3)
     residual : float
         Smallest eigenvalue of ``K = total I - 2 D``, the residual sum (not negative).
+
     """
     D = np.empty((4, 4))
     D[:3, :3] = B + B.T - np.trace(B) * np.eye(3)
@@ -292,16 +297,19 @@ def exact_lever_remainder(time: Array, C_b0b: Array, omega_eb_b: Array, omega_ie
     time : ndarray, shape (N,)
         Seconds, starting at t0.
     C_b0b : ndarray, shape (N, 3, 3)
+        Attitude relative to t0.
     omega_eb_b : ndarray, shape (N, 3)
         Angular rate to the Earth.
     omega_ie_b0 : ndarray, shape (3,)
         Earth rate in b0.
     lever_b : ndarray, shape (3,)
+        Lever arm, metres.
 
     Returns
     -------
     ndarray, shape (N, 3)
         m/s; at most ``2 W^2 t |lever|``.
+
     """
     rate = skew(omega_eb_b)
     swept = C_b0b @ rate

@@ -69,6 +69,7 @@ def imu_from_msg(msg: Any) -> tuple[int, np.ndarray, np.ndarray]:
         Angular rate, rad/s.
     accel : ndarray, shape (3,)
         Specific force, m/s^2.
+
     """
     rate, force = msg.angular_velocity, msg.linear_acceleration
     return (stamp_from_msg(msg), np.array([rate.x, rate.y, rate.z]),
@@ -96,6 +97,7 @@ def velocity_from_msg(msg: Any, config: Config) -> Velocity:
     ------
     MessageError
         If the message says that the velocity is given in a body frame.
+
     """
     covariance = None
     frame = msg.header.frame_id
@@ -129,14 +131,18 @@ def _usable_covariance(covariance: np.ndarray,
     Parameters
     ----------
     covariance : ndarray, shape (3, 3)
+        As sent, with whatever drivers put in for "unknown".
     default_std : three floats or None
         Stands in for single unknown variances; None: one unknown variance makes all unknown.
+
     """
     variances = np.diag(covariance).copy()
     known = np.isfinite(variances) & (variances > 0.0)
-    if not known.any() or (default_std is None and not known.all()):
+    if not known.any():
         return None
     if not known.all():
+        if default_std is None:
+            return None
         variances[~known] = np.square(default_std)[~known]
         return np.diag(variances)
     symmetric = 0.5 * covariance + 0.5 * covariance.T

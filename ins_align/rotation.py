@@ -34,11 +34,13 @@ def skew(vector: ArrayLike) -> Array:
     Parameters
     ----------
     vector : array_like, shape (..., 3)
+        The left factor.
 
     Returns
     -------
     ndarray, shape (..., 3, 3)
         ``skew(a) @ b == cross(a, b)``.
+
     """
     v = np.asarray(vector, dtype=float)
     matrix = np.zeros(v.shape + (3,))
@@ -98,13 +100,16 @@ def exp_so3(vector: ArrayLike) -> Array:
     Returns
     -------
     ndarray, shape (..., 3, 3)
+
     """
     return _rodrigues(vector, 0)
 
 
 def left_jacobian(vector: ArrayLike) -> Array:
     """
-    Left Jacobian of SO(3): ``exp_so3(v + d) ~ exp_so3(left_jacobian(v) d) exp_so3(v)``.
+    Left Jacobian of SO(3): what a change of a rotation vector does to its rotation.
+
+    ``exp_so3(v + d) ~ exp_so3(left_jacobian(v) d) exp_so3(v)``.
 
     Parameters
     ----------
@@ -114,6 +119,7 @@ def left_jacobian(vector: ArrayLike) -> Array:
     Returns
     -------
     ndarray, shape (..., 3, 3)
+
     """
     return _rodrigues(vector, 1)
 
@@ -127,11 +133,13 @@ def log_so3(matrix: ArrayLike) -> Array:
     Parameters
     ----------
     matrix : array_like, shape (..., 3, 3)
+        Rotation matrix.
 
     Returns
     -------
     ndarray, shape (..., 3)
         Radians.
+
     """
     q = quaternion_from_matrix(matrix)
     sine = np.sqrt(np.sum(q[..., :3] ** 2, axis=-1))
@@ -153,6 +161,7 @@ def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
     Returns
     -------
     ndarray, shape (..., 3, 3)
+
     """
     q = np.asarray(quaternion, dtype=float)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
@@ -170,11 +179,13 @@ def quaternion_from_matrix(matrix: ArrayLike) -> Array:
     Parameters
     ----------
     matrix : array_like, shape (..., 3, 3)
+        Rotation matrix.
 
     Returns
     -------
     ndarray, shape (..., 4)
         (x, y, z, w).
+
     """
     m = np.asarray(matrix, dtype=float)
     trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
@@ -207,6 +218,7 @@ def matrix_from_rpy(rpy: ArrayLike) -> Array:
     Returns
     -------
     ndarray, shape (..., 3, 3)
+
     """
     rpy = np.asarray(rpy, dtype=float)
     x, y, z = np.eye(3)
@@ -221,11 +233,13 @@ def roll_pitch_yaw(matrix: ArrayLike) -> Array:
     Parameters
     ----------
     matrix : array_like, shape (..., 3, 3)
+        ``C_nb``.
 
     Returns
     -------
     ndarray, shape (..., 3)
         Radians; pitch in [-pi/2, pi/2], the others in (-pi, pi].
+
     """
     m = np.asarray(matrix, dtype=float)
     return np.stack([np.arctan2(m[..., 2, 1], m[..., 2, 2]),
@@ -245,6 +259,7 @@ def orthonormalized(matrix: Array) -> Array:
     Returns
     -------
     ndarray, shape (3, 3)
+
     """
     return 1.5 * matrix - 0.5 * matrix @ (matrix.T @ matrix)
 
@@ -258,10 +273,12 @@ def cumulative_rotations(steps: Array) -> Array:
     Parameters
     ----------
     steps : ndarray, shape (..., n, 3, 3)
+        Rotation matrices.
 
     Returns
     -------
     ndarray, shape (..., n, 3, 3)
+
     """
     total = steps.copy()
     reach = 1
