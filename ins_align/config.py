@@ -61,7 +61,8 @@ PRESETS = {
 
 
 def _parameter(default: Any, description: str, unit: str = '', *, minimum: float | None = None,
-               maximum: float | None = None, choices: tuple[Any, ...] = (), runtime: bool = False) -> Any:
+               maximum: float | None = None, choices: tuple[Any, ...] = (),
+               runtime: bool = False) -> Any:
     return dataclasses.field(default=default, metadata={
         'description': description, 'unit': unit, 'minimum': minimum, 'maximum': maximum,
         'choices': choices, 'read_only': not runtime})
