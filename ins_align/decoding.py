@@ -15,12 +15,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 from ins_align.bag_files import Topic
-from ins_align.messages import imu_from_msg, MessageError
+from ins_align.messages import imu_from_msg, MessageError, stamp_from_msg
 import numpy as np
 
 # sensor_msgs/Imu behind its header: orientation 4 and its covariance 9, angular velocity 3 and 9,
@@ -33,11 +33,20 @@ _FRAME_LENGTH = slice(12, 16)  # of the frame_id, in both serialisations
 
 
 class ImuSamples(NamedTuple):
-    """IMU samples in the order of their messages."""
+    """Rates and specific forces in the order of their messages."""
 
     stamps_ns: np.ndarray  # (N,) int64
     gyro: np.ndarray  # (N, 3), rad/s
     accel: np.ndarray  # (N, 3), m/s^2
+    decoded: np.ndarray  # (M,) bool: which of M messages the N samples come from
+
+
+class Orientations(NamedTuple):
+    """Orientations in the order of their messages."""
+
+    stamps_ns: np.ndarray  # (N,) int64
+    quaternions: np.ndarray  # (N, 4), (x, y, z, w)
+    covariances: np.ndarray  # (N, 9), rad^2
 
 
 @lru_cache(maxsize=None)
@@ -72,8 +81,37 @@ def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
     Messages of one layout are taken from their bytes all at once; the rosbags library decodes
     those that differ from the layout that this module knows.
     """
+    return ImuSamples(*_decode(messages, topic, ((_RATE_OFFSET, 3), (_FORCE_OFFSET, 3)),
+                               imu_from_msg))
+
+
+def decode_orientations(messages: Sequence[bytes], topic: Topic) -> Orientations:
+    """Decode the orientations of serialised sensor_msgs/Imu like `decode_imu`."""
+    return Orientations(*_decode(messages, topic, ((0, 4), (8 * 4, 9)), _orientation_from_msg)[:3])
+
+
+def _orientation_from_msg(msg: Any) -> tuple[int, list[float], np.ndarray]:
+    quaternion = msg.orientation
+    return (stamp_from_msg(msg), [quaternion.x, quaternion.y, quaternion.z, quaternion.w],
+            msg.orientation_covariance)
+
+
+def _decode(messages: Sequence[bytes], topic: Topic, fields: tuple[tuple[int, int], ...],
+            convert: Callable[[Any], tuple]) -> list[np.ndarray]:
+    """
+    Return stamps, the fields and which messages could be decoded.
+
+    Parameters
+    ----------
+    messages, topic
+        As for `decode_imu`.
+    fields : tuple of (offset, width)
+        Where in the body a field starts, bytes, and how many numbers it has.
+    convert : callable
+        Makes the same of a message of the library.
+    """
     count = len(messages)
-    samples = ImuSamples(np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros((count, 3)))
+    columns = [np.zeros(count, np.int64)] + [np.zeros((count, width)) for _, width in fields]
     decoded = np.ones(count, bool)
     layouts: dict[tuple, list[int]] = {}
     for index, message in enumerate(messages):
@@ -81,20 +119,19 @@ def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
     for indices in layouts.values():
         start = body_start(messages[indices[0]], topic.encoding)
         if start is not None:
-            part = _decode_alike([messages[index] for index in indices], start)
-            for whole, values in zip(samples, part):
-                whole[indices] = values
+            part = _decode_alike([messages[index] for index in indices], start, fields)
+            for column, values in zip(columns, part):
+                column[indices] = values
             continue
         for index in indices:
             try:
-                sample = imu_from_msg(deserialize(messages[index], topic))
-                for whole, value in zip(samples, sample):
-                    whole[index] = value
+                values = convert(deserialize(messages[index], topic))
             except MessageError:
                 decoded[index] = False
-    if decoded.all():
-        return samples
-    return ImuSamples(*(whole[decoded] for whole in samples))
+                continue
+            for column, value in zip(columns, values):
+                column[index] = value
+    return [column if decoded.all() else column[decoded] for column in columns] + [decoded]
 
 
 def body_start(message: bytes, encoding: str) -> int | None:
@@ -115,7 +152,8 @@ def body_start(message: bytes, encoding: str) -> int | None:
     return start if len(message) == start + _BODY_BYTES else None
 
 
-def _decode_alike(messages: Sequence[bytes], start: int) -> ImuSamples:
+def _decode_alike(messages: Sequence[bytes], start: int, fields: tuple[tuple[int, int], ...],
+                  ) -> list[np.ndarray]:
     """Decode messages of one length whose numbers start at one place."""
     raw = np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), -1)
 
@@ -125,6 +163,5 @@ def _decode_alike(messages: Sequence[bytes], start: int) -> ImuSamples:
     # Both begin with four other bytes: the encapsulation, or the sequence number of ROS 1.
     seconds = column(4, 4, '<i4')[:, 0].astype(np.int64)
     nanoseconds = column(8, 4, '<u4')[:, 0]
-    return ImuSamples(seconds * 1_000_000_000 + nanoseconds,
-                      column(start + _RATE_OFFSET, 24, '<f8'),
-                      column(start + _FORCE_OFFSET, 24, '<f8'))
+    return [seconds * 1_000_000_000 + nanoseconds,
+            *(column(start + offset, 8 * width, '<f8') for offset, width in fields)]

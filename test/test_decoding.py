@@ -16,7 +16,7 @@
 from hypothesis import given, settings, strategies as st
 from ins_align import decoding
 from ins_align.bag_files import Topic
-from ins_align.decoding import body_start, decode_imu, deserialize
+from ins_align.decoding import body_start, decode_imu, decode_orientations, deserialize
 from ins_align.messages import MessageError
 import numpy as np
 import pytest
@@ -78,13 +78,28 @@ def test_big_endian_and_padding_go_to_the_library():
 def test_what_cannot_be_decoded_is_left_out(encoding):
     raws = serialized(encoding)
     spoilt = [b'', raws[0], b'\x00', raws[1][:100], raws[2], b'\xff' * 324, raws[3][:-1]]
-    assert_same(decode_imu(spoilt, TOPICS[encoding]),
-                by_library([raws[0], raws[2]], TOPICS[encoding]))
+    samples = decode_imu(spoilt, TOPICS[encoding])
+    assert_same(samples, by_library([raws[0], raws[2]], TOPICS[encoding]))
+    assert np.flatnonzero(samples.decoded).tolist() == [1, 4]
+
+
+@pytest.mark.parametrize('encoding', ['cdr', 'ros1'])
+def test_orientations(encoding):
+    raws = serialized(encoding) + [b''] + serialized(encoding, 1, frame_id='x')
+    orientations = decode_orientations(raws, TOPICS[encoding])
+    np.testing.assert_array_equal(orientations.quaternions, [[0.0, 0.0, 0.0, 1.0]] * 6)
+    np.testing.assert_array_equal(orientations.covariances, [[-1.0] + [0.0] * 8] * 6)
+    np.testing.assert_array_equal(orientations.stamps_ns,
+                                  decode_imu(raws, TOPICS[encoding]).stamps_ns)
+    if encoding == 'cdr':
+        big = serialized(encoding, little_endian=False)
+        assert_same(decode_orientations(big, TOPICS[encoding]),
+                    decode_orientations(raws[:5], TOPICS[encoding]))
 
 
 def test_nothing():
     samples = decode_imu([], TOPICS['cdr'])
-    assert [array.shape for array in samples] == [(0,), (0, 3), (0, 3)]
+    assert [array.shape for array in samples] == [(0,), (0, 3), (0, 3), (0,)]
 
 
 @pytest.mark.parametrize('seconds', [-2 ** 31, -1, 2 ** 31 - 1])
