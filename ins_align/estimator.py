@@ -92,6 +92,8 @@ ATTITUDE, GYRO_BIAS, ACCEL_BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
 START_VELOCITY, START_POSITION = slice(9, 12), slice(12, 15)
 LEVER_ARM, DELAY = slice(15, 18), slice(18, 19)
 SIZE = 19
+# Unknowns that outlive a new t0 and do not depend on the heading.
+BODY_FIXED = np.r_[GYRO_BIAS, ACCEL_BIAS, LEVER_ARM, DELAY]
 
 
 @dataclass(frozen=True)
@@ -316,6 +318,7 @@ class Whitener:
         self.normal = np.zeros((self._columns.size, self._columns.size))
         self.rows = 0
         self.rejected = [0, 0]
+        self.spurious = 0.0
 
     def predict(self, F: Array, W: Array) -> None:
         """Go over an interval with transition `F` and noise `W`, shape (9, 9)."""
@@ -357,6 +360,10 @@ class Whitener:
         weighted = np.linalg.solve(S, np.hstack([innovation, PL.T]))
         count = self._columns.size
         self.normal += innovation.T @ weighted[:, :count]
+        # The heading's column is made of integrated IMU data, whose own errors look like motion:
+        # this is the information that they would feign, in expectation (errors in variables).
+        feigned = weighted[:, count:] @ L.T
+        self.spurious += float(feigned[0, 0] + feigned[1, 1])
         self.X = self.X + PL @ weighted[:, :count]
         self.P = self.P - PL @ weighted[:, count:]
         self.rows += 3
@@ -520,6 +527,9 @@ class MapEstimator:
         information[ATTITUDE, ATTITUDE] += np.eye(3) / UNIFORM_ANGLE_STD ** 2
         s.P = _inverse(information)
         s.dx = s.P @ right
+        column = s.P[:, 2]
+        feigned = min(s.whitener.spurious, 1 / column[2] - 1 / UNIFORM_ANGLE_STD ** 2)
+        s.P = s.P + np.outer(column, column) * feigned / (1 - feigned * column[2])
         s.chi2 = float(s.whitener.normal[0, 0] + s.mean_step @ s.information @ s.mean_step
                        - right @ s.dx)
         s.dof = (s.whitener.rows - self._columns.size
@@ -695,9 +705,13 @@ class MapEstimator:
         return (C, x.start_velocity + Cv, x.start_position + time * x.start_velocity + Cp,
                 covariance)
 
-    def handover(self, C_n0n: Array, shift_v: Array, shift_p: Array) -> Prior:
+    def handover(self, C_n0n: Array, shift_v: Array, shift_p: Array, scale: float) -> Prior:
         """
         Return what is known now as the prior of an estimator whose t0 is the last epoch.
+
+        While the heading is not resolved, the linear picture of how it hangs together with the
+        rest is not good for long: then tilt, biases, lever arm and delay are kept, the heading
+        and the start are not.
 
         Parameters
         ----------
@@ -706,33 +720,44 @@ class MapEstimator:
         shift_v, shift_p : ndarray, shape (3,)
             s_v and s_p of an antenna track that starts at the last epoch, minus those of this one,
             in n0 axes.
+        scale : float
+            Factor on the covariance, for data that fit worse than stated.
         """
         C, v, p, joint = self._now()
         x = self.estimate()
         T = np.eye(joint.shape[0])
         for block in range(3):
             T[3 * block:3 * block + 3, 3 * block:3 * block + 3] = C_n0n.T
-        joint = T @ joint @ T.T
-        kept = np.flatnonzero(np.isin(self._columns, np.r_[GYRO_BIAS, ACCEL_BIAS, LEVER_ARM,
-                                                           DELAY]))
-        places = np.concatenate([[0, 1, 2], 9 + kept])
-        columns = np.concatenate([[0, 1, 2], self._columns[kept]])
+        joint = scale * T @ joint @ T.T
         heading_free = not math.sqrt(joint[2, 2]) < HEADING_RESOLVED_STD
-        if not heading_free:
-            start = np.arange(3, self._size)
-            places = np.concatenate([places, start])
-            columns = np.concatenate([columns, start + 6])
-        information = np.zeros((SIZE, SIZE))
-        known = _inverse(joint[np.ix_(places, places)])
+        # Places of what is kept in the joint covariance, and in the vector of unknowns.
+        kept = np.flatnonzero(np.isin(self._columns, BODY_FIXED))
         if heading_free:
-            # Conditioning the rest on nothing: the heading's row is taken out of the covariance.
-            rest = np.delete(np.arange(places.size), 2)
-            known = np.zeros_like(known)
-            known[np.ix_(rest, rest)] = _inverse(joint[np.ix_(places[rest], places[rest])])
-        information[np.ix_(columns, columns)] = known
+            places, unknowns = np.arange(2), np.arange(2)
+        else:
+            places = np.arange(self._size)
+            unknowns = np.concatenate([places[:3], places[3:] + START_VELOCITY.start - 3])
+        places = np.concatenate([places, 9 + kept])
+        unknowns = np.concatenate([unknowns, self._columns[kept]])
         mean = Unknowns(C_n0n.T @ C, x.gyro_bias, x.accel_bias, C_n0n.T @ (v + shift_v),
                         C_n0n.T @ (p + shift_p), x.lever_b, x.delay)
-        return Prior(mean, information, heading_free)
+        return _prior(mean, joint[np.ix_(places, places)], unknowns, heading_free)
+
+    def prior_without_attitude(self) -> Prior:
+        """Return what is known of biases, lever arm and delay as the prior of a fresh start."""
+        if self.solution is None:
+            return self._prior
+        unknowns = self._columns[np.isin(self._columns, BODY_FIXED)]
+        mean = replace(self.estimate(), C=np.eye(3), start_velocity=np.zeros(3),
+                       start_position=np.zeros(3))
+        return _prior(mean, self.covariance[np.ix_(unknowns, unknowns)], unknowns, False)
+
+
+def _prior(mean: Unknowns, covariance: Array, unknowns: Array, heading_free: bool) -> Prior:
+    """Prior from the covariance of some unknowns; nothing is known of the others."""
+    information = np.zeros((SIZE, SIZE))
+    information[np.ix_(unknowns, unknowns)] = _inverse(covariance)
+    return Prior(mean, information, heading_free)
 
 
 def _inverse(matrix: Array) -> Array:

@@ -1,0 +1,544 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+The aligner: messages in, attitudes and states out.
+
+The same object works under the node and under replay. Messages are buffered; an epoch is
+processed when IMU samples `gnss_lateness` newer than it have come, so that late messages find
+their place and the results depend on the messages alone.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+
+from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer
+from ins_align.config import Config, ConfigError, parameters
+from ins_align.declaration import Declaration, State, Verdict
+from ins_align.earth import EARTH_RATE, SEMI_MAJOR_AXIS
+from ins_align.estimator import Prior
+from ins_align.messages import Fix, Velocity
+from ins_align.methods import Epoch as MethodEpoch
+from ins_align.methods import ImuSteps, MapMethod, Method, NoteMethod, Nuisance
+from ins_align.plausibility import ForceCheck, VelocityCheck
+from ins_align.preintegration import split_at_epochs, Steps
+from ins_align.rotation import (Array, exp_so3, orthonormalized, quaternion_from_matrix,
+                                roll_pitch_yaw)
+
+# The IMU may be silent for this long; then the attitude is lost and alignment starts over (s).
+MAX_GAP_S = 2.0
+# A step this many times the usual one holds lost samples; what the motion can do meanwhile
+# (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
+GAP_STEPS = 2.5
+GAP_ANGULAR_ACCELERATION, GAP_JERK = 2.0, 20.0
+# Without GNSS an epoch without measurement is made this often, which bounds the buffer (ns).
+DRY_INTERVAL_NS = 2_000_000_000
+# Positions alone are taken when no velocity came for this long (ns).
+NO_VELOCITY_NS = 2_000_000_000
+# Positions with at most this sigma (m) are good enough to align with beside velocities.
+PRECISE_POSITION_STD = 0.1
+# A fix this far (m) from where the last one and the velocity lead is not believed at first.
+MAX_FIX_JUMP = 300.0
+FIX_JUMPS_BELIEVED = 5
+_UNKNOWN_VERTICAL_STD = 1e3
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """
+    An attitude of the IMU frame in ENU.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    quaternion_xyzw : ndarray, shape (4,)
+        Body to ENU, w >= 0.
+    covariance : ndarray, shape (3, 3)
+        Of the small rotation about the axes of ENU, rad^2.
+    """
+
+    stamp_ns: int
+    quaternion_xyzw: Array
+    covariance: Array
+    _rpy: Array = field(repr=False)
+
+    @staticmethod
+    def of(stamp_ns: int, C_nb: Array, covariance: Array) -> 'Attitude':
+        """Make one of a matrix."""
+        return Attitude(stamp_ns, quaternion_from_matrix(C_nb), covariance, roll_pitch_yaw(C_nb))
+
+    @property
+    def roll_deg(self) -> float:
+        """Roll, degrees."""
+        return math.degrees(self._rpy[0])
+
+    @property
+    def pitch_deg(self) -> float:
+        """Pitch, degrees; nose down is positive (REP-103)."""
+        return math.degrees(self._rpy[1])
+
+    @property
+    def yaw_deg(self) -> float:
+        """Heading as yaw: degrees counter-clockwise from east."""
+        return math.degrees(self._rpy[2])
+
+    @property
+    def sigma_deg(self) -> Array:
+        """One sigma about east, north, up, degrees, shape (3,)."""
+        return np.degrees(np.sqrt(np.diag(self.covariance)))
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """What came of a GNSS epoch; `t_s` counts from the first t0."""
+
+    stamp_ns: int
+    t_s: float
+    state: State
+    initial: Attitude | None
+    current: Attitude | None
+
+
+@dataclass(frozen=True)
+class Status:
+    """The aligner's state in numbers; see the attributes' names and units."""
+
+    state: State
+    reason: str
+    stamp_ns: int | None
+    t0_ns: int | None
+    time_to_align_s: float | None
+    initial: Attitude | None
+    current: Attitude | None
+    gyro_bias: Array
+    gyro_bias_std: Array
+    accel_bias: Array
+    accel_bias_std: Array
+    lever_arm: Array
+    lever_arm_std: Array
+    gnss_delay: float
+    gnss_delay_std: float
+    counts: dict[str, int]
+
+
+class Aligner:
+    """
+    In-motion alignment from messages as they come.
+
+    Parameters
+    ----------
+    config : Config, optional
+    """
+
+    def __init__(self, config: Config | None = None) -> None:
+        """Wait for the first messages."""
+        self.config = Config() if config is None else config
+        self.counts: Counter = Counter()
+        self._events: list[str] = []
+        self._delay_ns = round(self.config.gnss_delay * 1e9)
+        self._lateness_ns = (round(self.config.gnss_lateness * 1e9) + max(self._delay_ns, 0))
+        self._start_over(None)
+
+    def _start_over(self, prior: Prior | None) -> None:
+        """Forget everything but the counts and the prior."""
+        self._imu = ImuBuffer(self._lateness_ns, self.counts)
+        self._gnss = GnssBuffer(self._lateness_ns, self.counts)
+        self._forget_alignment(prior)
+
+    def _forget_alignment(self, prior: Prior | None) -> None:
+        """Start the alignment again on what is buffered."""
+        self._prior = prior
+        self._method: Method | None = None
+        self._declaration = Declaration(self.config)
+        self._force_check, self._velocity_check = ForceCheck(), VelocityCheck()
+        self._verdict = Verdict(State.WAITING_FOR_IMU, 'no IMU sample yet')
+        self._first_t0_ns: int | None = None
+        self._last_ns: int | None = None
+        self._place: tuple[float, float, float] | None = None
+        self._place_ns = 0
+        self._v_n: Array | None = None
+        self._fix_jumps = 0
+        self._first_fix_ns: int | None = None
+        self._last_velocity_ns: int | None = None
+        self._initial: Attitude | None = None
+        self._current: Attitude | None = None
+        self._time_to_align_s: float | None = None
+        self.declared: Attitude | None = None
+        self._now: tuple[int, Array] | None = None
+
+    # Input
+
+    def add_imu(self, stamp_ns: 'int | np.ndarray', gyro: Array, accel: Array) -> None:
+        """
+        Take an IMU sample, or many.
+
+        Parameters
+        ----------
+        stamp_ns : int or ndarray, shape (N,)
+        gyro, accel : array_like, shape (3,) or (N, 3)
+            Angular rate, rad/s; specific force, m/s^2.
+        """
+        if isinstance(stamp_ns, np.ndarray):
+            self._add_imu_array(stamp_ns, np.asarray(gyro, float), np.asarray(accel, float))
+            return
+        self._imu.add(stamp_ns, gyro, accel)
+        if self._imu.jumped_to_ns is not None:
+            self._clock_jumped()
+            self._imu.add(stamp_ns, gyro, accel)
+
+    def _add_imu_array(self, stamps_ns: np.ndarray, gyro: Array, accel: Array) -> None:
+        self._imu.add_many(stamps_ns, gyro, accel)
+        jumped_to = self._imu.jumped_to_ns
+        if jumped_to is not None:
+            first = int(np.flatnonzero(stamps_ns == jumped_to)[0])
+            self._clock_jumped()
+            self._add_imu_array(stamps_ns[first:], gyro[first:], accel[first:])
+
+    def _clock_jumped(self) -> None:
+        self.counts['clock_jumps'] += 1
+        self._events.append('the clock of the IMU jumped back: alignment starts over')
+        self._start_over(None)
+
+    def add_fix(self, fix: Fix) -> None:
+        """Take a GNSS position."""
+        self._gnss.add_fix(fix._replace(stamp_ns=fix.stamp_ns - self._delay_ns),
+                           self._imu.newest_ns)
+
+    def add_velocity(self, velocity: Velocity) -> None:
+        """Take a GNSS velocity."""
+        self._gnss.add_velocity(velocity._replace(stamp_ns=velocity.stamp_ns - self._delay_ns),
+                                self._imu.newest_ns)
+
+    def reject(self, reason: str) -> None:
+        """Count a message that an adapter could not convert."""
+        self.counts[reason] += 1
+
+    def reset(self, reason: str = 'on request') -> None:
+        """Start over."""
+        self.counts['resets'] += 1
+        self._events.append(f'alignment starts over: {reason}')
+        self._start_over(None)
+
+    def reconfigure(self, config: Config) -> None:
+        """
+        Change what may change while running: thresholds and hold time.
+
+        Raises
+        ------
+        ConfigError
+            If anything else differs.
+        """
+        for parameter in parameters():
+            if parameter.read_only and (getattr(config, parameter.name)
+                                        != getattr(self.config, parameter.name)):
+                raise ConfigError(f'{parameter.name} cannot change while running: set it at '
+                                  'start')
+        self.config = self._declaration.config = config
+
+    # Processing
+
+    def update(self) -> list[Epoch]:
+        """Process every epoch that nothing late can precede any more."""
+        newest = self._imu.newest_ns
+        return [] if newest is None else self._process(newest - self._lateness_ns)
+
+    def flush(self) -> list[Epoch]:
+        """Process the rest, at the end of a recording."""
+        newest = self._imu.newest_ns
+        return [] if newest is None else self._process(newest)
+
+    def _process(self, upto_ns: int) -> list[Epoch]:
+        self._imu.consolidate()
+        if self._imu.stamps.size < 4:
+            return []
+        # Interpolation at an epoch wants two samples after it.
+        upto_ns = min(upto_ns, int(self._imu.stamps[-2]))
+        done = []
+        for message in self._gnss.release(upto_ns):
+            done.extend(self._dry_epochs(message.stamp_ns))
+            epoch = self._take(message)
+            if epoch is not None:
+                done.append(epoch)
+        self._dry_epochs(upto_ns)
+        if self._method is None:
+            self._imu.forget_before(upto_ns, used=False)
+            if self._verdict.state is State.WAITING_FOR_IMU:
+                self._set_verdict(Verdict(State.WAITING_FOR_GNSS, 'no GNSS position yet'))
+        return done
+
+    def _dry_epochs(self, upto_ns: int) -> list[Epoch]:
+        """Go on without GNSS up to a stamp in steps of bounded length."""
+        done = []
+        while (self._method is not None and self._last_ns is not None
+               and upto_ns - self._last_ns > DRY_INTERVAL_NS):
+            epoch = self._take(GnssEpoch(self._last_ns + DRY_INTERVAL_NS))
+            if epoch is not None:
+                done.append(epoch)
+        return done
+
+    def _take(self, message: GnssEpoch) -> Epoch | None:
+        """Process one epoch."""
+        if self._last_ns is not None and message.stamp_ns <= self._last_ns:
+            self.counts['gnss_out_of_order'] += 1
+            return None
+        v_n = None
+        if message.velocity is not None and self.config.use_velocity is not False:
+            v_n = np.asarray(message.velocity.velocity, float)
+            self._last_velocity_ns = message.stamp_ns
+        fix = self._locate(message, v_n)
+        if self._place is None:
+            return None
+        if v_n is not None:
+            self._v_n = v_n
+            if fix is not None:
+                self._velocity_check.add(message.stamp_ns * 1e-9, *self._place, v_n,
+                                         self._position_std(fix))
+        epoch = MethodEpoch(message.stamp_ns, *self._place, v_n,
+                            self._velocity_covariance(message.velocity),
+                            fix is not None, self._position_covariance(fix))
+        if self._method is None:
+            return self._start(epoch, fix)
+        imu = self._imu_steps(message.stamp_ns)
+        if imu is None:
+            return None
+        self._method.advance(epoch, imu)
+        return self._judge(epoch)
+
+    def _locate(self, message: GnssEpoch, v_n: Array | None) -> Fix | None:
+        """Bring the antenna's place to an epoch; return the fix if it is believed."""
+        dt = (message.stamp_ns - self._place_ns) * 1e-9
+        predicted = self._place
+        speed = self._v_n if v_n is None else v_n
+        if predicted is not None and speed is not None and dt < 60.0:
+            latitude, longitude, altitude = predicted
+            predicted = (latitude + speed[1] * dt / SEMI_MAJOR_AXIS,
+                         longitude + speed[0] * dt / (SEMI_MAJOR_AXIS
+                                                      * max(math.cos(latitude), 1e-3)),
+                         altitude + speed[2] * dt)
+        fix = message.fix
+        if fix is None:
+            if predicted is not None:
+                self._place, self._place_ns = predicted, message.stamp_ns
+            return None
+        place = (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg), fix.altitude_m)
+        if predicted is not None and self._distance(place, predicted) > MAX_FIX_JUMP * (1 + dt):
+            self.counts['fix_jump'] += 1
+            self._fix_jumps += 1
+            if self._fix_jumps < FIX_JUMPS_BELIEVED:
+                self._place, self._place_ns = predicted, message.stamp_ns
+                return None
+            self._lose('the position jumped')
+        self._fix_jumps = 0
+        self._place, self._place_ns = place, message.stamp_ns
+        return fix
+
+    @staticmethod
+    def _distance(a: tuple[float, float, float], b: tuple[float, float, float]) -> float:
+        """Rough distance of two places, metres."""
+        east = math.remainder(a[1] - b[1], 2 * math.pi) * math.cos(a[0])
+        return math.hypot(SEMI_MAJOR_AXIS * (a[0] - b[0]), SEMI_MAJOR_AXIS * east, a[2] - b[2])
+
+    def _velocity_covariance(self, velocity: Velocity | None) -> Array:
+        config = self.config
+        if velocity is None or velocity.covariance is None:
+            covariance = np.diag([config.velocity_std ** 2, config.velocity_std ** 2,
+                                  config.velocity_std_vertical ** 2])
+        else:
+            covariance = velocity.covariance
+        if config.velocity_vertical == 'absent':
+            covariance = covariance.copy()
+            covariance[2, :2] = covariance[:2, 2] = 0.0
+            covariance[2, 2] = _UNKNOWN_VERTICAL_STD ** 2
+        return covariance
+
+    def _position_covariance(self, fix: Fix | None) -> Array:
+        config = self.config
+        if fix is None or fix.covariance is None:
+            return np.diag([config.position_std ** 2, config.position_std ** 2,
+                            config.position_std_vertical ** 2])
+        return fix.covariance
+
+    def _position_std(self, fix: Fix) -> float:
+        """Horizontal sigma of a fix, metres."""
+        return math.sqrt(float(np.max(np.diag(self._position_covariance(fix))[:2])))
+
+    def _start(self, epoch: MethodEpoch, fix: Fix | None) -> Epoch | None:
+        """Make an epoch t0 if it can be one."""
+        if fix is None:
+            return None
+        if self._first_fix_ns is None:
+            self._first_fix_ns = epoch.stamp_ns
+        wanted = self.config.use_velocity is not False
+        if self.config.method == 'pif' and self.config.use_velocity == 'auto':
+            wanted = True
+        alone = (not wanted or (self.config.use_velocity == 'auto' and self.config.method != 'vif'
+                                and epoch.stamp_ns - self._first_fix_ns >= NO_VELOCITY_NS))
+        if epoch.v_n is None and not alone:
+            self._set_verdict(Verdict(State.WAITING_FOR_GNSS, 'no GNSS velocity yet'))
+            return None
+        use_position = self.config.use_position
+        if use_position == 'auto':
+            precise = (fix.covariance is not None
+                       and self._position_std(fix) <= PRECISE_POSITION_STD)
+            use_position = epoch.v_n is None or precise
+        if epoch.v_n is None and not use_position:
+            self._set_verdict(Verdict(State.WAITING_FOR_GNSS, 'no GNSS velocity yet, and '
+                                      'use_position is false'))
+            return None
+        stamps = self._imu.stamps
+        if stamps[0] > epoch.stamp_ns:
+            return None
+        self._last_ns = epoch.stamp_ns
+        imu = self._imu_steps(epoch.stamp_ns)
+        if imu is None:
+            return None
+        if self.config.method == 'map':
+            self._method = MapMethod(self.config, epoch, imu, bool(use_position), self._prior)
+        else:
+            self._method = NoteMethod(self.config, epoch, imu, epoch.v_n is None)
+        self._first_t0_ns = epoch.stamp_ns
+        return self._judge(epoch)
+
+    def _imu_steps(self, stamp_ns: int) -> ImuSteps | None:
+        """IMU steps from the last epoch to `stamp_ns`; None when the IMU was silent too long."""
+        start_ns = self._last_ns
+        assert start_ns is not None
+        self._last_ns = stamp_ns
+        stamps = self._imu.stamps
+        end = int(np.searchsorted(stamps, stamp_ns, side='left')) + 2
+        seconds = (stamps[:end] - start_ns) * 1e-9
+        between = np.diff(seconds)
+        if seconds.size < 2 or seconds[0] > 0 or np.max(between[max(
+                int(np.searchsorted(seconds, 0.0, side='right')) - 1, 0):-1],
+                initial=0.0) > MAX_GAP_S:
+            self.counts['imu_gap'] += 1
+            self._lose(f'no IMU sample for more than {MAX_GAP_S:g} s')
+            return None
+        samples = self._imu.samples[:end]
+        self._force_check.add(samples[:, 3:])
+        steps = split_at_epochs(seconds, samples[:, :3], samples[:, 3:],
+                                np.array([0.0, (stamp_ns - start_ns) * 1e-9]))
+        self._imu.forget_before(stamp_ns, used=True)
+        return self._with_noise(steps, float(np.median(between)))
+
+    def _with_noise(self, steps: Steps, usual: float) -> ImuSteps:
+        """White noise of each step; where samples are missing, what motion can do meanwhile."""
+        noise = self.config.imu_noise
+        gap = np.where(steps.dt > GAP_STEPS * usual, steps.dt, 0.0)
+        self.counts['imu_gap'] += int(np.count_nonzero(gap))
+        # An error of acceleration * dt^2 over the step, as a density: squared, over dt.
+        density = gap ** 1.5
+        return ImuSteps(
+            steps, np.hypot(noise.angle_random_walk, GAP_ANGULAR_ACCELERATION * density),
+            np.hypot(noise.velocity_random_walk, GAP_JERK * density))
+
+    def _lose(self, why: str) -> None:
+        """Start the alignment over; biases are kept."""
+        prior = None if self._method is None else self._method.prior_without_attitude()
+        if self._method is not None:
+            self.counts['restarts'] += 1
+            self._events.append(f'alignment starts over: {why}')
+        self._forget_alignment(prior)
+
+    def _judge(self, epoch: MethodEpoch) -> Epoch:
+        """Results and state after an epoch."""
+        method, stamp_ns = self._method, epoch.stamp_ns
+        assert method is not None and self._first_t0_ns is not None
+        time_s = (stamp_ns - self._first_t0_ns) * 1e-9
+        fit = method.fit()
+        initial, current = method.initial(), method.current()
+        self._now = None
+        if initial is None or current is None:
+            self._initial = self._current = None
+            verdict = Verdict(State.ALIGNING, f'{fit.offered} GNSS epochs so far: more are '
+                                              'needed')
+        else:
+            verdict = self._declaration.update(time_s, (initial[1], current[1]), fit)
+            scale = fit.factor ** 2 if math.isfinite(fit.factor) else 1.0
+            self._initial = Attitude.of(method.t0_ns, initial[0], initial[1] * scale)
+            self._current = Attitude.of(stamp_ns, current[0], current[1] * scale)
+        fault = self._force_check.fault or self._velocity_check.fault
+        if fault:
+            self._declaration.levelled = self._declaration.aligned = False
+            verdict = Verdict(State.FAULT, fault)
+        if verdict.state is State.ALIGNED and self.declared is None:
+            self.declared = self._initial
+            self._time_to_align_s = time_s
+        elif verdict.state is not State.ALIGNED and self.declared is not None:
+            self.declared = self._time_to_align_s = None
+            self.counts['withdrawals'] += 1
+        self._set_verdict(verdict)
+        return Epoch(stamp_ns, time_s, verdict.state, self._initial, self._current)
+
+    def _set_verdict(self, verdict: Verdict) -> None:
+        if verdict.state is not self._verdict.state:
+            self._events.append(f'{verdict.state.value}: {verdict.reason}')
+        self._verdict = verdict
+
+    # Output
+
+    def take_events(self) -> list[str]:
+        """Return and forget the sentences worth a log line since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def attitude_now(self) -> Attitude | None:
+        """Return the current attitude carried on with the gyros to the newest IMU sample."""
+        method, current = self._method, self._current
+        if method is None or current is None or self._last_ns is None:
+            return None
+        self._imu.consolidate()
+        if self._now is None:
+            C = (method.current() or (None,))[0]
+            assert C is not None
+            self._now = self._last_ns, C
+        stamp_ns, C = self._now
+        first = int(np.searchsorted(self._imu.stamps, stamp_ns, side='right'))
+        if first < self._imu.stamps.size:
+            bias = method.biases()[0]
+            stamps = np.concatenate([[stamp_ns], self._imu.stamps[first:]])
+            for dt, omega in zip(np.diff(stamps) * 1e-9, self._imu.samples[first:, :3]):
+                C = C @ exp_so3((omega - bias) * dt)
+            C = orthonormalized(C)
+            stamp_ns = int(stamps[-1])
+            self._now = stamp_ns, C
+        age = (stamp_ns - self._last_ns) * 1e-9
+        drift = (self.config.imu_noise.angle_random_walk ** 2 * age
+                 + (np.max(method.nuisance().gyro_bias_std) ** 2 + EARTH_RATE ** 2) * age ** 2)
+        return Attitude.of(stamp_ns, C, current.covariance + drift * np.eye(3))
+
+    def status(self) -> Status:
+        """Return the state, the reason for it, the estimates and the counts."""
+        if self._method is None:
+            zero = np.zeros(3)
+            nuisance = Nuisance(zero, zero, zero, zero, np.array(self.config.lever_arm), zero,
+                                self.config.gnss_delay, 0.0)
+        else:
+            nuisance = self._method.nuisance()
+        return Status(self._verdict.state, self._verdict.reason, self._last_ns,
+                      None if self._method is None else self._method.t0_ns,
+                      self._time_to_align_s, self._initial, self._current,
+                      *vars(nuisance).values(), counts=self._all_counts())
+
+    def _all_counts(self) -> dict[str, int]:
+        counts = dict(self.counts)
+        if self._method is not None:
+            fit = self._method.fit()
+            counts['epochs_rejected_velocity'] = fit.rejected_velocity
+            counts['epochs_rejected_position'] = fit.rejected_position
+            counts['epochs_used'] = (fit.offered - fit.rejected_velocity - fit.rejected_position)
+            counts['rebases'] = self._method.moved
+        return counts

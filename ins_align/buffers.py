@@ -1,0 +1,221 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+What has arrived and is not used up yet: IMU samples and GNSS messages, put in order.
+
+Messages arrive late, twice, out of order or broken. What cannot be used is counted by reason; an
+epoch is released once the IMU is far enough ahead of it, so that results depend on what arrived
+and not on when somebody looked.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from ins_align.messages import Fix, Velocity
+from ins_align.rotation import Array
+
+# Beyond these no sensor measures; such values would overflow the integrals (rad/s, m/s^2, m/s).
+MAX_RATE, MAX_ACCELERATION, MAX_SPEED = 200.0, 2000.0, 2000.0
+# A GNSS stamp this far ahead of the IMU comes from another clock (ns).
+MAX_AHEAD_NS = 10_000_000_000
+MAX_PENDING = 10_000
+NO_FIX, STATUS_UNKNOWN = -1, -2
+
+
+class ImuBuffer:
+    """
+    IMU samples that are not integrated yet, in the order of their stamps.
+
+    Parameters
+    ----------
+    lateness_ns : int
+        How far out of order a sample may arrive.
+    counts : Counter
+        Where samples are counted: ``imu``, ``imu_nan``, ``imu_duplicate``, ``imu_out_of_order``,
+        ``imu_late``.
+    """
+
+    def __init__(self, lateness_ns: int, counts: Counter) -> None:
+        """Start empty."""
+        self._lateness_ns = lateness_ns
+        self._counts = counts
+        self.stamps = np.zeros(0, np.int64)
+        self.samples = np.zeros((0, 6))
+        self._new_stamps: list[int] = []
+        self._new_samples: list = []
+        self._new_arrays: list[tuple[np.ndarray, Array]] = []
+        self.newest_ns: int | None = None
+        self._used_ns = -(1 << 62)
+        self._suspect_ns: int | None = None
+        self.jumped_to_ns: int | None = None
+
+    def add(self, stamp_ns: int, gyro: Array, accel: Array) -> None:
+        """Append one sample."""
+        newest = self.newest_ns
+        if newest is not None and stamp_ns < newest - self._lateness_ns:
+            self._old_sample(stamp_ns)
+            return
+        self._suspect_ns = None
+        if newest is None or stamp_ns > newest:
+            self.newest_ns = stamp_ns
+        elif stamp_ns < newest:
+            self._counts['imu_out_of_order'] += 1
+        self._new_stamps.append(stamp_ns)
+        self._new_samples.append((*gyro, *accel))
+
+    def add_many(self, stamps_ns: np.ndarray, gyro: Array, accel: Array) -> None:
+        """Append samples, shapes (N,), (N, 3), (N, 3); the same as one by one."""
+        if stamps_ns.size == 0:
+            return
+        ordered = (np.all(stamps_ns[1:] > stamps_ns[:-1])
+                   and (self.newest_ns is None or stamps_ns[0] > self.newest_ns))
+        if not ordered:
+            for stamp_ns, g, a in zip(stamps_ns.tolist(), gyro, accel):
+                if self.jumped_to_ns is None:
+                    self.add(stamp_ns, g, a)
+            return
+        self._suspect_ns = None
+        self._flatten()
+        self._new_arrays.append((np.asarray(stamps_ns, np.int64), np.hstack([gyro, accel])))
+        self.newest_ns = int(stamps_ns[-1])
+
+    def _old_sample(self, stamp_ns: int) -> None:
+        """One sample from long ago is late; a second one after it means a clock set back."""
+        suspect = self._suspect_ns
+        if suspect is not None and 0 <= stamp_ns - suspect < 1_000_000_000:
+            self.jumped_to_ns = stamp_ns
+            return
+        self._suspect_ns = stamp_ns
+        self._counts['imu_late'] += 1
+
+    def _flatten(self) -> None:
+        """Turn single samples into an array."""
+        if self._new_stamps:
+            self._new_arrays.append((np.array(self._new_stamps, np.int64),
+                                     np.array(self._new_samples, float)))
+            self._new_stamps, self._new_samples = [], []
+
+    def consolidate(self) -> None:
+        """Sort what is new into the arrays, without what is broken, late or there twice."""
+        self._flatten()
+        if not self._new_arrays:
+            return
+        stamps = np.concatenate([s for s, _ in self._new_arrays])
+        samples = np.concatenate([x for _, x in self._new_arrays])
+        self._new_arrays = []
+        self._counts['imu'] += stamps.size
+        with np.errstate(invalid='ignore'):
+            good = np.all(np.abs(samples[:, :3]) < MAX_RATE, axis=1) & np.all(
+                np.abs(samples[:, 3:]) < MAX_ACCELERATION, axis=1)
+        self._counts['imu_nan'] += int(np.count_nonzero(~good))
+        late = stamps <= self._used_ns
+        self._counts['imu_late'] += int(np.count_nonzero(good & late))
+        good &= ~late
+        stamps = np.concatenate([self.stamps, stamps[good]])
+        samples = np.concatenate([self.samples, samples[good]])
+        if np.any(stamps[1:] <= stamps[:-1]):
+            order = np.argsort(stamps, kind='stable')
+            stamps, samples = stamps[order], samples[order]
+            first = np.concatenate([[True], stamps[1:] > stamps[:-1]])
+            self._counts['imu_duplicate'] += int(np.count_nonzero(~first))
+            stamps, samples = stamps[first], samples[first]
+        self.stamps, self.samples = stamps, samples
+
+    def forget_before(self, stamp_ns: int, used: bool) -> None:
+        """Drop samples before `stamp_ns`, but for two that interpolation needs."""
+        first = max(int(np.searchsorted(self.stamps, stamp_ns, side='right')) - 2, 0)
+        self.stamps, self.samples = self.stamps[first:], self.samples[first:]
+        if used:
+            self._used_ns = stamp_ns
+
+
+@dataclass
+class GnssEpoch:
+    """What the receiver said at one stamp."""
+
+    stamp_ns: int
+    fix: Fix | None = None
+    velocity: Velocity | None = None
+
+
+class GnssBuffer:
+    """
+    GNSS messages that are not used yet, by stamp.
+
+    Parameters
+    ----------
+    lateness_ns : int
+        How much later than newer IMU samples a message may arrive.
+    counts : Counter
+        Where messages are counted.
+    """
+
+    def __init__(self, lateness_ns: int, counts: Counter) -> None:
+        """Start empty."""
+        self._lateness_ns = lateness_ns
+        self._counts = counts
+        self._pending: dict[int, GnssEpoch] = {}
+
+    def add_fix(self, fix: Fix, imu_newest_ns: int | None) -> None:
+        """Take a position, or count why not."""
+        self._counts['fix'] += 1
+        position = fix.latitude_deg, fix.longitude_deg, fix.altitude_m
+        if fix.status == NO_FIX or position[:2] == (0.0, 0.0):
+            self._counts['fix_no_fix'] += 1
+        elif not (all(map(math.isfinite, position)) and abs(fix.latitude_deg) <= 90.0
+                  and abs(fix.longitude_deg) <= 360.0 and abs(fix.altitude_m) < 1e6):
+            self._counts['fix_nan'] += 1
+        else:
+            if fix.status == STATUS_UNKNOWN:
+                self._counts['fix_status_unknown'] += 1
+            epoch = self._epoch(fix.stamp_ns, imu_newest_ns, 'fix')
+            if epoch is not None and epoch.fix is None:
+                epoch.fix = fix
+            elif epoch is not None:
+                self._counts['fix_duplicate'] += 1
+
+    def add_velocity(self, velocity: Velocity, imu_newest_ns: int | None) -> None:
+        """Take a velocity, or count why not."""
+        self._counts['velocity'] += 1
+        if not np.all(np.abs(velocity.velocity) < MAX_SPEED):
+            self._counts['velocity_nan'] += 1
+            return
+        epoch = self._epoch(velocity.stamp_ns, imu_newest_ns, 'velocity')
+        if epoch is not None and epoch.velocity is None:
+            epoch.velocity = velocity
+        elif epoch is not None:
+            self._counts['velocity_duplicate'] += 1
+
+    def _epoch(self, stamp_ns: int, imu_newest_ns: int | None, kind: str) -> GnssEpoch | None:
+        """Return the pending epoch of a stamp; None and a count when it cannot be used."""
+        if imu_newest_ns is not None:
+            if stamp_ns < imu_newest_ns - self._lateness_ns:
+                self._counts[f'{kind}_late'] += 1
+                return None
+            if stamp_ns > imu_newest_ns + MAX_AHEAD_NS:
+                self._counts[f'{kind}_ahead'] += 1
+                return None
+        if len(self._pending) >= MAX_PENDING:
+            oldest = min(self._pending)
+            del self._pending[oldest]
+            self._counts['gnss_overflow'] += 1
+        return self._pending.setdefault(stamp_ns, GnssEpoch(stamp_ns))
+
+    def release(self, upto_ns: int) -> list[GnssEpoch]:
+        """Return and forget the epochs up to a stamp, in order."""
+        ready = sorted(stamp for stamp in self._pending if stamp <= upto_ns)
+        return [self._pending.pop(stamp) for stamp in ready]

@@ -1,0 +1,160 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+When an alignment is declared, held back or withdrawn, and why, in words with numbers.
+
+A declared attitude must be right: the stated sigma, inflated by how badly the data fit, must be
+under its threshold; the residuals must pass; both must have held for a while.
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+import math
+
+import numpy as np
+
+from ins_align.config import Config
+from ins_align.methods import Fit
+from ins_align.rotation import Array
+
+
+class State(str, Enum):
+    """State of an alignment."""
+
+    WAITING_FOR_IMU = 'WAITING_FOR_IMU'
+    WAITING_FOR_GNSS = 'WAITING_FOR_GNSS'
+    ALIGNING = 'ALIGNING'
+    LEVELLED = 'LEVELLED'
+    ALIGNED = 'ALIGNED'
+    FAULT = 'FAULT'
+
+
+# Mean square of normalised residuals above which the model is contradicted.
+MAX_MISFIT = 4.0
+# Share of epochs that may be rejected as outliers.
+MAX_REJECTED = 0.25
+# Redundant rows before anything is declared.
+MIN_DOF = 12
+# Epochs over which the latest innovations are averaged.
+RECENT = 25
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """State and the reason for it."""
+
+    state: State
+    reason: str
+
+
+class Declaration:
+    """
+    Decides from epoch to epoch.
+
+    Parameters
+    ----------
+    config : Config
+        ``heading_std_threshold``, ``tilt_std_threshold`` and ``hold_time``.
+    """
+
+    def __init__(self, config: Config) -> None:
+        """Start with nothing declared."""
+        self.config = config
+        self._level_since_s: float | None = None
+        self._heading_since_s: float | None = None
+        self.levelled = False
+        self.aligned = False
+        self._recent_nis = 1.0
+
+    def update(self, time_s: float, covariances: tuple[Array, ...], fit: Fit) -> Verdict:
+        """
+        Judge an epoch.
+
+        Parameters
+        ----------
+        time_s : float
+        covariances : tuple of ndarray, shape (3, 3)
+            Of the attitudes that must be good enough, in ENU.
+        fit : Fit
+
+        Returns
+        -------
+        Verdict
+        """
+        if math.isfinite(fit.nis):
+            self._recent_nis += (min(fit.nis, 10.0) - self._recent_nis) / RECENT
+        contradiction = self._contradiction(fit)
+        factor = fit.factor
+        tilt = math.degrees(max(math.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1])
+                                for P in covariances)) * factor
+        heading = math.degrees(max(math.sqrt(P[2, 2]) for P in covariances)) * factor
+        good = not contradiction and fit.converged and fit.dof >= MIN_DOF
+        tilt_good = good and tilt <= self.config.tilt_std_threshold
+        heading_good = tilt_good and heading <= self.config.heading_std_threshold
+        self._level_since_s = _since(self._level_since_s, time_s, tilt_good)
+        self._heading_since_s = _since(self._heading_since_s, time_s, heading_good)
+        if contradiction:
+            self.levelled = self.aligned = False
+            return Verdict(State.ALIGNING, contradiction)
+        self.levelled = self.levelled or self._held(self._level_since_s, time_s)
+        self.aligned = self.aligned or self._held(self._heading_since_s, time_s)
+        if self.aligned:
+            # What was declared stays declared until the data contradict it or its sigma has
+            # clearly grown.
+            self.aligned = heading <= 2 * self.config.heading_std_threshold
+        if self.levelled:
+            self.levelled = tilt <= 2 * self.config.tilt_std_threshold
+        return self._verdict(tilt, heading, fit)
+
+    def _verdict(self, tilt: float, heading: float, fit: Fit) -> Verdict:
+        config = self.config
+        if self.aligned:
+            return Verdict(State.ALIGNED, f'aligned: heading sigma {heading:.2g} deg, '
+                                          f'tilt sigma {tilt:.2g} deg')
+        if fit.dof < MIN_DOF:
+            return Verdict(State.ALIGNING, f'{fit.offered} GNSS epochs so far: more are needed')
+        if tilt > config.tilt_std_threshold and not self.levelled:
+            return Verdict(State.ALIGNING, f'tilt sigma {tilt:.2g} deg, needs '
+                                           f'{config.tilt_std_threshold:g}: wait')
+        state = State.LEVELLED if self.levelled else State.ALIGNING
+        if heading > config.heading_std_threshold:
+            return Verdict(state, f'heading sigma {heading:.2g} deg, needs '
+                                  f'{config.heading_std_threshold:g}: turn or change speed')
+        return Verdict(state, f'heading sigma {heading:.2g} deg is good enough: it has to hold '
+                              f'for {config.hold_time:g} s')
+
+    def _held(self, since_s: float | None, time_s: float) -> bool:
+        return since_s is not None and time_s - since_s >= self.config.hold_time - 1e-6
+
+    def _contradiction(self, fit: Fit) -> str:
+        """Return what in the data contradicts the model; empty when nothing does."""
+        if fit.dof < MIN_DOF:
+            return ''
+        rejected = fit.rejected_velocity + fit.rejected_position
+        if rejected > MAX_REJECTED * fit.offered:
+            return (f'{rejected} of {fit.offered} GNSS epochs do not fit the rest: check the '
+                    'velocity frame, the IMU axes and signs, the lever arm, the GNSS delay')
+        misfit = max(fit.chi2 / fit.dof, self._recent_nis)
+        if misfit > MAX_MISFIT:
+            return (f'the residuals are {math.sqrt(misfit):.1f} times what the stated noise '
+                    'allows: check the lever arm, the GNSS delay, the velocity frame, the IMU '
+                    'axes and signs')
+        return ''
+
+
+def _since(since_s: float | None, time_s: float, good: bool) -> float | None:
+    """Return since when something has been good."""
+    if not good:
+        return None
+    return time_s if since_s is None else since_s

@@ -1,0 +1,399 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+The alignment methods behind one face: the note's (``vif``, ``pif``) and ``map``.
+
+A method takes GNSS epochs with the IMU steps before them and tells the initial attitude (at its
+t0), the current one, and how well its model fits.
+"""
+
+from dataclasses import dataclass, replace
+import math
+from typing import Protocol
+
+import numpy as np
+
+from ins_align.config import Config
+from ins_align.earth import gravity_n
+from ins_align.estimator import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
+                                 MapEstimator, Measurements, Prior, UNIFORM_ANGLE_STD)
+from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
+from ins_align.preintegration import preintegrate, Steps
+from ins_align.rotation import Array, orthonormalized
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """
+    A GNSS epoch as a method takes it.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    latitude, longitude, altitude : float
+        Of the antenna, radians and metres; always there.
+    v_n : ndarray, shape (3,), or None
+        Antenna velocity, ENU, m/s.
+    velocity_covariance, position_covariance : ndarray, shape (3, 3)
+        ENU.
+    position_measured : bool
+        Whether the position is a measurement to align with.
+    """
+
+    stamp_ns: int
+    latitude: float
+    longitude: float
+    altitude: float
+    v_n: Array | None
+    velocity_covariance: Array
+    position_measured: bool
+    position_covariance: Array
+
+
+@dataclass(frozen=True)
+class ImuSteps:
+    """IMU steps up to an epoch and the white noise in each, rad/sqrt(s) and m/s/sqrt(s)."""
+
+    steps: Steps
+    angle_random_walk: Array
+    velocity_random_walk: Array
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well the data fit the model: sums, and the last epoch's innovations."""
+
+    chi2: float
+    dof: int
+    nis: float                  # of the last epoch, per row; nan without
+    converged: bool
+    rejected_velocity: int
+    rejected_position: int
+    offered: int                # epochs that were offered to the model, rejected ones included
+
+    @property
+    def factor(self) -> float:
+        """A-posteriori factor on sigmas, at least 1."""
+        return math.sqrt(max(1.0, self.chi2 / self.dof)) if self.dof > 0 else math.inf
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """Estimates beside the attitude, with their sigmas."""
+
+    gyro_bias: Array
+    gyro_bias_std: Array
+    accel_bias: Array
+    accel_bias_std: Array
+    lever_arm: Array
+    lever_arm_std: Array
+    gnss_delay: float
+    gnss_delay_std: float
+
+
+class Method(Protocol):
+    """What the aligner asks of a method."""
+
+    t0_ns: int
+    moved: int                          # how often t0 was moved forward
+
+    def advance(self, epoch: Epoch, imu: ImuSteps) -> None:
+        """Take the next epoch and the IMU steps before it."""
+
+    def initial(self) -> tuple[Array, Array] | None:
+        """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
+
+    def current(self) -> tuple[Array, Array] | None:
+        """Return ``C_nb`` at the last epoch and the covariance of its error in ENU."""
+
+    def fit(self) -> Fit:
+        """Return how well the data fit."""
+
+    def settle(self) -> None:
+        """Bring the estimate to its best before a decision."""
+
+    def nuisance(self) -> Nuisance:
+        """Return biases, lever arm and delay."""
+
+    def biases(self) -> tuple[Array, Array]:
+        """Return gyro and accelerometer bias."""
+
+    def prior_without_attitude(self) -> Prior | None:
+        """Return what a fresh start may keep."""
+
+
+class MapMethod:
+    """
+    The recursive estimator, handed over to a later t0 whenever its store is full.
+
+    Parameters
+    ----------
+    config : Config
+    epoch : Epoch
+        t0.
+    imu : ImuSteps
+        Of no length, at t0.
+    use_position : bool
+    prior : Prior, optional
+        From an earlier alignment.
+    capacity : int
+        Epochs that the estimator stores.
+    """
+
+    def __init__(self, config: Config, epoch: Epoch, imu: ImuSteps, use_position: bool,
+                 prior: Prior | None = None, capacity: int = 1000) -> None:
+        """Start at t0."""
+        self._config = config
+        self._use_position = use_position
+        self._capacity = capacity
+        self.moved = 0
+        if prior is None:
+            noise = config.imu_noise
+            prior = first_prior(noise.gyro_bias_std, noise.accel_bias_std,
+                                np.array(config.lever_arm), config.lever_arm_std,
+                                0.0, config.gnss_delay_std)
+        self._offered = 0
+        self._rejected = [0, 0]
+        self._start(epoch, prior)
+        self._nis = math.nan
+        self._add(epoch, imu)
+
+    def _start(self, epoch: Epoch, prior: Prior) -> None:
+        self.t0_ns = epoch.stamp_ns
+        self._track = InertialTrack(epoch.latitude, epoch.longitude, epoch.altitude)
+        self._estimator = MapEstimator(
+            prior, use_position=self._use_position,
+            estimate_lever_arm=self._config.lever_arm_std > 0,
+            estimate_delay=self._config.gnss_delay_std > 0, capacity=self._capacity)
+
+    def advance(self, epoch: Epoch, imu: ImuSteps) -> None:
+        """Take the next epoch and the IMU steps before it."""
+        if self._estimator.full:
+            self._move_start()
+        time = (epoch.stamp_ns - self.t0_ns) * 1e-9
+        self._track.advance(time, epoch.latitude, epoch.longitude, epoch.altitude)
+        self._add(epoch, imu)
+
+    def _add(self, epoch: Epoch, imu: ImuSteps) -> None:
+        track = self._track
+        C_n0n = track.C_n0n
+        present = [epoch.v_n is not None, epoch.position_measured and self._use_position]
+        still = track.s_v(np.zeros(3))
+        s_v = still if epoch.v_n is None else track.s_v(epoch.v_n)
+        gnss = Measurements(
+            np.array([track.time]), np.concatenate([s_v, track.s_p])[None],
+            (C_n0n @ np.stack([epoch.velocity_covariance, epoch.position_covariance])
+             @ C_n0n.T)[None],
+            np.array([present]), (C_n0n @ gravity_n(epoch.latitude, epoch.altitude))[None],
+            -still[None])
+        biases = self.biases()
+        interval = preintegrate(imu.steps, *biases, imu.angle_random_walk,
+                                imu.velocity_random_walk)
+        nis = self._estimator.add(interval, *biases, gnss)
+        self._last, self._last_epoch = imu, epoch
+        self._offered += any(present)
+        self._nis = float(np.nanmean(nis)) / 3 if np.any(np.isfinite(nis)) else math.nan
+
+    def _move_start(self) -> None:
+        """Move t0 to the last epoch; what was learnt becomes the prior."""
+        track, steps = self._track, self._last.steps
+        fit = self.fit()
+        prior = self._estimator.handover(track.C_n0n, -track.s_v(np.zeros(3)), -track.s_p,
+                                         fit.factor ** 2)
+        self._rejected = [fit.rejected_velocity, fit.rejected_position]
+        self.moved += 1
+        start = replace(self._last_epoch, v_n=None, position_measured=False)
+        self._start(start, prior)
+        instant = Steps(np.zeros((1, 1)), *(np.repeat(array[:, -1:], 2, axis=1) for array in (
+            steps.omega, steps.f, steps.omega_dot, steps.f_dot)))
+        self._add(start, ImuSteps(instant, np.zeros((1, 1)), np.zeros((1, 1))))
+
+    def initial(self) -> tuple[Array, Array] | None:
+        """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
+        if self._estimator.solution is None:
+            return None
+        return (self._estimator.estimate().C,
+                self._estimator.covariance[ATTITUDE, ATTITUDE])
+
+    def current(self) -> tuple[Array, Array] | None:
+        """Return ``C_nb`` at the last epoch and the covariance of its error in ENU."""
+        if self._estimator.solution is None:
+            return None
+        C_n0b, covariance = self._estimator.current()
+        C_nn0 = self._track.C_n0n.T
+        return C_nn0 @ C_n0b, C_nn0 @ covariance @ C_nn0.T
+
+    def fit(self) -> Fit:
+        """Return how well the data fit."""
+        solution = self._estimator.solution
+        if solution is None:
+            return Fit(math.nan, 0, math.nan, False, 0, 0, self._offered)
+        rejected = solution.whitener.rejected
+        return Fit(solution.chi2, solution.dof, self._nis,
+                   self._estimator.nonlinearity() <= self._estimator.NONLINEARITY,
+                   self._rejected[0] + rejected[0], self._rejected[1] + rejected[1],
+                   self._offered)
+
+    def settle(self) -> None:
+        """Relinearise now if that is worth it at all."""
+        self._estimator.settle()
+
+    def nuisance(self) -> Nuisance:
+        """Return biases, lever arm and delay."""
+        x = self._estimator.estimate()
+        std = np.sqrt(np.maximum(np.diag(self._estimator.covariance), 0.0))
+        return Nuisance(x.gyro_bias, std[GYRO_BIAS], x.accel_bias, std[ACCEL_BIAS],
+                        x.lever_b, std[LEVER_ARM], self._config.gnss_delay + x.delay,
+                        float(std[DELAY][0]))
+
+    def biases(self) -> tuple[Array, Array]:
+        """Return gyro and accelerometer bias."""
+        x = self._estimator.estimate()
+        return x.gyro_bias, x.accel_bias
+
+    def prior_without_attitude(self) -> Prior | None:
+        """Return what a fresh start may keep."""
+        return self._estimator.prior_without_attitude()
+
+
+class NoteMethod:
+    """
+    The note's velocity (``vif``) or position (``pif``) integration formula with lever arm.
+
+    Sensor biases are not known to it. Its sigma comes from the centred moments and the residuals.
+    ``pif`` takes positions where no velocity comes; the start velocity is then always free.
+
+    Parameters
+    ----------
+    config : Config
+    epoch : Epoch
+        t0.
+    imu : ImuSteps
+        Of no length, at t0.
+    use_position : bool
+        For ``pif``: integrate positions, not velocities.
+    """
+
+    def __init__(self, config: Config, epoch: Epoch, imu: ImuSteps, use_position: bool) -> None:
+        """Start at t0."""
+        self.t0_ns = epoch.stamp_ns
+        self.moved = 0
+        self._config = config
+        self._lever_b = np.array(config.lever_arm)
+        self._free = config.free_start
+        self._position_form = config.method == 'pif'
+        self._from_positions = self._position_form and use_position
+        self._zero = np.zeros(3)
+        self._body = BodyIntegrals(self._lever_b, imu.steps.omega[0, -1])
+        place = epoch.latitude, epoch.longitude, epoch.altitude
+        self._track = InertialTrack(*place)
+        self._start_place = place
+        self._navigation: NavigationIntegrals | None = None
+        if epoch.v_n is not None:
+            self._navigation = NavigationIntegrals(*place, epoch.v_n)
+        nuisance = 0
+        if self._position_form:
+            nuisance = 2 if self._free else int(self._from_positions)
+        elif self._free:
+            nuisance = 1
+        self._moments = AttitudeMoments(nuisance)
+        self._nuisance = nuisance
+        self._offered = 0
+        self._variance = 0.0
+        self._solution: tuple[Array, Array] | None = None
+        self._residual = 0.0
+        if self._free or self._from_positions:
+            self._pair(epoch)
+
+    def advance(self, epoch: Epoch, imu: ImuSteps) -> None:
+        """Take the next epoch and the IMU steps before it."""
+        interval = preintegrate(imu.steps, self._zero, self._zero, 0.0, 0.0)
+        self._body.advance(interval, 0)
+        time = (epoch.stamp_ns - self.t0_ns) * 1e-9
+        place = epoch.latitude, epoch.longitude, epoch.altitude
+        self._track.advance(time, *place)
+        if epoch.v_n is not None and self._navigation is not None:
+            self._navigation.advance(time, *place, epoch.v_n)
+        self._pair(epoch)
+
+    def _pair(self, epoch: Epoch) -> None:
+        """Add the pair of vectors of an epoch and solve."""
+        body, time = self._body, self._track.time
+        if self._from_positions:
+            if not epoch.position_measured:
+                return
+            regressors = (1.0, time) if self._free else (time,)
+            first = 0.0 if self._free else 1.0
+            self._moments.add(self._track.s_p, body.a_p - first * self._lever_b, regressors)
+            self._variance += float(np.trace(epoch.position_covariance)) / 3
+        elif epoch.v_n is not None and self._navigation is not None:
+            navigation = self._navigation
+            if self._position_form:
+                if self._free:
+                    self._moments.add(navigation.s_p, body.a_p, (1.0, time))
+                else:
+                    self._moments.add(navigation.beta_p, body.alpha_p)
+            elif self._free:
+                self._moments.add(navigation.s_v, body.a_v, (1.0,))
+            else:
+                self._moments.add(navigation.beta_v, body.alpha_v)
+            self._variance += float(np.trace(epoch.velocity_covariance)) / 3
+        else:
+            return
+        self._offered += 1
+        if self._moments.count < 3:
+            return
+        C, residual, A = self._moments.solve()
+        A_n = C @ A @ C.T
+        information = np.trace(A_n) * np.eye(3) - A_n
+        self._residual = residual
+        variance = self._variance / self._offered
+        self._solution = C, np.linalg.inv(information / variance
+                                          + np.eye(3) / UNIFORM_ANGLE_STD ** 2)
+
+    def initial(self) -> tuple[Array, Array] | None:
+        """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
+        return self._solution
+
+    def current(self) -> tuple[Array, Array] | None:
+        """Return ``C_nb`` at the last epoch and the covariance of its error in ENU."""
+        if self._solution is None:
+            return None
+        C, covariance = self._solution
+        C_nn0 = self._track.C_n0n.T
+        return orthonormalized(C_nn0 @ C @ self._body.C_b0b), C_nn0 @ covariance @ C_nn0.T
+
+    def fit(self) -> Fit:
+        """Return how well the data fit."""
+        dof = 3 * self._moments.count - 3 - 3 * self._nuisance
+        if self._solution is None or dof <= 0:
+            return Fit(math.nan, 0, math.nan, False, 0, 0, self._offered)
+        variance = self._variance / self._offered
+        return Fit(self._residual / variance, dof, math.nan, True, 0, 0, self._offered)
+
+    def settle(self) -> None:
+        """Nothing to bring: the estimate is closed form."""
+
+    def nuisance(self) -> Nuisance:
+        """Return what is assumed: no biases, lever arm and delay as configured."""
+        zero = np.zeros(3)
+        return Nuisance(zero, zero, zero, zero, self._lever_b, zero, self._config.gnss_delay, 0.0)
+
+    def biases(self) -> tuple[Array, Array]:
+        """Return zero biases."""
+        return self._zero, self._zero
+
+    def prior_without_attitude(self) -> Prior | None:
+        """Nothing but the attitude is estimated."""
+        return None
