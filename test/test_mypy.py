@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-CORE = ('rotation', 'earth', 'preintegration', 'formula', 'estimator', 'aligner', 'config',
-        'messages')
+CORE = ('rotation', 'earth', 'preintegration', 'formula', 'estimator', 'methods', 'buffers',
+        'plausibility', 'declaration', 'aligner', 'config', 'messages')
 
 
 @pytest.mark.linter

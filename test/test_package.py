@@ -25,8 +25,9 @@ from ins_align.config import parameters
 import pytest
 
 ROOT = Path(__file__).parents[1]
-CORE = ('rotation', 'earth', 'preintegration', 'formula', 'estimator', 'aligner', 'config',
-        'messages')
+CORE = ('rotation', 'earth', 'preintegration', 'formula', 'estimator', 'methods', 'buffers',
+        'plausibility', 'declaration', 'aligner', 'config', 'messages')
+OPTIONAL = ('rosbags', 'matplotlib', 'pyins', 'pandas', 'numba', 'tqdm')
 
 
 def read(name):
@@ -81,16 +82,29 @@ def test_entry_point_exists(command):
     assert function in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
 
 
-def test_core_needs_numpy_and_scipy_only():
-    """A robot without rosbags, matplotlib, python-ins; a laptop without ROS."""
-    imports = '; '.join(f'import ins_align.{name}' for name in CORE)
-    forbidden = ('rclpy', 'rosbags', 'matplotlib', 'pyins', 'pandas', 'numba', 'tqdm',
-                 'sensor_msgs')
-    code = (f'import sys; {imports}; '
-            f'print([name for name in {forbidden!r} if name in sys.modules])')
+def imported_by(modules):
+    """Top-level packages in a process that has imported these modules of ours."""
+    imports = '; '.join(f'import ins_align.{name}' for name in modules)
+    code = f'import sys; {imports}; print(*sys.modules)'
     run = subprocess.run([sys.executable, '-c', code], cwd=ROOT, check=True,
                          capture_output=True, text=True)
-    assert run.stdout.strip() == '[]'
+    return {name.split('.')[0] for name in run.stdout.split()}
+
+
+def test_core_needs_numpy_and_scipy_only():
+    """A laptop without ROS."""
+    assert not imported_by(CORE) & {*OPTIONAL, 'rclpy', 'sensor_msgs'}
+
+
+def test_node_needs_nothing_optional():
+    """A robot without rosbags, matplotlib and python-ins."""
+    pytest.importorskip('rclpy')
+    assert not imported_by(['node']) & set(OPTIONAL)
+
+
+def test_command_line_starts_without_anything_optional():
+    """Help has to work before the extras are installed."""
+    assert not imported_by(['cli']) & {*OPTIONAL, 'rclpy', 'scipy'}
 
 
 def test_readme_lists_every_parameter_with_its_default():
