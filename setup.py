@@ -18,11 +18,11 @@ from setuptools import find_packages, setup
 
 package_name = 'ins_align'
 
-# The robot needs numpy, scipy and, for parameter files, PyYAML; ROS brings rclpy and the messages.
+# The robot needs numpy and PyYAML (parameter files of replay); ROS brings rclpy and messages.
 extras = {
     'replay': ['rosbags>=0.10', 'tqdm'],
     'plot': ['matplotlib>=3.8'],
-    'simulation': ['python-ins>=1.0', 'rosbags>=0.10'],
+    'simulation': ['python-ins>=1.0', 'rosbags>=0.10', 'scipy>=1.11'],
     'test': [
         'catkin-pkg', 'hypothesis', 'mypy', 'pytest', 'pytest-cov', 'ros-ament-flake8',
         'ros-ament-pep257', 'flake8', 'flake8-blind-except', 'flake8-builtins',
@@ -44,7 +44,7 @@ setup(
         ('share/' + package_name + '/launch', glob('launch/*.launch.*')),
     ],
     python_requires='>=3.10',
-    install_requires=['setuptools', 'numpy>=1.26', 'scipy>=1.11', 'pyyaml'],
+    install_requires=['setuptools', 'numpy>=1.26', 'pyyaml'],
     extras_require=extras,
     tests_require=['pytest'],
     zip_safe=True,
