@@ -1,0 +1,324 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What a person sees of a result: tables of plain text, figures, and files written whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import math
+import os
+from pathlib import Path
+from typing import Any, IO, TYPE_CHECKING
+
+from ins_align.declaration import State
+import numpy as np
+
+if TYPE_CHECKING:
+    from ins_align.replay import ReplayResult
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's palette, which the colour-blind can tell apart.
+STATE_COLOURS = {
+    State.WAITING_FOR_IMU: '#999999', State.WAITING_FOR_GNSS: '#999999',
+    State.ALIGNING: '#E69F00', State.LEVELLED: '#56B4E9', State.ALIGNED: '#009E73',
+    State.FAULT: '#D55E00'}
+ROLL, PITCH, HEADING = '#0072B2', '#CC79A7', '#D55E00'
+NO_STATE = '#999999'
+DECLARED_GREEN = '#009E73'
+METRES_PER_DEGREE = 6_371_000.0 * math.pi / 180.0  # of latitude, mean sphere: good for a picture
+LOST_SIGMA_DEG = 60.0  # above this a heading is not worth drawing
+PLOT_SUFFIXES = ('.png', '.pdf', '.svg', '.jpg', '.jpeg', '.webp', '.eps', '.tif', '.tiff')
+
+
+def write_whole(path: str | os.PathLike, write: Callable[[IO[bytes]], None]) -> None:
+    """
+    Write a file whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+    write : callable
+        Gets the open file. If it raises, `path` is as it was before.
+    """
+    path = Path(path)
+    unfinished = path.with_name(f'.{path.name}.{os.getpid()}.part')
+    try:
+        with open(unfinished, 'xb') as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def format_table(rows: Sequence[Sequence[Any]], header: Sequence[str] = (),
+                 indent: str = '') -> str:
+    """
+    Align columns of text: the first to the left, all others to the right.
+
+    Parameters
+    ----------
+    rows : sequence of rows
+        Cells are text; floats get four significant digits, None is a dash.
+    header : sequence of str, optional
+    indent : str, optional
+        In front of every line.
+
+    Returns
+    -------
+    str
+        Without a newline at the end.
+    """
+    cells = [[_cell(cell) for cell in row] for row in rows]
+    if header:
+        cells.insert(0, list(header))
+    width = max((len(row) for row in cells), default=0)
+    cells = [row + [''] * (width - len(row)) for row in cells]
+    widths = [max(len(row[column]) for row in cells) for column in range(width)]
+    lines = ['  '.join([row[0].ljust(widths[0])]
+                       + [cell.rjust(size) for cell, size in zip(row[1:], widths[1:])]).rstrip()
+             for row in cells if row]
+    if header:
+        lines.insert(1, '  '.join('-' * size for size in widths))
+    return '\n'.join(indent + line for line in lines)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return '-'
+    if isinstance(value, float):
+        return f'{value:.4g}' if math.isfinite(value) else '-'
+    return str(value)
+
+
+def summary(result: ReplayResult) -> str:
+    """Return the table that ``ins_align replay`` prints of a recording."""
+    status = result.status
+    after = '' if status.time_to_align_s is None else f' after {status.time_to_align_s:.1f} s'
+    lines = [result.bag, f'  {status.state.value}{after}: {status.reason}']
+    attitudes = [('initial', status.initial), ('final', status.current)]
+    rows = []
+    for name, attitude in attitudes:
+        if attitude is None:
+            continue
+        row = [name, f'{attitude.stamp_ns * 1e-9:.3f}']
+        row += [f'{angle:.3f}' for angle in (
+            attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)]
+        row += [f'{sigma:.3f}' for sigma in attitude.sigma_deg]
+        if result.reference is not None:
+            errors = result.reference.errors_deg(attitude)
+            row += ['-'] * 3 if errors is None else [f'{error:+.3f}' for error in errors[1]]
+        rows.append(row)
+    if rows:
+        header = ['attitude, deg', 'stamp, s', 'roll', 'pitch', 'yaw', 'sigma e', 'n', 'u']
+        if result.reference is not None:
+            header += ['error roll', 'pitch', 'yaw']
+        lines += ['', format_table(rows, header, '  '), '', _nuisance_table(result)]
+    counts = ', '.join(f'{name} {count}' for name, count in sorted(status.counts.items()) if count)
+    return '\n'.join([*lines, '', f'  counts: {counts or "nothing read"}'])
+
+
+def _nuisance_table(result: ReplayResult) -> str:
+    status = result.status
+    rows = []
+    for name, scale, values, stds in (
+            ('gyro bias, deg/s', math.degrees(1.0), status.gyro_bias, status.gyro_bias_std),
+            ('accel bias, m/s^2', 1.0, status.accel_bias, status.accel_bias_std),
+            ('lever arm, m', 1.0, status.lever_arm, status.lever_arm_std)):
+        rows.append([name, *(f'{value * scale:+.4f}' for value in values),
+                     *(_sigma(std * scale) for std in stds)])
+    rows.append(['GNSS delay, s', f'{status.gnss_delay:+.4f}', '', '',
+                 _sigma(status.gnss_delay_std)])
+    return format_table(rows, ['estimate', 'x', 'y', 'z', 'sigma x', 'y', 'z'], '  ')
+
+
+def _sigma(value: float) -> str:
+    return f'{value:.4f}' if value else '-'  # 0: given, not estimated
+
+
+def save_figure(figure: Figure, path: str | os.PathLike) -> None:
+    """Write a figure whole or not at all, in the format that the suffix names."""
+    kind = Path(path).suffix.lstrip('.').lower()
+    write_whole(path, lambda file: figure.savefig(file, format=kind, dpi=120))
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure that needs no display, inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout='constrained')
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def plot(result: ReplayResult) -> Figure:
+    """Draw attitude, sigma, error and trajectory of a recording over time."""
+    figure = new_figure(14.0, 9.0)
+    status = result.status
+    after = '' if status.time_to_align_s is None else f' after {status.time_to_align_s:.1f} s'
+    name = Path(result.bag).name or result.bag
+    figure.suptitle(f'{name}: {status.state.value}{after}', fontsize=13)
+    left, right = figure.subfigures(1, 2, width_ratios=(3, 2))
+    tilt, heading, sigma = left.subplots(3, 1, sharex=True)
+    series = _Series(result)
+    _plot_angles(tilt, series, ((0, 'roll', ROLL), (1, 'pitch', PITCH)))
+    _plot_angles(heading, series, ((2, 'yaw', HEADING),))
+    tilt.set_ylabel('roll, pitch (deg)')
+    heading.set_ylabel('yaw (deg, counter-\nclockwise from east)')
+    _plot_sigma(sigma, series, result)
+    sigma.set_xlabel('time since t0 (s)')
+    time_axes = [tilt, heading, sigma]
+    if series.errors is None:
+        track = right.subplots()
+    else:
+        error, track = right.subplots(2, 1, height_ratios=(1, 2))
+        _plot_errors(error, series)
+        error.set_xlabel('time since t0 (s)')
+        time_axes.append(error)
+    _plot_track(track, result)
+    for axes in time_axes:
+        _mark_declaration(axes, series)
+    for axes in (*time_axes, track):
+        axes.grid(alpha=0.3)
+        if axes.get_legend_handles_labels()[0]:
+            # Above the axes: nothing that is drawn can lie under it.
+            axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), fontsize=8, frameon=False,
+                        ncols=7, borderpad=0.2, columnspacing=1.2, handletextpad=0.5)
+    if not len(series.time):
+        tilt.text(0.5, 0.5, 'no attitude', transform=tilt.transAxes, ha='center')
+    return figure
+
+
+class _Series:
+    """A result's epochs with an attitude, as arrays over time."""
+
+    def __init__(self, result: ReplayResult) -> None:
+        pairs = [(epoch, epoch.initial, epoch.current) for epoch in result.epochs
+                 if epoch.current is not None and epoch.initial is not None]
+        self.time = np.array([epoch.t_s for epoch, _, _ in pairs])
+        angles = np.array([[now.roll_deg, now.pitch_deg, now.yaw_deg] for _, _, now in pairs])
+        self.angles = angles.reshape(-1, 3)
+        self.sigma = np.array([now.sigma_deg for _, _, now in pairs]).reshape(-1, 3)
+        self.initial_sigma = np.array(
+            [first.sigma_deg for _, first, _ in pairs]).reshape(-1, 3)
+        # Roll and pitch turn about axes in the plane of level: the larger sigma holds for both.
+        self.angle_sigma = np.stack([self.sigma[:, :2].max(axis=1, initial=0.0)] * 2
+                                    + [self.sigma[:, 2]], axis=-1)
+        self.declared = [epoch.t_s for before, epoch in zip((None, *result.epochs), result.epochs)
+                         if epoch.state is State.ALIGNED
+                         and (before is None or before.state is not State.ALIGNED)]
+        self.errors = self.reference = None
+        if result.reference is not None:
+            none = (np.full(3, np.nan), np.full(3, np.nan))
+            errors = [result.reference.errors_deg(now) or none for _, _, now in pairs]
+            self.errors = np.array([rpy for _, rpy in errors]).reshape(-1, 3)
+            self.reference = np.remainder(self.angles - self.errors + 180.0, 360.0) - 180.0
+
+
+def _plot_angles(axes: Axes, series: _Series, lines: tuple[tuple[int, str, str], ...]) -> None:
+    for column, name, colour in lines:
+        sigma = series.angle_sigma[:, column]
+        angle = np.where(sigma < LOST_SIGMA_DEG, series.angles[:, column], np.nan)
+        axes.plot(*_broken_at_wraps(series.time, angle), color=colour, linewidth=2.0, label=name)
+        limits = axes.get_ylim()
+        axes.fill_between(series.time, angle - sigma, angle + sigma, color=colour, alpha=0.25,
+                          linewidth=0, label='1 sigma', where=_continues(angle))
+        axes.set_ylim(limits)
+    if series.reference is not None:
+        for number, (column, _, _) in enumerate(lines):
+            axes.plot(*_broken_at_wraps(series.time, series.reference[:, column]), color='black',
+                      linewidth=0.8, linestyle='--', label=None if number else 'reference')
+
+
+def _continues(angle: np.ndarray) -> np.ndarray:
+    """Whether no wrap lies before or after."""
+    steps = np.abs(np.diff(angle)) > 180.0
+    return ~(np.concatenate([steps, [False]]) | np.concatenate([[False], steps]))
+
+
+def _broken_at_wraps(time: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Put a gap where a line would run from one end of the scale to the other."""
+    wraps = np.flatnonzero(np.abs(np.diff(angle)) > 180.0) + 1
+    return np.insert(time, wraps, np.nan), np.insert(angle, wraps, np.nan)
+
+
+def _plot_sigma(axes: Axes, series: _Series, result: ReplayResult) -> None:
+    axes.set_ylabel('1 sigma (deg)')
+    if not len(series.time):
+        return
+    for column, name, colour in ((0, 'tilt', ROLL), (2, 'heading', HEADING)):
+        now = series.angle_sigma[:, column]
+        first = series.initial_sigma
+        first = first[:, 2] if column else first[:, :2].max(axis=1)
+        threshold = (result.config.heading_std_threshold if column
+                     else result.config.tilt_std_threshold)
+        axes.semilogy(series.time, now, color=colour, linewidth=1.2, label=f'{name}, current')
+        axes.semilogy(series.time, first, color=colour, linewidth=1.0, linestyle=':',
+                      label=f'{name}, at t0')
+        axes.axhline(threshold, color=colour, linewidth=0.8, linestyle='--', alpha=0.7)
+        axes.annotate(f'{name} threshold', (1.0, threshold), xycoords=('axes fraction', 'data'),
+                      xytext=(-4, 2), textcoords='offset points', ha='right', fontsize=7,
+                      color=colour)
+
+
+def _plot_errors(axes: Axes, series: _Series) -> None:
+    axes.set_ylabel('error against the reference (deg)')
+    finite = np.isfinite(series.errors).all(axis=1)
+    if not finite.any():
+        axes.set_title('the reference does not cover these epochs', fontsize=10)
+        return
+    for column, name, colour in ((0, 'roll', ROLL), (1, 'pitch', PITCH), (2, 'yaw', HEADING)):
+        axes.plot(series.time, series.errors[:, column], color=colour, linewidth=1.0, label=name)
+    for sign, label in ((1.0, 'heading, 3 sigma'), (-1.0, None)):
+        axes.plot(series.time, sign * 3.0 * series.sigma[:, 2], color=HEADING, linewidth=0.8,
+                  linestyle=':', label=label)
+    # What is seen of an error is its end: its first seconds are as large as an angle can be.
+    settled = finite & (series.time >= (series.declared[0] if series.declared
+                                        else np.median(series.time[finite])))
+    largest = np.abs(series.errors[settled if settled.any() else finite]).max()
+    limit = max(1.0, 2.0 * largest)
+    axes.set_ylim(-limit, limit)
+
+
+def _plot_track(axes: Axes, result: ReplayResult) -> None:
+    axes.set_xlabel('east (m)')
+    axes.set_ylabel('north (m)')
+    track = result.track[np.isfinite(result.track).all(axis=1)]
+    if not len(track):
+        return
+    latitude, longitude = track[0, 1:]
+    north = (track[:, 1] - latitude) * METRES_PER_DEGREE
+    east = (np.remainder(track[:, 2] - longitude + 180.0, 360.0) - 180.0) \
+        * METRES_PER_DEGREE * math.cos(math.radians(latitude))
+    stamps = np.array([epoch.stamp_ns - result.first_fix_ns for epoch in result.epochs])
+    index = np.searchsorted(stamps, track[:, 0], side='right') - 1
+    states = [result.epochs[i].state if i >= 0 else State.WAITING_FOR_GNSS for i in index]
+    axes.plot(east, north, color='#cccccc', linewidth=0.8, zorder=1)
+    for state, colour in STATE_COLOURS.items():
+        chosen = np.array([s is state for s in states])
+        if chosen.any():
+            axes.scatter(east[chosen], north[chosen], s=7, color=colour, zorder=2,
+                         label=state.value)
+    axes.plot(east[0], north[0], marker='^', color='black', markersize=8, linestyle='none',
+              label='start', zorder=3)
+    axes.set_aspect('equal', adjustable='datalim')
+
+
+def _mark_declaration(axes: Axes, series: _Series) -> None:
+    for number, time in enumerate(series.declared):
+        axes.axvline(time, color=DECLARED_GREEN, linewidth=1.2,
+                     label='declared aligned' if number == 0 else None)
