@@ -34,7 +34,7 @@ from ins_align.messages import Fix, Velocity
 from ins_align.methods import Epoch as MethodEpoch
 from ins_align.methods import ImuSteps, MapMethod, Method, NoteMethod, Nuisance
 from ins_align.plausibility import ForceCheck, VelocityCheck
-from ins_align.preintegration import split_at_epochs, Steps
+from ins_align.preintegration import split_at_epochs, Steps, white_noise
 from ins_align.rotation import (Array, exp_so3, orthonormalized, quaternion_from_matrix,
                                 roll_pitch_yaw)
 
@@ -44,6 +44,10 @@ MAX_GAP_S = 2.0
 # (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
 GAP_STEPS = 2.5
 GAP_ANGULAR_ACCELERATION, GAP_JERK = 2.0, 20.0
+# Noise is measured over the interval and this long before it (ns); it replaces the stated one
+# when it is this many times as large.
+NOISE_WINDOW_NS = 500_000_000
+NOISE_EXCESS = 1.25
 # Without GNSS an epoch without measurement is made this often, which bounds the buffer (ns).
 DRY_INTERVAL_NS = 2_000_000_000
 # Positions alone are taken when no velocity came for this long (ns).
@@ -274,7 +278,7 @@ class Aligner:
                 done.append(epoch)
         self._dry_epochs(upto_ns)
         if self._method is None:
-            self._imu.forget_before(upto_ns, used=False)
+            self._imu.forget_before(upto_ns)
             if self._verdict.state is State.WAITING_FOR_IMU:
                 self._set_verdict(Verdict(State.WAITING_FOR_GNSS, 'no GNSS position yet'))
         return done
@@ -431,19 +435,26 @@ class Aligner:
         self._force_check.add(samples[:, 3:])
         steps = split_at_epochs(seconds, samples[:, :3], samples[:, 3:],
                                 np.array([0.0, (stamp_ns - start_ns) * 1e-9]))
-        self._imu.forget_before(stamp_ns, used=True)
-        return self._with_noise(steps, float(np.median(between)))
+        noise = self._noise_floor(seconds, samples)
+        self._imu.forget_before(stamp_ns - NOISE_WINDOW_NS)
+        self._imu.used_ns = stamp_ns
+        return self._with_noise(steps, float(np.median(between)), noise)
 
-    def _with_noise(self, steps: Steps, usual: float) -> ImuSteps:
+    def _noise_floor(self, seconds: Array, samples: Array) -> Array:
+        """Densities of gyro and accelerometer noise: stated, or measured where that is more."""
+        stated = np.array(self.config.imu_noise[:2])
+        measured = white_noise(seconds, samples)
+        return np.where(measured > NOISE_EXCESS * stated, measured, stated)
+
+    def _with_noise(self, steps: Steps, usual: float, noise: Array) -> ImuSteps:
         """White noise of each step; where samples are missing, what motion can do meanwhile."""
-        noise = self.config.imu_noise
         gap = np.where(steps.dt > GAP_STEPS * usual, steps.dt, 0.0)
         self.counts['imu_gap'] += int(np.count_nonzero(gap))
         # An error of acceleration * dt^2 over the step, as a density: squared, over dt.
         density = gap ** 1.5
         return ImuSteps(
-            steps, np.hypot(noise.angle_random_walk, GAP_ANGULAR_ACCELERATION * density),
-            np.hypot(noise.velocity_random_walk, GAP_JERK * density))
+            steps, np.hypot(noise[0], GAP_ANGULAR_ACCELERATION * density),
+            np.hypot(noise[1], GAP_JERK * density))
 
     def _lose(self, why: str) -> None:
         """Start the alignment over; biases are kept."""

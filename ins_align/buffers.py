@@ -59,7 +59,7 @@ class ImuBuffer:
         self._new_samples: list = []
         self._new_arrays: list[tuple[np.ndarray, Array]] = []
         self.newest_ns: int | None = None
-        self._used_ns = -(1 << 62)
+        self.used_ns = -(1 << 62)
         self._suspect_ns: int | None = None
         self.jumped_to_ns: int | None = None
 
@@ -122,7 +122,7 @@ class ImuBuffer:
             good = np.all(np.abs(samples[:, :3]) < MAX_RATE, axis=1) & np.all(
                 np.abs(samples[:, 3:]) < MAX_ACCELERATION, axis=1)
         self._counts['imu_nan'] += int(np.count_nonzero(~good))
-        late = stamps <= self._used_ns
+        late = stamps <= self.used_ns
         self._counts['imu_late'] += int(np.count_nonzero(good & late))
         good &= ~late
         stamps = np.concatenate([self.stamps, stamps[good]])
@@ -135,12 +135,10 @@ class ImuBuffer:
             stamps, samples = stamps[first], samples[first]
         self.stamps, self.samples = stamps, samples
 
-    def forget_before(self, stamp_ns: int, used: bool) -> None:
+    def forget_before(self, stamp_ns: int) -> None:
         """Drop samples before `stamp_ns`, but for two that interpolation needs."""
         first = max(int(np.searchsorted(self.stamps, stamp_ns, side='right')) - 2, 0)
         self.stamps, self.samples = self.stamps[first:], self.samples[first:]
-        if used:
-            self._used_ns = stamp_ns
 
 
 @dataclass

@@ -352,7 +352,11 @@ class Whitener:
         nis = math.nan
         if gate is not None:
             residual = innovation[:, 0] - innovation[:, 1:] @ gate[0]
-            spread = S + innovation[:, 1:] @ gate[1] @ innovation[:, 1:].T
+            spread = innovation[:, 1:] @ gate[1] @ innovation[:, 1:].T
+            if gate[1][2, 2] > HEADING_RESOLVED_STD ** 2:
+                # A large error of heading shows along the motion too, not only across.
+                spread[:2, :2] = (spread[0, 0] + spread[1, 1]) * np.eye(2)
+            spread += S
             nis = float(residual @ np.linalg.solve(spread, residual))
             if not nis < GATE:
                 self.rejected[kind] += 1
@@ -365,7 +369,8 @@ class Whitener:
         feigned = weighted[:, count:] @ L.T
         self.spurious += float(feigned[0, 0] + feigned[1, 1])
         self.X = self.X + PL @ weighted[:, :count]
-        self.P = self.P - PL @ weighted[:, count:]
+        P = self.P - PL @ weighted[:, count:]
+        self.P = 0.5 * (P + P.T)                  # or rounding grows in the antisymmetric part
         self.rows += 3
         return nis
 

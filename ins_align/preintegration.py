@@ -129,7 +129,7 @@ def split_at_epochs(stamps: Array, gyro: Array, accel: Array, epochs: Array) -> 
         Sample times, seconds, strictly increasing, first <= epochs[0], last >= epochs[-1].
     gyro, accel : ndarray, shape (N, 3)
     epochs : ndarray, shape (K + 1,)
-        Strictly increasing.
+        Increasing; two equal ones make an interval of no length.
 
     Returns
     -------
@@ -138,7 +138,7 @@ def split_at_epochs(stamps: Array, gyro: Array, accel: Array, epochs: Array) -> 
     # Sample numbers inside each open interval (start, end).
     first = np.searchsorted(stamps, epochs[:-1], side='right')
     last = np.searchsorted(stamps, epochs[1:], side='left')
-    width = int(np.max(last - first)) + 2
+    width = max(int(np.max(last - first)), 0) + 2
     inner = np.minimum(first[:, None] + np.arange(-1, width - 1), last[:, None])
     knots = np.clip(stamps[np.clip(inner, 0, stamps.size - 1)],
                     epochs[:-1, None], epochs[1:, None])
@@ -157,6 +157,38 @@ def split_at_epochs(stamps: Array, gyro: Array, accel: Array, epochs: Array) -> 
              + t * (1 - t) * (bend1 - bend0)) / h
     return Steps(np.diff(knots, axis=1), value[..., :3], value[..., 3:],
                  slope[..., :3], slope[..., 3:])
+
+
+def white_noise(stamps: Array, samples: Array) -> Array:
+    """
+    White noise density of gyros and accelerometers, measured in the data.
+
+    Third divided differences take out everything that is quadratic over four samples, which
+    motion is, and leave what is new in each sample. Vibration counts as noise.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (N,)
+        Seconds, strictly increasing.
+    samples : ndarray, shape (N, 6)
+        Angular rate and specific force.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+        rad/sqrt(s) and m/s/sqrt(s), mean over the axes; 0 for fewer than eight samples.
+    """
+    count = stamps.size - 3
+    if count < 5:
+        return np.zeros(2)
+    t = np.stack([stamps[i:i + count] for i in range(4)])
+    apart = t[:, None] - t[None]
+    apart[range(4), range(4)] = 1.0
+    weights = 1 / np.prod(apart, axis=1)
+    weights /= np.sqrt(np.sum(weights ** 2, axis=0))
+    left = sum(weights[i, :, None] * samples[i:i + count] for i in range(4))
+    variance = np.mean(np.square(left).reshape(count, 2, 3), axis=(0, 2))
+    return np.sqrt(variance * (stamps[-1] - stamps[0]) / (stamps.size - 1))
 
 
 def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array,
