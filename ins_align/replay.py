@@ -188,10 +188,13 @@ def replay(path: str | os.PathLike, config: Config | None = None, *, imu_topic: 
         if topics.velocity_type is not None:
             config = dataclasses.replace(config, velocity_type=topics.velocity_type)
         run = _Run(Aligner(config), config, topics)
-        for block, done in _blocks(bag, topics, start, duration):
-            run.feed(block)
-            if progress is not None:
-                progress(done)
+        try:
+            for block, done in _blocks(bag, topics, start, duration):
+                run.feed(block)
+                if progress is not None:
+                    progress(done)
+        except OSError as error:
+            raise BagError(f'{path} cannot be read: {error.strerror}') from None
         return run.result(str(path), bag.warnings)
 
 

@@ -149,10 +149,9 @@ def _sigma(value: float) -> str:
     return f'{value:.4f}' if value else '-'  # 0: given, not estimated
 
 
-def save_figure(figure: Figure, path: str | os.PathLike) -> None:
-    """Write a figure whole or not at all, in the format that the suffix names."""
-    kind = Path(path).suffix.lstrip('.').lower()
-    write_whole(path, lambda file: figure.savefig(file, format=kind, dpi=120))
+def save_figure(figure: Figure, file: IO[bytes], suffix: str) -> None:
+    """Write a figure to an open file in the format that a suffix names."""
+    figure.savefig(file, format=suffix.lstrip('.').lower(), dpi=120)
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -230,6 +229,8 @@ class _Series:
 
 
 def _plot_angles(axes: Axes, series: _Series, lines: tuple[tuple[int, str, str], ...]) -> None:
+    if not len(series.time):
+        return
     for column, name, colour in lines:
         sigma = series.angle_sigma[:, column]
         angle = np.where(sigma < LOST_SIGMA_DEG, series.angles[:, column], np.nan)

@@ -1,0 +1,448 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The command ``ins_align``: replay recordings, simulate, repeat experiments."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+import json
+import os
+from pathlib import Path
+import sys
+from typing import Any, IO, NoReturn, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ins_align.config import Config
+    from ins_align.replay import ReplayResult
+
+# Everything else is imported where it is used: --help must not wait for numpy.
+
+ALIGNED, NOT_ALIGNED, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
+
+SCENARIOS = 'flight, car, straight, static, hover, launch, reverse, swing'
+
+DESCRIPTION = """\
+Finds roll, pitch and true heading of a moving IMU with a GNSS receiver.
+
+commands:
+  replay      align recordings (rosbag2 mcap and sqlite3, ROS 1), no ROS needed
+  simulate    write a recording of a simulated vehicle, with truth
+  experiment  repeat a documented experiment: figure and numbers
+
+"ins_align COMMAND --help" explains each.
+"""
+
+REPLAY_EPILOG = """\
+exit status:
+  0  aligned (of several recordings: all)
+  1  read to the end and not aligned; table and JSON say why
+  2  bad usage or a recording that cannot be read
+
+With several recordings --json writes an array with an object for each, and --csv and --plot put
+the recording's name before the suffix: out.csv becomes out_first.csv, out_second.csv.
+
+examples:
+  ins_align replay flight_1 --set lever_arm=[1.2,0,0.4] --json flight_1.json
+  ins_align replay drive.bag --params config/ins_align.yaml --start 30 --plot drive.png
+"""
+
+SIMULATE_EPILOG = """\
+The recording holds /imu/data_raw, /fix, /fix_velocity and the true attitude on /reference/imu.
+Beside it lies ins_align.yaml with the parameters that suit it.
+
+example:
+  ins_align simulate flight --scenario flight --imu mems --seed 1 --lever-arm 1 1 1
+  ins_align replay flight --params flight/ins_align.yaml
+"""
+
+
+class UsageError(Exception):
+    """A wrong command line; the text says what is wrong in one sentence."""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that says in one sentence what is wrong."""
+
+    def error(self, message: str) -> NoReturn:
+        """Leave with the exit status of bad usage."""
+        self.exit(UNUSABLE, f'{self.prog}: {message}; see "{self.prog} --help"\n')
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run the command line.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        By default that of the process.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
+    arguments = parser().parse_args(argv)
+    try:
+        return int(arguments.run(arguments))
+    except UsageError as error:
+        print(f'ins_align {arguments.command}: {error}', file=sys.stderr)
+        return UNUSABLE
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read our output has left; keep Python from complaining when it flushes.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNUSABLE
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the whole command line."""
+    top = Parser(prog='ins_align', description=DESCRIPTION,
+                 formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = top.add_subparsers(dest='command', metavar='COMMAND', required=True,
+                                  help=argparse.SUPPRESS)
+    _add_replay(commands)
+    _add_simulate(commands)
+    _add_experiment(commands)
+    return top
+
+
+def _add_command(commands: Any, name: str, run: Callable[[argparse.Namespace], int],
+                 description: str, epilog: str) -> argparse.ArgumentParser:
+    command: argparse.ArgumentParser = commands.add_parser(
+        name, description=description, epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    command.set_defaults(run=run)
+    return command
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < 1e9:
+        raise ValueError
+    return value
+
+
+_seconds.__name__ = 'number of seconds'  # what argparse calls it in its message
+
+
+def _add_replay(commands: Any) -> None:
+    command = _add_command(commands, 'replay', run_replay, 'Align recordings.', REPLAY_EPILOG)
+    command.add_argument('bags', nargs='+', metavar='BAG',
+                         help='rosbag2 directory or file (.mcap, .db3), or ROS 1 .bag')
+    group = command.add_argument_group('parameters')
+    group.add_argument('--params', metavar='FILE', help='parameter file of the node (YAML)')
+    group.add_argument('--set', action='append', default=[], metavar='NAME=VALUE',
+                       dest='overrides', help='set a parameter; repeatable, after --params')
+    group = command.add_argument_group('input')
+    for name, what in (('imu', 'IMU'), ('fix', 'position'), ('velocity', 'velocity')):
+        group.add_argument(f'--{name}-topic', metavar='TOPIC',
+                           help=f'the {what} topic, where there is more than one')
+    group.add_argument('--start', type=_seconds, metavar='S',
+                       help='skip this many seconds of the recording')
+    group.add_argument('--duration', type=_seconds, metavar='S', help='read this many seconds')
+    group = command.add_argument_group('output')
+    group.add_argument('--json', metavar='FILE', help='write the result')
+    group.add_argument('--csv', metavar='FILE', help='write a row for every GNSS epoch')
+    group.add_argument('--plot', metavar='FILE',
+                       help='draw attitude, sigma, error and trajectory (.png, .pdf, .svg)')
+
+
+def _add_simulate(commands: Any) -> None:
+    command = _add_command(commands, 'simulate', run_simulate,
+                           'Write a recording of a simulated vehicle, with truth.',
+                           SIMULATE_EPILOG)
+    command.add_argument('out', metavar='OUT_BAG', help='directory to make')
+    command.add_argument('--scenario', default='flight', metavar='NAME',
+                         help=f'one of {SCENARIOS} (default: flight)')
+    command.add_argument('--imu', default='mems', metavar='GRADE', dest='imu_grade',
+                         help='navigation, tactical or mems (default: mems)')
+    command.add_argument('--storage', default='mcap', choices=('mcap', 'sqlite3'))
+    command.add_argument('--seed', type=int, default=0, help='of everything random (default: 0)')
+    command.add_argument('--duration', type=_seconds, metavar='S',
+                         help='default: what suits the scenario')
+    command.add_argument('--ideal', action='store_true', help='no noise and no biases')
+    for group_name, options in SIMULATE_OPTIONS.items():
+        group = command.add_argument_group(group_name)
+        for option, count, metavar, text in options:
+            group.add_argument(option, type=float, metavar=metavar, help=text,
+                               nargs=count or None, default=argparse.SUPPRESS)
+    group.add_argument('--outage', type=float, nargs=2, action='append', default=[],
+                       metavar=('FROM', 'TO'), dest='outages',
+                       help='no GNSS between these seconds; repeatable')
+
+
+# Options that hand a number, or three, to the argument of the same name of
+# `simulation.simulate`, whose defaults hold where an option is not given.
+SIMULATE_OPTIONS = {
+    'IMU': (
+        ('--imu-rate', 0, 'HZ', 'default: 100'),
+        ('--lever-arm', 3, ('X', 'Y', 'Z'),
+         'IMU to antenna in the IMU frame, m (default: 1 1 1)'),
+        ('--mount-rpy-deg', 3, ('ROLL', 'PITCH', 'YAW'), 'attitude of the IMU in the vehicle'),
+        ('--gyro-scale-std', 0, 'S', 'scale-factor error of the gyros, 0.01 is one percent'),
+    ),
+    'motion': (
+        ('--latitude-deg', 0, 'DEG', 'where it starts (default: 48)'),
+        ('--longitude-deg', 0, 'DEG', 'where it starts (default: 11)'),
+        ('--altitude', 0, 'M', 'where it starts (default: 300)'),
+        ('--heading-deg', 0, 'DEG', 'course of the start, counter-clockwise from east'),
+        ('--crab-deg', 0, 'DEG', 'the nose points so far left of the course'),
+        ('--stand-still', 0, 'S', 'at rest before setting off'),
+    ),
+    'GNSS': (
+        ('--gnss-rate', 0, 'HZ', 'default: 5'),
+        ('--gnss-latency', 0, 'S', 'messages arrive so long after their stamp'),
+        ('--gnss-delay', 0, 'S', 'measurements are older than their stamp by this'),
+        ('--velocity-std', 0, 'M/S', 'default: 0.1'),
+        ('--position-std', 0, 'M', 'default: 2.5'),
+        ('--outlier-rate', 0, 'PART', 'part of the epochs that are spoilt'),
+    ),
+}
+
+
+def _add_experiment(commands: Any) -> None:
+    command = _add_command(
+        commands, 'experiment', run_experiment,
+        'Repeat a published or documented experiment: its figure and its numbers.', '')
+    command.add_argument('name', metavar='NAME', help='an unknown name lists those there are')
+    command.add_argument('--out', required=True, metavar='DIR', help='where to write')
+    command.add_argument('--data', metavar='DIR', help='folder of the real recordings')
+    command.add_argument('--runs', type=int, metavar='N', help='of a Monte Carlo experiment')
+    command.add_argument('--jobs', type=int, metavar='N', help='processes at a time')
+
+
+def run_replay(arguments: argparse.Namespace) -> int:
+    """Run ``ins_align replay``."""
+    for path in (arguments.json, arguments.csv, arguments.plot):
+        _check_writable(path)
+    config = _config(arguments)
+    labels = _labels(arguments.bags)
+    if arguments.plot:
+        _check_plot(arguments.plot)
+    several = len(arguments.bags) > 1
+    objects = []
+    statuses = []
+    with _progress(len(arguments.bags)) as progress:
+        for index, (bag, label) in enumerate(zip(arguments.bags, labels)):
+            with progress.bag(index) as advance:
+                try:
+                    result = _replay(bag, config, arguments, advance)
+                except UsageError as error:
+                    if not several:
+                        raise
+                    progress.note(f'ins_align replay: {error}')
+                    objects.append({'bag': bag, 'aligned': False, 'error': str(error)})
+                    statuses.append(UNUSABLE)
+                    continue
+            objects.append(result.to_json())
+            statuses.append(ALIGNED if result.aligned else NOT_ALIGNED)
+            _show(result, arguments, label if several else '', progress)
+    if arguments.json:
+        text = json.dumps(objects if several else objects[0], indent=2, allow_nan=False)
+        _write(arguments.json, lambda file: file.write(text.encode() + b'\n'))
+    return max(statuses)
+
+
+def _replay(bag: str, config: Config, arguments: argparse.Namespace,
+            advance: Callable[[float], None]) -> ReplayResult:
+    from ins_align.bag_files import BagError
+    from ins_align.replay import replay
+
+    try:
+        return replay(bag, config, imu_topic=arguments.imu_topic, fix_topic=arguments.fix_topic,
+                      velocity_topic=arguments.velocity_topic, start=arguments.start,
+                      duration=arguments.duration, progress=advance)
+    except BagError as error:
+        raise UsageError(error) from None
+    except ModuleNotFoundError as error:
+        raise UsageError(_missing(error)) from None
+
+
+def _show(result: ReplayResult, arguments: argparse.Namespace, label: str,
+          progress: Progress) -> None:
+    """Print and write what belongs to one recording."""
+    from ins_align import report
+
+    for warning in result.warnings:
+        progress.note(f'ins_align replay: warning: {warning}')
+    progress.print(report.summary(result) + '\n')
+    if arguments.csv:
+        text = result.to_csv().encode()
+        _write(_with_label(arguments.csv, label), lambda file: file.write(text))
+    if arguments.plot:
+        figure = report.plot(result)
+        path = _with_label(arguments.plot, label)
+        _write(path, lambda file: report.save_figure(figure, file, Path(path).suffix))
+
+
+def _config(arguments: argparse.Namespace) -> Config:
+    from ins_align.config import config_from_mapping, ConfigError, load_params, parse_override
+
+    try:
+        values = load_params(arguments.params) if arguments.params else {}
+        values.update(parse_override(text) for text in arguments.overrides)
+        return config_from_mapping(values)
+    except ConfigError as error:
+        raise UsageError(error) from None
+
+
+def _labels(bags: Sequence[str]) -> list[str]:
+    """Name the recordings, all differently, for the names of output files."""
+    names = [Path(bag).resolve().name.split('.')[0] or 'bag' for bag in bags]
+    return [name if names.count(name) == 1 else f'{name}_{index + 1}'
+            for index, name in enumerate(names)]
+
+
+def _with_label(path: str, label: str) -> str:
+    if not label:
+        return path
+    return str(Path(path).with_stem(f'{Path(path).stem}_{label}'))
+
+
+def _check_writable(path: str | None) -> None:
+    """Find out before the work whether its result can be written."""
+    if path is None:
+        return
+    folder = Path(path).parent
+    if not folder.is_dir():
+        raise UsageError(f'cannot write {path}: there is no directory {folder}')
+    if Path(path).is_dir():
+        raise UsageError(f'cannot write {path}: it is a directory')
+    if not os.access(folder, os.W_OK):
+        raise UsageError(f'cannot write {path}: no permission to write to {folder}')
+
+
+def _check_plot(path: str) -> None:
+    from importlib.util import find_spec
+
+    from ins_align.report import PLOT_SUFFIXES
+
+    if Path(path).suffix.lower() not in PLOT_SUFFIXES:
+        raise UsageError(f'cannot draw {path}: its name must end with one of '
+                         f'{", ".join(PLOT_SUFFIXES)}')
+    if find_spec('matplotlib') is None:
+        raise UsageError('--plot needs matplotlib, which is not installed: '
+                         'pip install matplotlib')
+
+
+def _write(path: str, write: Callable[[IO[bytes]], Any]) -> None:
+    from ins_align.report import write_whole
+
+    try:
+        write_whole(path, write)
+    except OSError as error:
+        raise UsageError(f'cannot write {path}: {error.strerror}') from None
+
+
+def _missing(error: ModuleNotFoundError) -> str:
+    """Say what to install; a module of our own that is missing is a bug."""
+    if (error.name or 'ins_align').startswith('ins_align'):
+        raise error
+    return f'{error.name} is not installed: pip install rosbags python-ins'
+
+
+def run_simulate(arguments: argparse.Namespace) -> int:
+    """Run ``ins_align simulate``."""
+    from ins_align.simulation import simulate, SimulationError, write_bag
+
+    options = {name: value for name, value in vars(arguments).items()
+               if name not in ('command', 'run', 'out', 'storage', 'scenario')}
+    try:
+        write_bag(simulate(arguments.scenario, **options), arguments.out, arguments.storage)
+    except SimulationError as error:
+        raise UsageError(error) from None
+    except ModuleNotFoundError as error:
+        raise UsageError(_missing(error)) from None
+    except OSError as error:
+        raise UsageError(f'cannot write {arguments.out}: {error.strerror}') from None
+    print(f'{arguments.out}: {arguments.scenario}, {arguments.imu_grade} IMU, '
+          f'seed {arguments.seed}; parameters that suit it: {arguments.out}/ins_align.yaml')
+    return 0
+
+
+def run_experiment(arguments: argparse.Namespace) -> int:
+    """Run ``ins_align experiment``."""
+    from ins_align import experiments
+
+    try:
+        experiments.run(arguments.name, Path(arguments.out),
+                        data_dir=None if arguments.data is None else Path(arguments.data),
+                        runs=arguments.runs, jobs=arguments.jobs)
+    except experiments.ExperimentError as error:
+        raise UsageError(error) from None
+    return 0
+
+
+class Progress:
+    """
+    One bar over all recordings, on a terminal and with tqdm; otherwise nothing.
+
+    Parameters
+    ----------
+    bar : tqdm or None
+        Counts recordings.
+    """
+
+    def __init__(self, bar: Any) -> None:
+        self._bar = bar
+
+    @contextmanager
+    def bag(self, index: int) -> Iterator[Callable[[float], None]]:
+        """Give the function that says how much of recording `index` has been read."""
+        self._advance(float(index))
+        yield lambda part: self._advance(index + part)
+        self._advance(index + 1.0)
+
+    def print(self, text: str) -> None:
+        """Write to standard output without tearing the bar."""
+        self._write(text, sys.stdout)
+
+    def note(self, text: str) -> None:
+        """Write to standard error without tearing the bar."""
+        self._write(text, sys.stderr)
+
+    def _advance(self, position: float) -> None:
+        if self._bar is not None and position > self._bar.n:
+            self._bar.update(position - self._bar.n)
+
+    def _write(self, text: str, file: IO[str]) -> None:
+        if self._bar is None:
+            print(text, file=file)
+        else:
+            self._bar.write(text, file=file)
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Progress]:
+    bar = None
+    if sys.stderr.isatty():
+        try:
+            from tqdm import tqdm
+            bar = tqdm(total=total, file=sys.stderr, leave=False,
+                       bar_format='{percentage:3.0f}% |{bar}| {elapsed}, {remaining} left')
+        except ImportError:
+            pass
+    try:
+        yield Progress(bar)
+    finally:
+        if bar is not None:
+            bar.close()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,303 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The command line: exit statuses, outputs, and one sentence for whatever is wrong."""
+
+import contextlib
+import fcntl
+import json
+import os
+from pathlib import Path
+import pty
+import signal
+import struct
+import subprocess
+import sys
+import termios
+
+from ins_align.cli import main, SCENARIOS
+import pytest
+from recordings import FIX, IMU, real_recording, TWIST, write_recording
+
+COMMAND = [sys.executable, '-m', 'ins_align.cli']
+
+
+@pytest.fixture(scope='module')
+def flight(tmp_path_factory):
+    """Make a simulated flight with the command itself."""
+    path = tmp_path_factory.mktemp('cli') / 'flight'
+    assert main(['simulate', str(path), '--scenario', 'flight', '--imu', 'mems', '--seed', '1',
+                 '--lever-arm', '1', '1', '1', '--duration', '40', '--gnss-rate', '5']) == 0
+    return path
+
+
+@pytest.fixture(scope='module')
+def standing(tmp_path_factory):
+    """Record a vehicle that stands still: heading is never found."""
+    return write_recording(tmp_path_factory.mktemp('cli') / 'standing', 'sqlite3', 20.0)
+
+
+def one_sentence(capsys):
+    """Return what went to standard error after checking that it is one line."""
+    captured = capsys.readouterr()
+    assert captured.err.count('\n') == 1, captured.err
+    assert 'Traceback' not in captured.err
+    assert captured.out == ''
+    return captured.err
+
+
+def test_aligned(flight, tmp_path, capsys):
+    outputs = {name: tmp_path / f'out.{name}' for name in ('json', 'csv', 'png')}
+    assert main(['replay', str(flight), '--set', 'lever_arm=[1,1,1]', '--json',
+                 str(outputs['json']), '--csv', str(outputs['csv']),
+                 '--plot', str(outputs['png'])]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ''
+    assert 'ALIGNED after' in captured.out
+    result = json.loads(outputs['json'].read_text())
+    assert list(result) == [
+        'bag', 'aligned', 'state', 'reason', 't0', 'time_to_align_s', 'initial_attitude',
+        'final_attitude', 'gyro_bias_rad_s', 'accel_bias_m_s2', 'lever_arm_m', 'gnss_delay_s',
+        'counts']
+    assert result['aligned'] is True and result['state'] == 'ALIGNED'
+    assert type(result['t0']) is int and type(result['final_attitude']['stamp']) is int
+    assert list(result['initial_attitude']) == [
+        'quaternion_xyzw', 'roll_deg', 'pitch_deg', 'yaw_deg', 'sigma_deg']
+    lines = outputs['csv'].read_text().splitlines()
+    assert lines[0].startswith('stamp_ns,t_s,state,qx,qy,qz,qw,sigma_e_deg,sigma_n_deg,'
+                               'sigma_u_deg,current_qx,')
+    assert len(lines) == 1 + result['counts']['epochs_used']
+    assert outputs['png'].read_bytes().startswith(b'\x89PNG')
+    assert sorted(tmp_path.iterdir()) == sorted(outputs.values())
+
+
+def test_parameter_file_of_the_simulation(flight, capsys):
+    assert main(['replay', str(flight), '--params', str(flight / 'ins_align.yaml')]) == 0
+
+
+def test_not_aligned(standing, tmp_path, capsys):
+    assert main(['replay', str(standing), '--json', str(tmp_path / 'a.json')]) == 1
+    result = json.loads((tmp_path / 'a.json').read_text())
+    assert result['aligned'] is False
+    assert result['state'] != 'ALIGNED' and result['reason']
+    assert result['time_to_align_s'] is None
+
+
+def test_start_and_duration(flight, tmp_path, capsys):
+    main(['replay', str(flight), '--start', '10', '--duration', '5', '--json',
+          str(tmp_path / 'a.json')])
+    assert json.loads((tmp_path / 'a.json').read_text())['counts']['imu'] == 500
+
+
+def test_nothing_left_after_start(flight, tmp_path, capsys):
+    assert main(['replay', str(flight), '--start', '1000', '--json', str(tmp_path / 'a.json'),
+                 '--csv', str(tmp_path / 'a.csv'), '--plot', str(tmp_path / 'a.png')]) == 1
+    result = json.loads((tmp_path / 'a.json').read_text())
+    assert result['initial_attitude'] is None and result['final_attitude'] is None
+    assert result['t0'] is None
+    assert len((tmp_path / 'a.csv').read_text().splitlines()) == 1
+
+
+def test_several_recordings(flight, standing, tmp_path, capsys):
+    missing = tmp_path / 'none'
+    arguments = ['--set', 'lever_arm=[1,1,1]', '--json', str(tmp_path / 'a.json'), '--csv',
+                 str(tmp_path / 'a.csv'), '--plot', str(tmp_path / 'a.svg')]
+    assert main(['replay', str(flight), str(standing), *arguments]) == 1
+    results = json.loads((tmp_path / 'a.json').read_text())
+    assert [result['aligned'] for result in results] == [True, False]
+    assert [result['bag'] for result in results] == [str(flight), str(standing)]
+    assert {path.name for path in tmp_path.iterdir()} == {
+        'a.json', 'a_flight.csv', 'a_standing.csv', 'a_flight.svg', 'a_standing.svg'}
+    capsys.readouterr()
+    assert main(['replay', str(missing), str(standing), '--json', str(tmp_path / 'a.json')]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count('\n') == 1 and 'does not exist' in captured.err
+    results = json.loads((tmp_path / 'a.json').read_text())
+    assert 'does not exist' in results[0]['error']
+    assert results[1]['state']
+
+
+def test_same_name_twice(standing, tmp_path, capsys):
+    assert main(['replay', str(standing), str(standing), '--csv', str(tmp_path / 'a.csv')]) == 1
+    assert {path.name for path in tmp_path.iterdir()} == {'a_standing_1.csv', 'a_standing_2.csv'}
+
+
+@pytest.mark.parametrize('arguments, message', [
+    (['--set', 'lever_arm=[1,2]'], 'lever_arm must be three numbers'),
+    (['--set', 'lever_arm=[1,2,.nan]'], 'finite'),
+    (['--set', 'lever_arm=[1,2,.inf]'], 'finite'),
+    (['--set', 'lever_am=[1,2,3]'], 'did you mean lever_arm'),
+    (['--set', 'method'], 'NAME=VALUE'),
+    (['--params', 'no/such/file.yaml'], 'No such file'),
+    (['--imu-topic', '/no/such'], 'has no topic /no/such; it has /fix'),
+    (['--imu-topic', '/fix'], 'IMU needs sensor_msgs/Imu'),
+    (['--velocity-topic', '/fix'], 'velocity needs'),
+    (['--json', 'no/such/directory/a.json'], 'there is no directory'),
+    (['--json', '.'], 'is a directory'),
+    (['--plot', 'a.xyz'], 'must end with'),
+    (['--plot', 'a'], 'must end with')])
+def test_wrong_arguments(standing, capsys, arguments, message):
+    assert main(['replay', str(standing), *arguments]) == 2
+    assert message in one_sentence(capsys)
+
+
+@pytest.mark.parametrize('arguments', [
+    [], ['replay'], ['fly'], ['replay', 'x', '--start', '-1'], ['replay', 'x', '--start', 'nan'],
+    ['replay', 'x', '--nothing'], ['simulate'], ['simulate', 'x', '--seed', 'a'],
+    ['simulate', 'x', '--lever-arm', '1', '2'], ['experiment', 'x']])
+def test_wrong_usage(capsys, arguments):
+    with pytest.raises(SystemExit) as info:
+        main(arguments)
+    assert info.value.code == 2
+    assert '--help' in one_sentence(capsys)
+
+
+@pytest.mark.parametrize('content, message', [
+    (b'', 'is empty'), (b'x' * 100, 'no recording'), (None, 'does not exist')])
+def test_unusable_files(tmp_path, capsys, content, message):
+    path = tmp_path / 'a.mcap'
+    if content is not None:
+        path.write_bytes(content)
+    assert main(['replay', str(path), '--json', str(tmp_path / 'a.json')]) == 2
+    assert message in one_sentence(capsys)
+    assert not (tmp_path / 'a.json').exists()
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
+def test_no_imu(tmp_path, capsys, kind):
+    path = write_recording(tmp_path / 'a.bag', kind, 1.0, {'/fix': FIX, '/fix_velocity': TWIST})
+    assert main(['replay', str(path)]) == 2
+    assert 'no IMU topic (sensor_msgs/Imu); it has /fix, /fix_velocity' in one_sentence(capsys)
+
+
+def test_reference_alone_is_no_imu(tmp_path, capsys):
+    path = write_recording(tmp_path / 'a', 'mcap', 1.0, {'/fix': FIX, '/reference/imu': IMU})
+    assert main(['replay', str(path)]) == 2
+    assert 'no IMU topic' in one_sentence(capsys)
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
+def test_cut_off_to_nothing(tmp_path, capsys, kind):
+    path = write_recording(tmp_path / 'a.bag', kind, 5.0)
+    file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix != '.yaml')
+    file.write_bytes(file.read_bytes()[:64])
+    assert main(['replay', str(path)]) == 2
+    assert 'cut off' in one_sentence(capsys)
+
+
+def test_cut_off_is_used_as_far_as_it_goes(flight, tmp_path, capsys):
+    file = next(flight.glob('*.mcap'))
+    (tmp_path / 'cut.mcap').write_bytes(file.read_bytes()[:-1_000_000])
+    status = main(['replay', str(tmp_path / 'cut.mcap'), '--set', 'lever_arm=[1,1,1]'])
+    captured = capsys.readouterr()
+    assert status == 0
+    assert captured.err == ('ins_align replay: warning: cut.mcap was cut off or not closed: '
+                            'it is read as far as it goes\n')
+
+
+@pytest.mark.parametrize('name', ['uav_thor75', 'car_drive0708', 'quad_dot08.bag'])
+@pytest.mark.parametrize('method', ['vif', 'map'])
+def test_real_recordings(tmp_path, capsys, name, method):
+    path = real_recording(name)
+    status = main(['replay', str(path), '--set', f'method={method}', '--duration', '60',
+                   '--json', str(tmp_path / 'a.json'), '--csv', str(tmp_path / 'a.csv'),
+                   '--plot', str(tmp_path / 'a.png')])
+    assert status in (0, 1)
+    result = json.loads((tmp_path / 'a.json').read_text())
+    assert result['aligned'] == (status == 0)
+    assert result['counts']['imu'] > 1000
+
+
+def test_failed_output_leaves_the_old_file(flight, tmp_path, capsys, monkeypatch):
+    from ins_align import replay
+    (tmp_path / 'a.csv').write_text('old')
+    monkeypatch.setattr(replay.ReplayResult, 'to_csv', lambda self: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(['replay', str(flight), '--csv', str(tmp_path / 'a.csv')])
+    assert (tmp_path / 'a.csv').read_text() == 'old'
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_simulate_refuses_in_a_sentence(tmp_path, capsys):
+    assert main(['simulate', str(tmp_path / 'a'), '--scenario', 'submarine']) == 2
+    assert 'flight' in one_sentence(capsys)
+    assert main(['simulate', str(tmp_path), '--duration', '1']) == 2
+    assert 'exists already' in one_sentence(capsys)
+    assert main(['simulate', str(tmp_path / 'a'), '--imu', 'perfect']) == 2
+    assert 'mems' in one_sentence(capsys)
+
+
+def test_simulate_passes_its_options_on(tmp_path, capsys):
+    from ins_align.bags import Bag
+    assert main(['simulate', str(tmp_path / 'a'), '--duration', '10', '--imu-rate', '50',
+                 '--gnss-rate', '2', '--outage', '2', '8', '--storage', 'sqlite3']) == 0
+    with Bag(tmp_path / 'a') as bag:
+        names = [topic.name for topic, _, _ in bag.messages(bag.topics)]
+    assert names.count('/imu/data_raw') in (500, 501)
+    assert names.count('/fix') == 8
+
+
+def test_help_names_the_scenarios():
+    from ins_align.simulation import SCENARIOS as simulated
+    assert SCENARIOS.split(', ') == list(simulated)
+
+
+@pytest.mark.parametrize('arguments', [['--help'], ['replay', '--help'], ['simulate', '--help'],
+                                       ['experiment', '--help']])
+def test_help_imports_nothing_heavy(arguments):
+    code = ('import sys; from ins_align.cli import main\n'
+            'try: main(sys.argv[1:])\n'
+            'except SystemExit as stop: assert stop.code == 0\n'
+            'assert not {"numpy", "rosbags", "matplotlib", "yaml"} & set(sys.modules)')
+    subprocess.run([sys.executable, '-c', code, *arguments], check=True,
+                   stdout=subprocess.DEVNULL, cwd=Path(__file__).parents[1])
+
+
+def test_interrupt(flight):
+    """Ctrl-C leaves without a traceback."""
+    process = subprocess.Popen([*COMMAND, 'replay', *[str(flight)] * 200],
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                               cwd=Path(__file__).parents[1])
+    process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert errors == ''
+
+
+def test_reader_that_leaves(flight):
+    """As in ``ins_align replay ... | head -1``."""
+    process = subprocess.Popen([*COMMAND, 'replay', *[str(flight)] * 200],
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                               cwd=Path(__file__).parents[1])
+    process.stdout.readline()
+    process.stdout.close()
+    assert process.stderr.read() == ''
+    process.wait(timeout=60)
+
+
+def test_progress_bar_on_a_terminal(flight, tmp_path):
+    pytest.importorskip('tqdm')
+    master, slave = pty.openpty()
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack('4H', 24, 80, 0, 0))
+    process = subprocess.Popen([*COMMAND, 'replay', str(flight)], stdout=subprocess.PIPE,
+                               stderr=slave, text=True, cwd=Path(__file__).parents[1])
+    os.close(slave)
+    shown = b''
+    with contextlib.suppress(OSError):  # the terminal goes away with the process
+        while piece := os.read(master, 4096):
+            shown += piece
+    os.close(master)
+    out, _ = process.communicate(timeout=60)
+    assert b'%' in shown
+    assert 'ALIGN' in out and '%' not in out
