@@ -1,0 +1,484 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+The estimation problem solved in one go, all noise covariances written out: the reference.
+
+It shares neither integration nor recursion with the package: attitude, velocity and position are
+integrated by plain sums at the IMU's instants, the Earth is python-ins', and the covariance of
+the random-walk errors of all epochs is one dense matrix. On the true motion its inverse
+information is the Cramer-Rao bound; on the measured data it gives the estimate that the recursion
+must match. Cost grows with the cube of the number of epochs: 500 take about a second.
+
+The unknowns are in the order of `ins_align.estimator`; velocity rows come before position rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from ins_align.config import ImuNoise
+from ins_align.estimator import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO_BIAS, LEVER_ARM, SIZE,
+                                 START_POSITION, START_VELOCITY)
+from ins_align.messages import ENU_FROM_NED
+from ins_align.rotation import Array, skew
+from ins_align.simulation import Simulation
+import numpy as np
+
+# Nothing more than "somewhere on the circle" is known of an angle (rad): keeps the information
+# regular where the motion shows no heading.
+_ATTITUDE_STD = math.pi / math.sqrt(3)
+
+
+@dataclass(frozen=True)
+class Bound:
+    """
+    Cramer-Rao bound of the initial attitude after each GNSS epoch.
+
+    Attributes
+    ----------
+    time : ndarray, shape (K,)
+        Seconds since t0, the first epoch.
+    covariance : ndarray, shape (K, 3, 3)
+        Of the small rotation about the axes of ENU, rad^2.
+    """
+
+    time: Array
+    covariance: Array
+
+    def at(self, seconds: float) -> Array:
+        """Return the bound after the last epoch up to `seconds` after t0."""
+        return self.covariance[np.searchsorted(self.time, seconds + 1e-6) - 1]
+
+
+@dataclass(frozen=True)
+class DenseSolution:
+    """
+    The estimate from all epochs at once.
+
+    Attributes
+    ----------
+    C : ndarray, shape (3, 3)
+        ``C_nb(t0)``.
+    unknowns : ndarray, shape (19,)
+        Biases, start, lever arm, delay in their places, the first three zero. The start is that
+        of the IMU with respect to inertial space.
+    covariance : ndarray, shape (19, 19)
+        Zero where something is not estimated.
+    chi2 : float
+        Sum of squares of the whitened residuals and the prior's.
+    C_n0b : ndarray, shape (3, 3)
+        Attitude at the last epoch.
+    current_covariance : ndarray, shape (3, 3)
+        Of its error in n0.
+    """
+
+    C: Array
+    unknowns: Array
+    covariance: Array
+    chi2: float
+    C_n0b: Array
+    current_covariance: Array
+
+
+def bound(simulation: Simulation, *, noise: ImuNoise | None = None, use_velocity: bool = True,
+          use_position: bool = False, lever_arm_std: float = 0.0,
+          delay_std: float = 0.0) -> Bound:
+    """
+    Cramer-Rao bound on the true motion of a simulation.
+
+    Parameters
+    ----------
+    simulation : Simulation
+        Its truth, epochs and stated covariances are used; its noise is not.
+    noise : ImuNoise, optional
+        By default that of the simulation.
+    use_velocity, use_position : bool
+    lever_arm_std, delay_std : float
+        Metres per axis and seconds; above 0 they are unknowns too.
+
+    Returns
+    -------
+    Bound
+    """
+    noise = simulation.imu_noise if noise is None else noise
+    epochs = _true_epochs_ns(simulation)
+    path = _true_path(simulation, epochs)
+    H = _design(path, simulation.lever_arm)
+    V = _noise_covariance(path, noise, _measurement_covariance(simulation, path))
+    rows = _rows(len(epochs), use_velocity, use_position)
+    columns, prior = _prior(noise, use_position, lever_arm_std, delay_std)
+    whitened = _whitened(V[np.ix_(rows, rows)], H[rows][:, columns])
+    each = whitened.reshape(len(epochs), -1, len(columns))
+    information = np.cumsum(each.transpose(0, 2, 1) @ each, axis=0) + np.diag(prior)
+    return Bound(path.time, np.array([_inverse(matrix)[:3, :3] for matrix in information]))
+
+
+def dense_solution(simulation: Simulation, *, noise: ImuNoise | None = None,
+                   use_velocity: bool = True, use_position: bool = False,
+                   lever_arm_std: float = 0.0, delay_std: float = 0.0,
+                   lever_arm: Array | None = None, iterations: int = 6) -> DenseSolution:
+    """
+    Gauss-Newton on all measured data of a simulation, from the truth on.
+
+    Parameters
+    ----------
+    simulation : Simulation
+    noise : ImuNoise, optional
+        By default that of the simulation.
+    use_velocity, use_position : bool
+    lever_arm_std, delay_std : float
+        Metres per axis and seconds; above 0 they are estimated, from `lever_arm` and 0 on.
+    lever_arm : array_like, shape (3,), optional
+        By default that of the simulation.
+    iterations : int
+
+    Returns
+    -------
+    DenseSolution
+    """
+    noise = simulation.imu_noise if noise is None else noise
+    stamps = simulation.gnss_stamps_ns
+    rows = _rows(len(stamps), use_velocity, use_position)
+    columns, prior = _prior(noise, use_position, lever_arm_std, delay_std)
+    mean = np.zeros(SIZE)
+    mean[LEVER_ARM] = simulation.lever_arm if lever_arm is None else lever_arm
+    x = mean.copy()
+    x[GYRO_BIAS], x[ACCEL_BIAS] = simulation.gyro_bias, simulation.accel_bias
+    C = simulation.attitude_at(int(stamps[0]))
+    for _ in range(iterations):
+        # A late measurement is one of an earlier instant.
+        path = _measured_path(simulation, C, x)
+        V = _noise_covariance(path, noise, _measurement_covariance(simulation, path))
+        H = _design(path, x[LEVER_ARM])[rows][:, columns]
+        s = _measured_sides(simulation, path)
+        lever_v, lever_p = _lever_terms(path, x[LEVER_ARM])
+        time = path.time[:, None]
+        y = np.stack([s[:, 0] - path.U - lever_v - x[START_VELOCITY],
+                      s[:, 1] - path.P - lever_p - x[START_POSITION]
+                      - time * x[START_VELOCITY]], axis=1).ravel()[rows]
+        both = _whitened(V[np.ix_(rows, rows)], np.column_stack([y, H]))
+        whitened_y, whitened_H = both[:, 0], both[:, 1:]
+        P = _inverse(whitened_H.T @ whitened_H + np.diag(prior))
+        to_mean = (mean - x)[columns]
+        information = prior.copy()
+        information[:3] = 0.0
+        dx = np.zeros(SIZE)
+        dx[columns] = P @ (whitened_H.T @ whitened_y + information * to_mean)
+        left = whitened_y - whitened_H @ dx[columns]
+        chi2 = float(left @ left + np.sum(information * (to_mean - dx[columns]) ** 2))
+        rotation, E = _attitude_error_now(path, noise, V[np.ix_(rows, rows)], rows, y, H,
+                                          dx[columns])
+        current = _rotation(dx[:3] - path.Theta[-1] @ dx[GYRO_BIAS] + rotation) @ path.C[-1]
+        C = _rotation(dx[:3]) @ C
+        x = x + dx
+        x[:3] = 0.0
+    J = np.zeros((3, SIZE))
+    J[:, ATTITUDE], J[:, GYRO_BIAS] = np.eye(3), -path.Theta[-1]
+    J = J[:, columns] - E[:, :len(columns)]
+    covariance = np.zeros((SIZE, SIZE))
+    covariance[np.ix_(columns, columns)] = P
+    return DenseSolution(C, x, covariance, chi2, current, J @ P @ J.T + E[:, len(columns):])
+
+
+@dataclass(frozen=True)
+class _Path:
+    """
+    Integrals over the motion at K epochs, in n0 axes.
+
+    U and P are the first and second integral of the specific force, Theta that of C, Gamma that of
+    ``[U' x] Theta``; M holds the integrals of z z^T, z = (1, U, t U - P).
+    """
+
+    time: Array
+    C: Array              # C_n0b
+    U: Array
+    P: Array
+    Theta: Array
+    int_Theta: Array
+    Gamma: Array
+    int_Gamma: Array
+    M: Array
+    omega: Array          # of the body to inertial space, body axes
+    acceleration: Array   # over ground
+    v_ground: Array
+    C_n0n: Array
+
+
+def _cumulative(time: Array, values: Array) -> Array:
+    """Integral by the trapezoidal rule along the first axis."""
+    h = np.diff(time).reshape((-1,) + (1,) * (values.ndim - 1))
+    return np.concatenate([np.zeros_like(values[:1]),
+                           np.cumsum(h / 2 * (values[1:] + values[:-1]), axis=0)])
+
+
+def _path(time: Array, C: Array, omega: Array, f: Array, at: Array, C_n0n: Array, g_n: Array,
+          v_n: Array) -> _Path:
+    """Integrate along a grid of instants; `at` picks the epochs from it."""
+    force = np.einsum('nij,nj->ni', C, f)
+    U = _cumulative(time, force)
+    P = _cumulative(time, U)
+    Theta = _cumulative(time, C)
+    Gamma = _cumulative(time, skew(force) @ Theta)
+    z = np.hstack([np.ones((len(time), 1)), U, time[:, None] * U - P])
+    M = _cumulative(time, z[:, :, None] * z[:, None, :])
+    gravity = np.einsum('nij,nj->ni', C_n0n, g_n)
+    return _Path(time[at], C[at], U[at], P[at], Theta[at], _cumulative(time, Theta)[at], Gamma[at],
+                 _cumulative(time, Gamma)[at], M[at], omega[at], force[at] + gravity,
+                 np.einsum('nij,nj->ni', C_n0n, v_n), C_n0n)
+
+
+def _grid(imu_ns: np.ndarray, epochs_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Instants of the samples from the first epoch to the last with those of the epochs."""
+    inside = (imu_ns > epochs_ns[0]) & (imu_ns < epochs_ns[-1])
+    grid = np.union1d(imu_ns[inside], epochs_ns)
+    return grid, np.searchsorted(grid, epochs_ns)
+
+
+def _interpolated(stamps_ns: np.ndarray, values: Array, wanted_ns: np.ndarray) -> Array:
+    from scipy.interpolate import CubicSpline
+
+    origin = stamps_ns[0]
+    return CubicSpline((stamps_ns - origin) * 1e-9, values)((wanted_ns - origin) * 1e-9)
+
+
+def _true_epochs_ns(simulation: Simulation) -> np.ndarray:
+    """Instants of the measurements, which may be before their stamps."""
+    return simulation.gnss_stamps_ns - round(simulation.meta['gnss_delay'] * 1e9)
+
+
+def _true_path(simulation: Simulation, epochs_ns: np.ndarray) -> _Path:
+    grid, at = _grid(simulation.imu_stamps_ns, epochs_ns)
+    time = (grid - grid[0]) * 1e-9
+    stamps = simulation.truth_stamps_ns
+    # Longitudes go round at the antimeridian, the Earth-fixed matrices do not.
+    lla = simulation.truth_lla.copy()
+    lla[:, 1] = np.unwrap(lla[:, 1], period=360.0)
+    lla = _interpolated(stamps, lla, grid)
+    C_n0n = _matrices_n0n(lla, lla[0], time)
+    C = C_n0n @ simulation.attitude_at(grid)
+    return _path(time, C, _interpolated(stamps, simulation.truth_gyro, grid),
+                 _interpolated(stamps, simulation.truth_accel, grid), at, C_n0n[at],
+                 _gravity_n(lla[at]),
+                 _interpolated(stamps, simulation.truth_velocity, epochs_ns))
+
+
+def _measured_path(simulation: Simulation, C: Array, x: Array) -> _Path:
+    from scipy.spatial.transform import Rotation
+
+    epochs_ns = simulation.gnss_stamps_ns - round(x[DELAY][0] * 1e9)
+    grid, at = _grid(simulation.imu_stamps_ns, epochs_ns)
+    time = (grid - grid[0]) * 1e-9
+    omega = _interpolated(simulation.imu_stamps_ns, simulation.gyro, grid) - x[GYRO_BIAS]
+    f = _interpolated(simulation.imu_stamps_ns, simulation.accel, grid) - x[ACCEL_BIAS]
+    # Angle of each step with the coning term of a rate that is linear in time.
+    h = np.diff(time)[:, None]
+    steps = Rotation.from_rotvec(h / 2 * (omega[1:] + omega[:-1])
+                                 + h * h / 12 * np.cross(omega[:-1], omega[1:])).as_matrix()
+    attitude = np.empty((len(time), 3, 3))
+    attitude[0] = C
+    for k, step in enumerate(steps):
+        attitude[k + 1] = attitude[k] @ step
+    lla = simulation.lla_deg
+    velocity = simulation.velocity
+    return _path(time, attitude, omega, f, at, _matrices_n0n(lla, lla[0], time[at]),
+                 _gravity_n(lla), velocity)
+
+
+def _measured_sides(simulation: Simulation, path: _Path) -> Array:
+    """Antenna velocity and position in n0 without what gravitation did, shape (K, 2, 3)."""
+    from pyins.earth import gravitation_ecef, RATE
+    from pyins.transform import lla_to_ecef
+
+    lla = simulation.lla_deg
+    r_e = lla_to_ecef(lla)
+    C_en = _matrices_en(lla)
+    to_n0 = C_en[0].T @ _matrices_earth(path.time)
+    v_e = (np.einsum('nij,nj->ni', C_en, simulation.velocity)
+           + np.cross([0.0, 0.0, RATE], r_e))
+    gravitation = np.einsum('nij,nj->ni', to_n0, gravitation_ecef(lla))
+    fallen = _cumulative(path.time, gravitation)
+    return np.stack([np.einsum('nij,nj->ni', to_n0, v_e) - fallen,
+                     np.einsum('nij,nj->ni', to_n0, r_e)
+                     - _cumulative(path.time, fallen)], axis=1)
+
+
+def _matrices_en(lla: Array) -> Array:
+    from pyins.transform import mat_en_from_ll
+
+    return mat_en_from_ll(lla[:, 0], lla[:, 1]) @ ENU_FROM_NED
+
+
+def _matrices_earth(time: Array) -> Array:
+    from pyins.earth import RATE
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(RATE * time[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+
+
+def _matrices_n0n(lla: Array, start: Array, time: Array) -> Array:
+    return _matrices_en(start[None])[0].T @ _matrices_earth(time) @ _matrices_en(lla)
+
+
+def _gravity_n(lla: Array) -> Array:
+    from pyins.earth import gravity
+
+    return np.stack([0 * lla[:, 0], 0 * lla[:, 0], -gravity(lla[:, 0], lla[:, 2])], axis=-1)
+
+
+def _lever_terms(path: _Path, lever_b: Array) -> tuple[Array, Array]:
+    """Velocity and position of the antenna with respect to the IMU, in n0."""
+    return (np.einsum('nij,nj->ni', path.C, np.cross(path.omega, lever_b)), path.C @ lever_b)
+
+
+def _design(path: _Path, lever_b: Array) -> Array:
+    """Derivatives of the measurements to the 19 unknowns, shape (6 K, 19)."""
+    lever_v, lever_p = _lever_terms(path, lever_b)
+    time = path.time[:, None, None]
+    H = np.zeros((len(path.time), 2, 3, SIZE))
+    velocity, position = H[:, 0], H[:, 1]
+    velocity[..., ATTITUDE] = -skew(path.U + lever_v)
+    position[..., ATTITUDE] = -skew(path.P + lever_p)
+    velocity[..., GYRO_BIAS] = (path.Gamma + skew(lever_v) @ path.Theta
+                                + path.C @ skew(lever_b))
+    position[..., GYRO_BIAS] = path.int_Gamma + skew(lever_p) @ path.Theta
+    velocity[..., ACCEL_BIAS] = -path.Theta
+    position[..., ACCEL_BIAS] = -path.int_Theta
+    velocity[..., START_VELOCITY] = np.eye(3)
+    position[..., START_VELOCITY] = time * np.eye(3)
+    position[..., START_POSITION] = np.eye(3)
+    velocity[..., LEVER_ARM] = path.C @ skew(path.omega)
+    position[..., LEVER_ARM] = path.C
+    velocity[..., DELAY] = -path.acceleration[..., None]
+    position[..., DELAY] = -path.v_ground[..., None]
+    return H.reshape(-1, SIZE)
+
+
+def _measurement_covariance(simulation: Simulation, path: _Path) -> Array:
+    """Covariances of velocity and position in n0, shape (K, 2, 3, 3)."""
+    stated = np.stack([simulation.velocity_covariance, simulation.position_covariance])
+    turn = path.C_n0n[:, None]
+    return turn @ stated @ turn.swapaxes(-1, -2)
+
+
+def _turned_by_noise(path: _Path) -> tuple[Array, Array]:
+    """
+    How an angle error at s turns a row: ``-[x x]`` with ``x = B z(s)``.
+
+    Velocity: ``x = U(t) - U(s)``; position: ``x = P(t) - P(s) - (t - s) U(s)``. The lever arm,
+    centimetres of motion per rad, is left out of the noise.
+
+    Returns
+    -------
+    B : ndarray, shape (2 K, 3, 7)
+    M : ndarray, shape (2 K, 7, 7)
+    """
+    B = np.zeros((len(path.time), 2, 3, 7))
+    B[:, 0, :, 0], B[:, 1, :, 0] = path.U, path.P
+    B[:, 0, :, 1:4] = -np.eye(3)
+    B[:, 1, :, 1:4] = -path.time[:, None, None] * np.eye(3)
+    B[:, 1, :, 4:] = np.eye(3)
+    return B.reshape(-1, 3, 7), np.repeat(path.M, 2, axis=0)
+
+
+def _noise_covariance(path: _Path, noise: ImuNoise, measurement: Array) -> Array:
+    """Covariance of all rows: random walks of the IMU and GNSS noise, shape (6 K, 6 K)."""
+    B, M = _turned_by_noise(path)
+    n = len(B)
+    # O[i, a, j, b]: integral of x_i[a] x_j[b] up to the earlier one, i <= j.
+    O = ((B @ M).reshape(3 * n, 7) @ B.reshape(3 * n, 7).T).reshape(n, 3, n, 3)
+    trace = np.einsum('iaja->ij', O)
+    V = -noise.angle_random_walk ** 2 * O.transpose(0, 3, 2, 1)
+    t = np.repeat(path.time, 2)
+    is_position = np.tile([0.0, 1.0], len(path.time))
+    early, late = t[:, None], t[None]
+    # An accelerometer error at s is worth 1 in a velocity, t - s in a position.
+    late_position = early * late - early ** 2 / 2
+    both = early ** 2 * late / 2 - early ** 3 / 6
+    first, second = is_position[:, None], is_position[None]
+    pushed = ((1 - first) * (1 - second) * early + (1 - first) * second * late_position
+              + first * (1 - second) * early ** 2 / 2 + first * second * both)
+    diagonal = (noise.angle_random_walk ** 2 * trace
+                + noise.velocity_random_walk ** 2 * pushed)
+    for axis in range(3):
+        V[:, axis, :, axis] += diagonal
+    V = V.reshape(3 * n, 3 * n)
+    upper = np.kron(np.triu(np.ones((n, n))), np.ones((3, 3)))
+    V = np.where(upper > 0, V, V.T)
+    blocks = V.reshape(n, 3, n, 3)
+    blocks[range(n), :, range(n), :] += measurement.reshape(-1, 3, 3)
+    return V
+
+
+def _attitude_error_now(path: _Path, noise: ImuNoise, V: Array, rows: Array, y: Array, H: Array,
+                        dx: Array) -> tuple[Array, Array]:
+    """
+    Predict the random-walk error of the attitude at the last epoch.
+
+    Returns
+    -------
+    rotation : ndarray, shape (3,)
+    E : ndarray, shape (3, n + 3)
+        What the prediction makes of the columns of H; the covariance of what it leaves.
+    """
+    variance = noise.angle_random_walk ** 2
+    B, M = _turned_by_noise(path)
+    mean = (B @ M[..., :1])[..., 0]
+    cross = variance * skew(mean).transpose(1, 0, 2).reshape(3, -1)[:, rows]
+    solved = np.linalg.solve(V, np.column_stack([y, H, cross.T]))
+    spread = variance * path.time[-1] * np.eye(3) - cross @ solved[:, -3:]
+    n = H.shape[1]
+    E = np.hstack([cross @ solved[:, 1:1 + n], spread])
+    return cross @ solved[:, 0] - E[:, :n] @ dx, E
+
+
+def _rows(epochs: int, use_velocity: bool, use_position: bool) -> Array:
+    """Numbers of the rows that are used, in the order of time."""
+    return np.flatnonzero(np.tile(np.repeat([use_velocity, use_position], 3), epochs))
+
+
+def _prior(noise: ImuNoise, use_position: bool, lever_arm_std: float,
+           delay_std: float) -> tuple[Array, Array]:
+    """Numbers of the unknowns that are estimated, and the prior's information about each."""
+    std = np.full(SIZE, math.inf)
+    std[ATTITUDE] = _ATTITUDE_STD
+    std[GYRO_BIAS], std[ACCEL_BIAS] = noise.gyro_bias_std, noise.accel_bias_std
+    std[LEVER_ARM], std[DELAY] = lever_arm_std, delay_std
+    wanted = std > 0
+    wanted[START_POSITION] = use_position
+    return np.flatnonzero(wanted), std[wanted] ** -2.0
+
+
+def _whitened(V: Array, columns: Array) -> Array:
+    """
+    Solve with the Cholesky factor of V.
+
+    The first rows of the result depend on the first rows of the problem alone: sums over them are
+    those of the problem cut short.
+    """
+    from scipy.linalg import cholesky, solve_triangular
+
+    return solve_triangular(cholesky(V, lower=True), columns, lower=True)
+
+
+def _inverse(matrix: Array) -> Array:
+    """Inverse of a symmetric positive definite matrix whose rows differ widely in scale."""
+    scale = 1 / np.sqrt(np.diag(matrix))
+    return np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
+
+
+def _rotation(vector: Array) -> Array:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(vector).as_matrix()
