@@ -1,0 +1,219 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Replay: the same numbers whatever the format, the blocks, the reference."""
+
+import dataclasses
+import json
+import sqlite3
+
+from ins_align import replay as replay_module
+from ins_align.aligner import Aligner, Attitude
+from ins_align.bag_files import BagError
+from ins_align.config import Config
+from ins_align.decoding import Orientations
+from ins_align.replay import CSV_HEADER, Reference, replay
+from ins_align.rotation import exp_so3, matrix_from_rpy, quaternion_from_matrix
+from ins_align.simulation import feed, simulate, write_bag
+import numpy as np
+import pytest
+from recordings import real_recording, write_recording
+
+CONFIG = Config(lever_arm=(1.0, 1.0, 1.0))
+
+
+@pytest.fixture(scope='module')
+def simulation():
+    return simulate('flight', seed=3, duration=30.0)
+
+
+@pytest.fixture(scope='module')
+def flight(simulation, tmp_path_factory):
+    path = tmp_path_factory.mktemp('replay') / 'flight'
+    write_bag(simulation, path, 'sqlite3')
+    return path
+
+
+@pytest.fixture(scope='module')
+def result(flight):
+    return replay(flight, CONFIG)
+
+
+def numbers(result):
+    """Return all that a result says but the name of the recording."""
+    return {**result.to_json(), 'bag': None}, result.to_csv()
+
+
+def test_same_as_the_messages_without_a_recording(simulation, result):
+    aligner = Aligner(CONFIG)
+    epochs = feed(aligner, simulation)
+    assert [epoch.stamp_ns for epoch in epochs] == [epoch.stamp_ns for epoch in result.epochs]
+    np.testing.assert_array_equal(aligner.status().initial.quaternion_xyzw,
+                                  result.status.initial.quaternion_xyzw)
+    assert aligner.status().counts == result.status.counts
+
+
+@pytest.mark.parametrize('block', [1, 7, 1000])
+def test_blocks_do_not_matter(flight, result, monkeypatch, block):
+    monkeypatch.setattr(replay_module, 'BLOCK', block)
+    assert numbers(replay(flight, CONFIG)) == numbers(result)
+
+
+def test_format_does_not_matter(simulation, result, tmp_path):
+    write_bag(simulation, tmp_path / 'flight', 'mcap')
+    assert numbers(replay(tmp_path / 'flight', CONFIG)) == numbers(result)
+
+
+def test_reference_is_not_read_by_the_alignment(flight, result, tmp_path):
+    """A reference that lies changes the comparison and nothing else."""
+    database = sqlite3.connect(flight / 'flight.db3')
+    liar = sqlite3.connect(tmp_path / 'liar.db3')
+    database.backup(liar)
+    database.close()
+    liar.execute('UPDATE messages SET data = (SELECT data FROM messages m WHERE '
+                 "m.topic_id = (SELECT id FROM topics WHERE name='/reference/imu') LIMIT 1) "
+                 "WHERE topic_id = (SELECT id FROM topics WHERE name='/reference/imu')")
+    liar.commit()
+    liar.close()
+    other = replay(tmp_path / 'liar.db3', CONFIG)
+    assert numbers(other) == numbers(result)
+    assert other.reference.attitude_at(result.status.current.stamp_ns) is None
+    assert result.reference.attitude_at(result.status.current.stamp_ns) is not None
+
+
+def test_error_against_truth(simulation, result):
+    rotation, rpy = result.reference.errors_deg(result.status.initial)
+    assert np.all(np.abs(rotation) < 5.0 * result.status.initial.sigma_deg)
+    np.testing.assert_allclose(
+        result.reference.attitude_at(result.status.current.stamp_ns),
+        simulation.attitude_at(result.status.current.stamp_ns), atol=1e-4)
+
+
+def test_json_and_csv_agree(result):
+    text = json.dumps(result.to_json(), allow_nan=False)
+    final = json.loads(text)['final_attitude']
+    lines = result.to_csv().splitlines()
+    assert lines[0] == CSV_HEADER
+    assert len(lines) == 1 + len(result.epochs)
+    last = dict(zip(lines[0].split(','), lines[-1].split(',')))
+    assert int(last['stamp_ns']) == final['stamp']
+    assert [float(last['current_q' + axis]) for axis in 'xyzw'] == final['quaternion_xyzw']
+    assert [float(last[f'current_sigma_{axis}_deg']) for axis in 'enu'] == final['sigma_deg']
+    assert last['state'] == result.status.state.value
+
+
+def test_window_is_by_recorded_time(flight, simulation):
+    part = replay(flight, CONFIG, start=10.0, duration=5.0)
+    assert part.status.counts['imu'] == 500
+    assert part.track.shape == (25, 3)
+    assert replay(flight, CONFIG, start=10.0).status.counts['imu'] == \
+        len(simulation.imu_stamps_ns) - 1000
+    assert replay(flight, CONFIG, duration=10.0).status.counts['imu'] == 1000
+
+
+def test_progress_goes_up_to_one(flight):
+    seen = []
+    replay(flight, CONFIG, progress=seen.append)
+    assert seen == sorted(seen)
+    assert seen[-1] == 1.0
+
+
+def test_what_cannot_be_decoded_is_counted(flight, tmp_path):
+    database = sqlite3.connect(flight / 'flight.db3')
+    spoilt = sqlite3.connect(tmp_path / 'spoilt.db3')
+    database.backup(spoilt)
+    database.close()
+    for topic, every in (('/imu/data_raw', 100), ('/fix', 10), ('/fix_velocity', 10)):
+        spoilt.execute("UPDATE messages SET data = x'00010000ff' WHERE id IN (SELECT id FROM "
+                       '(SELECT id, row_number() OVER (ORDER BY id) AS number FROM messages '
+                       'WHERE topic_id = (SELECT id FROM topics WHERE name = ?)) '
+                       'WHERE number % ? = 0)', (topic, every))
+    spoilt.commit()
+    spoilt.close()
+    counts = replay(tmp_path / 'spoilt.db3', CONFIG).status.counts
+    assert counts['imu_undecodable'] == 30
+    assert counts['fix_undecodable'] == 15
+    assert counts['velocity_undecodable'] == 15
+    assert counts['imu'] == 3001 - 30
+
+
+def test_body_frame_velocity_is_counted(flight, tmp_path):
+    """Named by the user, refused message by message, with the reason in the counts."""
+    path = write_recording(tmp_path / 'a', 'sqlite3', 3.0)
+    database = sqlite3.connect(path / 'a.db3')
+    rows = database.execute('SELECT messages.id, data FROM messages JOIN topics ON '
+                            "topic_id = topics.id WHERE name = '/fix_velocity'").fetchall()
+    for key, data in rows:
+        database.execute('UPDATE messages SET data = ? WHERE id = ?',
+                         (data.replace(b'gps\0', b'imu\0'), key))
+    database.commit()
+    database.close()
+    assert replay(path).topics.velocity is None
+    counts = replay(path, velocity_topic='/fix_velocity').status.counts
+    assert counts['velocity_body_frame'] == len(rows) == 15
+
+
+def test_positions_only(flight):
+    alone = replay(flight, dataclasses.replace(CONFIG, use_velocity=False))
+    assert alone.topics.velocity is None
+    assert 'velocity' not in alone.status.counts
+    assert alone.status.initial is not None
+
+
+def test_no_recording(tmp_path):
+    with pytest.raises(BagError, match='does not exist'):
+        replay(tmp_path / 'none')
+
+
+def test_uav_velocity_integration_formula():
+    """From 165 s for 30 s of the flight: heading at t0 within 5 deg of the reference."""
+    result = replay(real_recording('uav_thor75'), Config(method='vif'), start=165.0, duration=30.0)
+    _, rpy = result.reference.errors_deg(result.status.initial)
+    assert abs(rpy[2]) < 5.0
+    assert np.all(np.abs(rpy[:2]) < 2.0)
+
+
+def orientations(angles, stamps, variance=0.1):
+    count = len(stamps)
+    covariances = np.zeros((count, 9))
+    covariances[:, 0] = variance
+    return Orientations(np.array(stamps), quaternion_from_matrix(matrix_from_rpy(angles)),
+                        covariances)
+
+
+def test_reference_is_interpolated():
+    reference = Reference(orientations([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0]], [0, 10 ** 9]))
+    np.testing.assert_allclose(
+        reference.attitude_at(5 * 10 ** 8), matrix_from_rpy([0.0, 0.0, np.pi]), atol=1e-12)
+    np.testing.assert_allclose(reference.attitude_at(0), matrix_from_rpy([0.0, 0.0, 3.0]),
+                               atol=1e-12)
+    assert reference.attitude_at(-1) is None
+    assert reference.attitude_at(10 ** 9 + 1) is None
+
+
+def test_reference_has_gaps_and_unknown_attitudes():
+    known = orientations([[0.0, 0.0, 0.1]] * 3, [0, 10 ** 9, 4 * 10 ** 9])
+    assert Reference(known).attitude_at(2 * 10 ** 9) is None
+    assert Reference(known._replace(covariances=np.full((3, 9), -1.0))).attitude_at(0) is None
+    assert Reference(known._replace(quaternions=np.zeros((3, 4)))).attitude_at(0) is None
+    assert Reference(known._replace(quaternions=np.full((3, 4), np.nan))).attitude_at(0) is None
+
+
+def test_errors_are_estimate_less_reference_and_wrap():
+    reference = Reference(orientations([[0.1, 0.0, 3.1]] * 2, [0, 1]))
+    C_nb = matrix_from_rpy([0.1, 0.02, -3.1])
+    rotation, rpy = reference.errors_deg(Attitude.of(0, C_nb, np.eye(3)))
+    np.testing.assert_allclose(rpy, np.degrees([0.0, 0.02, 2.0 * np.pi - 6.2]), atol=1e-9)
+    np.testing.assert_allclose(exp_so3(np.radians(rotation)) @ C_nb,
+                               matrix_from_rpy([0.1, 0.0, 3.1]), atol=1e-12)
+    assert reference.errors_deg(Attitude.of(2, C_nb, np.eye(3))) is None

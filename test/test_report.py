@@ -1,0 +1,129 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Tables, figures, and files that are written whole or not at all."""
+
+import dataclasses
+import math
+from types import SimpleNamespace
+
+from ins_align.config import Config
+from ins_align.replay import replay
+from ins_align.report import format_table, plot, save_figure, summary, write_whole
+from ins_align.simulation import simulate, write_bag
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope='module')
+def result(tmp_path_factory):
+    path = tmp_path_factory.mktemp('report') / 'flight'
+    write_bag(simulate('flight', seed=1, duration=30.0), path)
+    return replay(path, Config(lever_arm=(1.0, 1.0, 1.0)))
+
+
+def test_table_is_aligned():
+    text = format_table([['a', 1.23456, 'x'], ['longer', None, 12], ['n', math.nan]],
+                        ['name', 'value', 'text'], '  ')
+    assert text.splitlines() == [
+        '  name    value  text',
+        '  ------  -----  ----',
+        '  a       1.235     x',
+        '  longer      -    12',
+        '  n           -']
+
+
+def test_table_of_nothing():
+    assert format_table([]) == ''
+    assert format_table([['a', 1]]) == 'a  1'
+
+
+def test_file_is_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / 'a.txt'
+    write_whole(path, lambda file: file.write(b'first'))
+    assert path.read_bytes() == b'first'
+
+    def fail(file):
+        file.write(b'sec')
+        raise RuntimeError('on the way')
+
+    with pytest.raises(RuntimeError):
+        write_whole(path, fail)
+    assert path.read_bytes() == b'first'
+    write_whole(path, lambda file: file.write(b'third'))
+    assert path.read_bytes() == b'third'
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_summary_says_what_matters(result):
+    text = summary(result)
+    assert result.status.state.value in text
+    assert result.status.reason in text
+    assert f'{result.status.initial.yaw_deg:.3f}' in text
+    assert 'error roll' in text
+    assert 'imu 3001' in text
+    assert 'error roll' not in summary(dataclasses.replace(result, reference=None))
+
+
+def test_summary_without_an_attitude(result):
+    status = dataclasses.replace(result.status, initial=None, current=None, counts={},
+                                 time_to_align_s=None)
+    text = summary(dataclasses.replace(result, status=status))
+    assert text.splitlines()[-1] == '  counts: nothing read'
+    assert 'roll' not in text
+
+
+@pytest.mark.parametrize('suffix, magic', [('.png', b'\x89PNG'), ('.pdf', b'%PDF'),
+                                           ('.SVG', b'<?xml')])
+def test_figure_is_saved(result, tmp_path, suffix, magic):
+    path = tmp_path / ('a' + suffix)
+    figure = plot(result)
+    write_whole(path, lambda file: save_figure(figure, file, suffix))
+    assert path.read_bytes().startswith(magic)
+
+
+def drawn(figure):
+    """Return every axes by its label after a layout."""
+    figure.draw_without_rendering()
+    return figure.axes
+
+
+def test_figure_has_labels_with_units_and_no_overlap(result):
+    figure = plot(result)
+    axes = drawn(figure)
+    assert len(axes) == 5
+    for one in axes:
+        assert '(deg' in one.get_ylabel() or '(m)' in one.get_ylabel()
+    renderer = figure.canvas.get_renderer()
+    boxes = [one.get_window_extent(renderer) for one in axes]
+    legends = [one.get_legend().get_window_extent(renderer) for one in axes if one.get_legend()]
+    for index, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[index + 1:])
+        assert not any(box.shrunk(0.99, 0.97).overlaps(legend) for legend in legends)
+    for legend in legends:
+        assert figure.bbox.x0 <= legend.x0 and legend.x1 <= figure.bbox.x1
+
+
+def test_figure_marks_the_declaration(result):
+    first = next(epoch.t_s for epoch in result.epochs if epoch.state.value == 'ALIGNED')
+    tilt = plot(result).axes[0]
+    marks = [line for line in tilt.lines if line.get_label() == 'declared aligned']
+    assert [line.get_xdata()[0] for line in marks] == [first]
+
+
+def test_figure_without_reference_or_epochs(result):
+    assert len(drawn(plot(dataclasses.replace(result, reference=None)))) == 4
+    empty = dataclasses.replace(result, epochs=(), track=np.zeros((0, 3)))
+    assert len(drawn(plot(empty))) == 5
+    unknown = SimpleNamespace(errors_deg=lambda attitude: None)
+    assert len(drawn(plot(dataclasses.replace(result, reference=unknown)))) == 5
