@@ -1,0 +1,193 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What the tests of the node share: the node as a process, messages to play, a listener."""
+
+from contextlib import contextmanager
+from pathlib import Path
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import QuaternionStamped
+from ins_align.bags import Bag
+from ins_align.config import Config
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import Imu
+
+PLAYER = Path(__file__).with_name('node_player.py')
+TOPICS = {'imu': '/imu/data_raw', 'fix': '/fix', 'velocity': '/fix_velocity'}
+# Reliable, for comparisons with replay that stand and fall with every single message.
+RELIABLE = [f'qos_overrides.{topic}.subscription.reliability:=reliable'
+            for topic in TOPICS.values()]
+
+
+class NodeProcess:
+    """`ins_align_node` in a process of its own."""
+
+    def __init__(self, parameters=(), arguments=()):
+        command = [sys.executable, '-m', 'ins_align.node', '--ros-args']
+        for parameter in parameters:
+            command += ['-p', parameter]
+        self._process = subprocess.Popen(
+            [*command, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        self.pid = self._process.pid
+        self.output = ''
+
+    @property
+    def running(self):
+        return self._process.poll() is None
+
+    def stop(self, number=signal.SIGINT):
+        """Send a signal and return the exit status."""
+        if self.running:
+            self._process.send_signal(number)
+        return self.wait()
+
+    def wait(self, timeout=20.0):
+        """Return the exit status; `output` then holds all that was printed."""
+        try:
+            self.output += self._process.communicate(timeout=timeout)[0] or ''
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self.output += self._process.communicate()[0] or ''
+            raise
+        return self._process.returncode
+
+
+@contextmanager
+def running_node(parameters=(), arguments=()):
+    """Run the node; it must still be alive at the end and stop cleanly."""
+    node = NodeProcess(parameters, arguments)
+    try:
+        yield node
+    except BaseException:
+        node.stop(signal.SIGKILL)
+        print(node.output)
+        raise
+    alive = node.running
+    status = node.stop()
+    assert alive, node.output
+    assert status == 0, node.output
+    assert 'Traceback' not in node.output, node.output
+
+
+class Listener:
+    """Hears what the node publishes, in a thread of the test."""
+
+    def __init__(self, *, imu=False, name='listener'):
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self.node = rclpy.create_node(name, context=self._context)
+        self.attitudes, self.statuses, self.diagnostics, self.imus = [], [], [], []
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        for msg_type, topic, store, qos in (
+                (QuaternionStamped, '/ins_align/initial_attitude', self.attitudes, latched),
+                (DiagnosticArray, '/ins_align/status', self.statuses, 100),
+                (DiagnosticArray, '/diagnostics', self.diagnostics, 100)):
+            self.node.create_subscription(msg_type, topic, store.append, qos)
+        if imu:
+            self.node.create_subscription(Imu, '/ins_align/imu', self.imus.append, 10000)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def _spin(self):
+        try:
+            self._executor.spin()
+        except ExternalShutdownException:
+            pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._executor.shutdown()
+        self._thread.join()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    @property
+    def status(self):
+        """The newest status as a dict, empty before the first."""
+        if not self.statuses:
+            return {}
+        return {value.key: value.value for value in self.statuses[-1].status[0].values}
+
+    def count(self, name):
+        return int(self.status.get(name, 0))
+
+    def wait_for(self, condition, timeout=20.0):
+        """Wait until a condition holds; an AssertionError shows the last status."""
+        deadline = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < deadline, self.status
+            time.sleep(0.02)
+
+    def wait_for_next_status(self):
+        """Wait for a status that was made after this call."""
+        seen = len(self.statuses)
+        self.wait_for(lambda: len(self.statuses) > seen + 1)
+
+    def call(self, service_type, name, request):
+        client = self.node.create_client(service_type, name)
+        assert client.wait_for_service(20.0)
+        future = client.call_async(request)
+        self.wait_for(future.done)
+        return future.result()
+
+
+def bag_script(path, until_s=None):
+    """Return what the drivers published when a bag was recorded."""
+    from rosbags.typesys import get_typestore, Stores
+    ros1 = get_typestore(Stores.ROS1_NOETIC)
+    script = []
+    with Bag(path) as bag:
+        topics = bag.choose_topics(Config())
+        wanted = {topic: TOPICS[role] for role, topic in topics._asdict().items()
+                  if role in TOPICS and topic is not None}
+        for topic, time_ns, data in bag.messages(wanted):
+            if until_s is not None and time_ns - bag.start_ns > until_s * 1e9:
+                break
+            if topic.encoding == 'ros1':
+                data = bytes(ros1.ros1_to_cdr(data, topic.msgtype))
+            script.append((time_ns, wanted[topic], topic.msgtype, data))
+    return script
+
+
+@contextmanager
+def playing(script, tmp_path, rate=1.0, reliability='reliable'):
+    """Publish a script from another process, beside what the block does."""
+    path = tmp_path / f'script{len(list(tmp_path.iterdir()))}.pickle'
+    path.write_bytes(pickle.dumps(script))
+    player = subprocess.Popen([sys.executable, PLAYER, path, str(rate), reliability])
+    try:
+        yield player
+        assert player.wait() == 0, 'the player failed'
+    finally:
+        if player.poll() is None:
+            player.kill()
+            player.wait()
+
+
+def play(script, tmp_path, rate=1.0, reliability='reliable'):
+    """Publish a script from another process and wait for its end."""
+    with playing(script, tmp_path, rate, reliability):
+        pass
