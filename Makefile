@@ -60,11 +60,12 @@ docs: $(VENV)/ready
 
 #: make bench                  time and memory of the estimator
 bench: $(VENV)/ready
-	@$(BIN)/python -m ins_align.cli experiment bench --out docs/experiments
+	@$(BIN)/ins_align experiment cost --out docs/experiments
 
-#: make experiments            renews the figures and tables in docs/experiments (an hour or so)
+#: make experiments            renews the figures and tables in docs/experiments; those of real
+#:                             recordings with DATA=folder
 experiments: $(VENV)/ready
-	@$(BIN)/python -m ins_align.cli experiment all --out docs/experiments
+	@$(BIN)/ins_align experiment all --out docs/experiments $(if $(DATA),--data '$(DATA)')
 
 #: make lock                   renews the pinned versions in requirements/ (needs uv)
 lock:
