@@ -23,8 +23,6 @@ from collections import Counter
 from dataclasses import dataclass, field
 import math
 
-import numpy as np
-
 from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer
 from ins_align.config import Config, ConfigError, parameters
 from ins_align.declaration import Declaration, State, Verdict
@@ -37,6 +35,7 @@ from ins_align.plausibility import ForceCheck, VelocityCheck
 from ins_align.preintegration import split_at_epochs, Steps, white_noise
 from ins_align.rotation import (Array, exp_so3, orthonormalized, quaternion_from_matrix,
                                 roll_pitch_yaw)
+import numpy as np
 
 # The IMU may be silent for this long; then the attitude is lost and alignment starts over (s).
 MAX_GAP_S = 2.0
@@ -72,6 +71,7 @@ class Attitude:
         Body to ENU, w >= 0.
     covariance : ndarray, shape (3, 3)
         Of the small rotation about the axes of ENU, rad^2.
+
     """
 
     stamp_ns: int
@@ -145,12 +145,13 @@ class Aligner:
     Parameters
     ----------
     config : Config, optional
+
     """
 
     def __init__(self, config: Config | None = None) -> None:
         """Wait for the first messages."""
         self.config = Config() if config is None else config
-        self.counts: Counter = Counter()
+        self.counts: Counter[str] = Counter()
         self._events: list[str] = []
         self._delay_ns = round(self.config.gnss_delay * 1e9)
         self._lateness_ns = (round(self.config.gnss_lateness * 1e9) + max(self._delay_ns, 0))
@@ -192,8 +193,10 @@ class Aligner:
         Parameters
         ----------
         stamp_ns : int or ndarray, shape (N,)
+            Time of measurement.
         gyro, accel : array_like, shape (3,) or (N, 3)
             Angular rate, rad/s; specific force, m/s^2.
+
         """
         if isinstance(stamp_ns, np.ndarray):
             self._add_imu_array(stamp_ns, np.asarray(gyro, float), np.asarray(accel, float))
@@ -244,6 +247,7 @@ class Aligner:
         ------
         ConfigError
             If anything else differs.
+
         """
         for parameter in parameters():
             if parameter.read_only and (getattr(config, parameter.name)
@@ -423,7 +427,7 @@ class Aligner:
         self._last_ns = stamp_ns
         stamps = self._imu.stamps
         end = int(np.searchsorted(stamps, stamp_ns, side='left')) + 2
-        seconds = (stamps[:end] - start_ns) * 1e-9
+        seconds = np.asarray((stamps[:end] - start_ns) * 1e-9, dtype=float)
         between = np.diff(seconds)
         if seconds.size < 2 or seconds[0] > 0 or np.max(between[max(
                 int(np.searchsorted(seconds, 0.0, side='right')) - 1, 0):-1],
@@ -542,7 +546,7 @@ class Aligner:
         return Status(self._verdict.state, self._verdict.reason, self._last_ns,
                       None if self._method is None else self._method.t0_ns,
                       self._time_to_align_s, self._initial, self._current,
-                      *vars(nuisance).values(), counts=self._all_counts())
+                      **vars(nuisance), counts=self._all_counts())
 
     def _all_counts(self) -> dict[str, int]:
         counts = dict(self.counts)

@@ -72,6 +72,7 @@ def decompressor(compression: str) -> Any:
     ------
     BagError
         If the compression is none that recordings use.
+
     """
     if compression == 'zstd':
         try:
@@ -141,14 +142,14 @@ class ChunkedFile:
 
     @property
     def start_ns(self) -> int | None:
-        """Recorded time of the first message."""
+        """Time at which the first message was recorded."""
         # An mcap chunk without messages says that it starts and ends at 0.
         return min((segment.start_ns for segment in self._segments if segment.end_ns > 0),
                    default=None)
 
     @property
     def end_ns(self) -> int | None:
-        """Recorded time of the last message."""
+        """Time at which the last message was recorded."""
         return max((segment.end_ns for segment in self._segments if segment.end_ns > 0),
                    default=None)
 

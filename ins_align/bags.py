@@ -66,6 +66,7 @@ class Bag:
     ------
     BagError
         If it cannot be read at all. What can be read in part is, with `warnings`.
+
     """
 
     def __init__(self, path: str | os.PathLike) -> None:
@@ -98,12 +99,12 @@ class Bag:
 
     @property
     def start_ns(self) -> int | None:
-        """Recorded time of the first message of any topic; None: there is none."""
+        """Time at which the first message of any topic was recorded; None: there is none."""
         return min((f.start_ns for f in self._files if f.start_ns is not None), default=None)
 
     @property
     def end_ns(self) -> int | None:
-        """Recorded time of the last message where that is known."""
+        """Time at which the last message was recorded, where that is known."""
         return max((f.end_ns for f in self._files if f.end_ns is not None), default=None)
 
     def messages(self, topics: Collection[Topic], start_ns: int | None = None,
@@ -117,6 +118,7 @@ class Bag:
             What to read.
         start_ns, stop_ns : int, optional
             First recorded time and the one to stop before.
+
         """
         start_ns = 0 if start_ns is None else start_ns
         stop_ns = INT64_MAX if stop_ns is None else stop_ns
@@ -193,6 +195,7 @@ class Bag:
         BagError
             If a topic is missing or there is more than one candidate: the text lists them and
             names the option that chooses one.
+
         """
         velocity_topic = velocity_type = None
         imu_topic = self._choose('IMU', '--imu-topic', [IMU_TYPE], imu)

@@ -23,10 +23,9 @@ from collections import Counter
 from dataclasses import dataclass
 import math
 
-import numpy as np
-
 from ins_align.messages import Fix, Velocity
 from ins_align.rotation import Array
+import numpy as np
 
 # Beyond these no sensor measures; such values would overflow the integrals (rad/s, m/s^2, m/s).
 MAX_RATE, MAX_ACCELERATION, MAX_SPEED = 200.0, 2000.0, 2000.0
@@ -47,16 +46,17 @@ class ImuBuffer:
     counts : Counter
         Where samples are counted: ``imu``, ``imu_nan``, ``imu_duplicate``, ``imu_out_of_order``,
         ``imu_late``.
+
     """
 
-    def __init__(self, lateness_ns: int, counts: Counter) -> None:
+    def __init__(self, lateness_ns: int, counts: Counter[str]) -> None:
         """Start empty."""
         self._lateness_ns = lateness_ns
         self._counts = counts
         self.stamps = np.zeros(0, np.int64)
         self.samples = np.zeros((0, 6))
         self._new_stamps: list[int] = []
-        self._new_samples: list = []
+        self._new_samples: list[tuple[float, ...]] = []
         self._new_arrays: list[tuple[np.ndarray, Array]] = []
         self.newest_ns: int | None = None
         self.used_ns = -(1 << 62)
@@ -160,9 +160,10 @@ class GnssBuffer:
         How much later than newer IMU samples a message may arrive.
     counts : Counter
         Where messages are counted.
+
     """
 
-    def __init__(self, lateness_ns: int, counts: Counter) -> None:
+    def __init__(self, lateness_ns: int, counts: Counter[str]) -> None:
         """Start empty."""
         self._lateness_ns = lateness_ns
         self._counts = counts

@@ -22,11 +22,10 @@ from dataclasses import dataclass
 from enum import Enum
 import math
 
-import numpy as np
-
 from ins_align.config import Config
 from ins_align.methods import Fit
 from ins_align.rotation import Array
+import numpy as np
 
 
 class State(str, Enum):
@@ -66,6 +65,7 @@ class Declaration:
     ----------
     config : Config
         ``heading_std_threshold``, ``tilt_std_threshold`` and ``hold_time``.
+
     """
 
     def __init__(self, config: Config) -> None:
@@ -84,13 +84,16 @@ class Declaration:
         Parameters
         ----------
         time_s : float
+            Seconds since the first t0.
         covariances : tuple of ndarray, shape (3, 3)
             Of the attitudes that must be good enough, in ENU.
         fit : Fit
+            How well the data fit the model.
 
         Returns
         -------
         Verdict
+
         """
         if math.isfinite(fit.nis):
             self._recent_nis += (min(fit.nis, 10.0) - self._recent_nis) / RECENT

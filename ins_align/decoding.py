@@ -63,6 +63,7 @@ def deserialize(data: bytes, topic: Topic) -> Any:
     ------
     MessageError
         If the bytes are no message of the topic's type.
+
     """
     store = _typestore(topic.encoding)
     try:
@@ -109,6 +110,7 @@ def _decode(messages: Sequence[bytes], topic: Topic, fields: tuple[tuple[int, in
         Where in the body a field starts, bytes, and how many numbers it has.
     convert : callable
         Makes the same of a message of the library.
+
     """
     count = len(messages)
     columns = [np.zeros(count, np.int64)] + [np.zeros((count, width)) for _, width in fields]

@@ -25,12 +25,15 @@ rows: velocity first, then position; both in n0.
 
 from dataclasses import dataclass, replace
 import math
-
-import numpy as np
+from typing import Any
 
 from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals
 from ins_align.rotation import Array, cross, cumulative_rotations, exp_so3, log_so3, skew
+import numpy as np
+from numpy.typing import NDArray
+
+Index = NDArray[np.integer[Any]]
 
 # A heading is never known worse than uniform on the circle.
 UNIFORM_ANGLE_STD = math.pi / math.sqrt(3)
@@ -58,6 +61,7 @@ class Unknowns:
         Metres.
     delay : float
         Seconds by which a GNSS measurement is older than its stamp.
+
     """
 
     C: Array
@@ -139,6 +143,7 @@ class Measurements:
         Whether the velocity and the position rows hold a measurement.
     gravity, offset : ndarray, shape (K, 3)
         Gravity in n0, and what has to be added to s_v for the velocity over ground in n0.
+
     """
 
     time: Array
@@ -200,6 +205,7 @@ class Chain:
             Transition of the chain's errors over each interval.
         W : ndarray, shape (K, 9, 9)
             What the interval's noise adds to their covariance.
+
         """
         K = interval.duration.size
         R_end = self.R @ cumulative_rotations(interval.R)
@@ -242,9 +248,11 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements, omega: Arra
     Parameters
     ----------
     point : Unknowns
+        Where to linearise.
     chain : Chain
         K epochs of it.
     gnss : Measurements
+        The same K epochs.
     omega, f : ndarray, shape (K, 3)
         Angular rate and specific force at the epochs, bias-corrected.
 
@@ -255,6 +263,7 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements, omega: Arra
         unknown.
     L : ndarray, shape (K, 6, 9)
         Derivative of the model to the chain's errors.
+
     """
     K = gnss.time.size
     C, lever = point.C, point.lever_b
@@ -307,9 +316,10 @@ class Whitener:
         Unknowns that are estimated, out of the 19.
     size : int
         9 when positions are used, 6 when velocities alone are.
+
     """
 
-    def __init__(self, columns: Array, size: int) -> None:
+    def __init__(self, columns: Index, size: int) -> None:
         """Start at t0, where the chain has no error."""
         self._columns = np.concatenate([[0], 1 + columns])
         self._size = size
@@ -334,9 +344,11 @@ class Whitener:
         Parameters
         ----------
         kind : int
+            0 or 1.
         Y, L : ndarray, shapes (3, 20), (3, 9)
             From `sensitivities`.
         covariance : ndarray, shape (3, 3)
+            Of the measurement.
         gate : (dx, P) or None
             Step to the present estimate and its covariance; the innovation is tested against it.
 
@@ -344,6 +356,7 @@ class Whitener:
         -------
         float
             Normalised innovation squared, nan where it was not tested.
+
         """
         L = L[:, :self._size]
         innovation = Y[:, self._columns] - L @ self.X
@@ -393,6 +406,7 @@ class Solution:
     chi2 : float
         Sum of squares of the whitened residuals at the estimate, prior included.
     dof : int
+
     """
 
     point: Unknowns
@@ -422,6 +436,7 @@ class MapEstimator:
         Otherwise they stay at the prior's mean.
     capacity : int
         Epochs that are stored.
+
     """
 
     # Epochs before the first linearisation: fewer leave the q-method no redundancy.
@@ -477,6 +492,7 @@ class MapEstimator:
         ------
         RuntimeError
             When the store is full.
+
         """
         if self.full:
             raise RuntimeError('the store is full: hand over to a new estimator')
@@ -659,6 +675,7 @@ class MapEstimator:
         ------
         RuntimeError
             Before the first solution.
+
         """
         C, _, _, spread = self._now()
         return C, spread[:3, :3]
@@ -727,6 +744,7 @@ class MapEstimator:
             in n0 axes.
         scale : float
             Factor on the covariance, for data that fit worse than stated.
+
         """
         C, v, p, joint = self._now()
         x = self.estimate()
@@ -758,7 +776,7 @@ class MapEstimator:
         return _prior(mean, self.covariance[np.ix_(unknowns, unknowns)], unknowns, False)
 
 
-def _prior(mean: Unknowns, covariance: Array, unknowns: Array, heading_free: bool) -> Prior:
+def _prior(mean: Unknowns, covariance: Array, unknowns: Index, heading_free: bool) -> Prior:
     """Prior from the covariance of some unknowns; nothing is known of the others."""
     information = np.zeros((SIZE, SIZE))
     information[np.ix_(unknowns, unknowns)] = _inverse(covariance)
@@ -782,8 +800,10 @@ def first_prior(gyro_bias_std: float, accel_bias_std: float, lever_b: Array,
     gyro_bias_std, accel_bias_std : float
         rad/s, m/s^2, per axis.
     lever_b : array_like, shape (3,)
+        Lever arm, metres.
     lever_std, delay, delay_std : float
         Metres per axis, seconds.
+
     """
     std = np.full(SIZE, math.inf)
     std[GYRO_BIAS], std[ACCEL_BIAS] = gyro_bias_std, accel_bias_std

@@ -76,6 +76,7 @@ def with_orientation(data: bytes, quaternion_xyzw: np.ndarray | None = None,
         None marks the orientation as not known: covariance[0] = -1.
     covariance : ndarray, shape (3, 3), optional
         rad^2.
+
     """
     orientation = _NO_ORIENTATION
     if quaternion_xyzw is not None and covariance is not None:

@@ -22,8 +22,6 @@ from dataclasses import dataclass, replace
 import math
 from typing import Protocol
 
-import numpy as np
-
 from ins_align.config import Config
 from ins_align.earth import gravity_n
 from ins_align.estimator import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
@@ -31,6 +29,7 @@ from ins_align.estimator import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
 from ins_align.preintegration import preintegrate, Steps
 from ins_align.rotation import Array, orthonormalized
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -49,6 +48,7 @@ class Epoch:
         ENU.
     position_measured : bool
         Whether the position is a measurement to align with.
+
     """
 
     stamp_ns: int
@@ -149,6 +149,7 @@ class MapMethod:
         From an earlier alignment.
     capacity : int
         Epochs that the estimator stores.
+
     """
 
     def __init__(self, config: Config, epoch: Epoch, imu: ImuSteps, use_position: bool,
@@ -283,6 +284,7 @@ class NoteMethod:
         Of no length, at t0.
     use_position : bool
         For ``pif``: integrate positions, not velocities.
+
     """
 
     def __init__(self, config: Config, epoch: Epoch, imu: ImuSteps, use_position: bool) -> None:

@@ -15,10 +15,9 @@
 
 import math
 
-import numpy as np
-
 from ins_align.earth import ecef_from_lla, matrix_en
 from ins_align.rotation import Array
+import numpy as np
 
 # The specific force averages gravity unless the vehicle falls or its units are wrong (m/s^2).
 FORCE_RANGE = 4.0, 30.0
@@ -94,7 +93,7 @@ class VelocityCheck:
 
     @property
     def fault(self) -> str:
-        """What is wrong, in words; empty when nothing is known to be."""
+        """Fault in words; empty when nothing is known to be wrong."""
         if self.bad_in_a_row < CONVICTING:
             return ''
         if self._as_ned_in_a_row >= CONVICTING:

@@ -21,10 +21,9 @@ interpolation. All samples of an interval, and all intervals of a batch, are han
 
 from dataclasses import dataclass, fields
 
+from ins_align.rotation import (Array, cross, cumulative_rotations, exp_so3, left_jacobian, skew)
 import numpy as np
 from numpy.typing import ArrayLike
-
-from ins_align.rotation import (Array, cross, cumulative_rotations, exp_so3, left_jacobian, skew)
 
 
 @dataclass(frozen=True)
@@ -48,6 +47,7 @@ class Intervals:
         Covariance of the errors (rotation at the start, v, p) that the sensors' noise leaves.
     omega, f : ndarray, shape (K, 3)
         Angular rate and specific force at the end of the interval.
+
     """
 
     duration: Array
@@ -107,6 +107,7 @@ class Steps:
     omega, f : ndarray, shape (K, n + 1, 3)
         Angular rate, rad/s, and specific force, m/s^2, at the ends of the steps.
     omega_dot, f_dot : ndarray, shape (K, n + 1, 3)
+
     """
 
     dt: Array
@@ -128,12 +129,14 @@ def split_at_epochs(stamps: Array, gyro: Array, accel: Array, epochs: Array) -> 
     stamps : ndarray, shape (N,)
         Sample times, seconds, strictly increasing, first <= epochs[0], last >= epochs[-1].
     gyro, accel : ndarray, shape (N, 3)
+        Angular rate, rad/s; specific force, m/s^2.
     epochs : ndarray, shape (K + 1,)
         Increasing; two equal ones make an interval of no length.
 
     Returns
     -------
     Steps
+
     """
     # Sample numbers inside each open interval (start, end).
     first = np.searchsorted(stamps, epochs[:-1], side='right')
@@ -177,6 +180,7 @@ def white_noise(stamps: Array, samples: Array) -> Array:
     -------
     ndarray, shape (2,)
         rad/sqrt(s) and m/s/sqrt(s), mean over the axes; 0 for fewer than eight samples.
+
     """
     count = stamps.size - 3
     if count < 5:
@@ -203,6 +207,7 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array,
     Parameters
     ----------
     steps : Steps
+        The samples, cut at the epochs.
     gyro_bias, accel_bias : ndarray, shape (3,)
         Subtracted first.
     angle_random_walk, velocity_random_walk : array_like, shape () or (K, n)
@@ -217,6 +222,7 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array,
     .. [1] P. G. Savage, "Strapdown inertial navigation integration algorithm design, part 1:
        attitude algorithms", J. Guidance, Control, and Dynamics 21(1), 1998.
     .. [2] P. G. Savage, part 2: velocity and position algorithms, 21(2), 1998.
+
     """
     dt = steps.dt
     omega, f = steps.omega - gyro_bias, steps.f - accel_bias
@@ -281,10 +287,9 @@ def _noise(gyro_variance: Array, accel_variance: Array, dt: Array, remaining: Ar
     lever *= np.sqrt(gyro_variance)[..., None, None]
     columns = lever.transpose(0, 2, 1, 3).reshape(dt.shape[0], 9, -1)
     Q = columns @ columns.transpose(0, 2, 1)
-    for rows, columns, weight in ((slice(3, 6), slice(3, 6), 1.0),
-                                  (slice(3, 6), slice(6, 9), remaining),
-                                  (slice(6, 9), slice(3, 6), remaining),
-                                  # dt^2 / 12 is the variance within the step itself
-                                  (slice(6, 9), slice(6, 9), remaining ** 2 + dt ** 2 / 12)):
-        Q[:, rows, columns] += np.sum(accel_variance * weight, axis=1)[:, None, None] * eye
+    v, p = slice(3, 6), slice(6, 9)
+    for row, column, weight in ((v, v, 1.0), (v, p, remaining), (p, v, remaining),
+                                # dt^2 / 12 is the variance within the step itself
+                                (p, p, remaining ** 2 + dt ** 2 / 12)):
+        Q[:, row, column] += np.sum(accel_variance * weight, axis=1)[:, None, None] * eye
     return Q

@@ -78,6 +78,7 @@ def motion_function(name: str, duration: float, heading: float = 0.0, crab: floa
     -------
     callable
         Takes times (n,) in seconds, gives a `Motion`.
+
     """
     scenario = SCENARIOS[name]
     motion = scenario.motion(duration)
@@ -114,6 +115,7 @@ def _profile(durations: Sequence[float], values: Sequence[float], width: float) 
     -------
     scipy.interpolate.PPoly
         Twice continuously differentiable, with exact antiderivatives.
+
     """
     from scipy.interpolate import PPoly
 

@@ -85,10 +85,12 @@ class Simulation:
         Parameters
         ----------
         stamps_ns : int or ndarray, shape (...)
+            Within the recording.
 
         Returns
         -------
         ndarray, shape (..., 3, 3)
+
         """
         stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
         time = (stamps_ns.ravel() - START_NS) * 1e-9
@@ -106,6 +108,7 @@ class Simulation:
         payload : tuple
             For 'imu' the samples since the message before: stamps (n,), gyro (n, 3),
             accel (n, 3). Otherwise a `Fix` or a `Velocity`.
+
         """
         upto = np.searchsorted(self.imu_stamps_ns, self.gnss_arrival_ns, side='right')
         start = 0
@@ -140,7 +143,9 @@ def feed(aligner: Any, simulation: Simulation, *, fix: bool = True,
     Parameters
     ----------
     aligner : Aligner
+        Or whatever has its methods.
     simulation : Simulation
+        What to give it.
     fix, velocity : bool
         Leave out positions or velocities.
 
@@ -148,6 +153,7 @@ def feed(aligner: Any, simulation: Simulation, *, fix: bool = True,
     -------
     list of Epoch
         Of every update and the final flush.
+
     """
     epochs = []
     for kind, payload in simulation.messages():
@@ -217,8 +223,9 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
     gnss_delay : float
         The measurement is older than its stamp by this, s.
     velocity_std, position_std : float
-        Horizontal noise, m/s and m. Vertical: by default the same for velocity, twice that for
-        position.
+        Horizontal noise, m/s and m.
+    velocity_std_vertical, position_std_vertical : float, optional
+        By default the same for velocity, twice that for position.
     position_drift_std, position_drift_time : float
         First-order Gauss-Markov error on top of the white noise, m and s; not in the covariance.
     outages : sequence of (start, end)
@@ -248,6 +255,7 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
     ------
     SimulationError
         If an argument makes no sense.
+
     """
     meta = dict(locals())
     noise = checked_arguments(meta)
@@ -352,6 +360,7 @@ def write_bag(simulation: Simulation, path: str | os.PathLike, storage: str = 'm
     Parameters
     ----------
     simulation : Simulation
+        What to write.
     path : path
         Directory to be made; written whole or not at all.
     storage : str
@@ -361,6 +370,7 @@ def write_bag(simulation: Simulation, path: str | os.PathLike, storage: str = 'm
     ------
     SimulationError
         If the path exists or the storage is not known.
+
     """
     path = Path(path)
     if storage not in STORAGES:

@@ -85,8 +85,10 @@ def write_messages(path, kind, messages, topics):
     kind : str
         One of FORMATS.
     messages : iterable of (topic's name, recorded time, message)
+        In the order in which they are to be written.
     topics : dict
         Message type by name.
+
     """
     from rosbags import rosbag1, rosbag2
     ros1 = kind.startswith('ros1')
