@@ -18,12 +18,13 @@ help:
 #: make demo                   aligns a simulated flight: table of errors, picture
 #: make demo BAG=path          the same for a recording; ARGS='--set lever_arm=[1,0,0.5]'
 demo: $(VENV)/ready
-	@rm -rf build/demo && mkdir -p build/demo
+	@mkdir -p build/demo
 ifdef BAG
 	@$(BIN)/ins_align replay '$(BAG)' $(ARGS) --json build/demo/recording.json \
 	    --csv build/demo/recording.csv --plot build/demo/recording.png || [ $$? -eq 1 ]
 	@echo 'Picture: build/demo/recording.png (the numbers are beside it: .json, .csv)'
 else
+	@rm -rf build/demo/flight
 	@$(BIN)/ins_align simulate build/demo/flight --scenario flight --imu mems --seed 1 \
 	    --lever-arm 1 1 1
 	@$(BIN)/ins_align replay build/demo/flight --set 'lever_arm=[1, 1, 1]' $(ARGS) \
