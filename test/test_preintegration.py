@@ -1,0 +1,286 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Preintegration against quadrature of closed-form motion, re-integration and Monte Carlo."""
+
+from ins_align.preintegration import Intervals, preintegrate, split_at_epochs, white_noise
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+ZERO = np.zeros(3)
+RATE = 100.0
+NOISE = 1e-3, 1e-2     # rad/sqrt(s), m/s/sqrt(s)
+
+
+def omega_of(t):
+    """Angular rate of a lively vehicle with coning, rad/s, shape (..., 3)."""
+    t = np.asarray(t, float)
+    return np.stack([0.5 * np.sin(2.1 * t), 0.4 * np.cos(1.7 * t + 0.3),
+                     0.6 + 0.2 * np.sin(0.9 * t)], axis=-1)
+
+
+def force_of(t):
+    """Specific force with sculling, m/s^2, shape (..., 3)."""
+    t = np.asarray(t, float)
+    return np.stack([2.0 * np.sin(1.3 * t), 1.5 * np.cos(2.1 * t), 9.8 + np.sin(2.9 * t)], axis=-1)
+
+
+def exact(start, end, gyro_bias=ZERO, accel_bias=ZERO):
+    """Attitude, velocity, position by a high-order integrator from `start` to `end`."""
+    def derivative(t, y):
+        R = y[:9].reshape(3, 3)
+        w = omega_of(t) - gyro_bias
+        wx = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+        return np.concatenate([(R @ wx).ravel(), R @ (force_of(t) - accel_bias), y[9:12]])
+
+    y0 = np.concatenate([np.eye(3).ravel(), np.zeros(6)])
+    y = solve_ivp(derivative, (start, end), y0, method='DOP853', rtol=1e-12, atol=1e-13).y[:, -1]
+    return y[:9].reshape(3, 3), y[9:12], y[12:]
+
+
+def samples(duration, rate=RATE, jitter=0.0, seed=0):
+    """Instants around [0, duration] with margin, and what perfect sensors say at them."""
+    index = np.arange(-3, int(duration * rate) + 4, dtype=float)
+    index += jitter * np.random.default_rng(seed).uniform(-1, 1, index.size)
+    stamps = index / rate
+    return stamps, omega_of(stamps), force_of(stamps)
+
+
+def integrated(epochs, rate=RATE, jitter=0.0, gyro_bias=ZERO, accel_bias=ZERO, noise=NOISE):
+    stamps, gyro, accel = samples(epochs[-1], rate, jitter)
+    steps = split_at_epochs(stamps, gyro, accel, np.asarray(epochs, float))
+    return preintegrate(steps, gyro_bias, accel_bias, *noise)
+
+
+def chained(interval):
+    """Attitude, velocity, position over all intervals, the plain way."""
+    R, v, p = np.eye(3), np.zeros(3), np.zeros(3)
+    for k, duration in enumerate(interval.duration):
+        p = p + v * duration + R @ interval.p[k]
+        v = v + R @ interval.v[k]
+        R = R @ interval.R[k]
+    return R, v, p
+
+
+def angle(R_1, R_2):
+    return Rotation.from_matrix(R_1 @ R_2.T).magnitude()
+
+
+@pytest.mark.parametrize('jitter', (0.0, 0.4))
+def test_integrals_are_those_of_the_motion(jitter):
+    R, v, p = exact(0.0, 10.0)
+    interval = integrated([0.0, 10.0], jitter=jitter)
+    assert interval.duration[0] == pytest.approx(10.0, abs=1e-12)
+    assert angle(interval.R[0], R) < 2e-7
+    assert np.allclose(interval.v[0], v, atol=2e-6)
+    assert np.allclose(interval.p[0], p, atol=2e-4)
+
+
+def test_error_falls_faster_than_the_square_of_the_step():
+    R, v, _ = exact(0.0, 2.0)
+    errors = []
+    for rate in (25.0, 50.0, 100.0):
+        interval = integrated([0.0, 2.0], rate=rate)
+        errors.append([angle(interval.R[0], R), np.linalg.norm(interval.v[0] - v)])
+    errors = np.array(errors)
+    assert np.all(errors[:-1] / errors[1:] > 5.0)
+
+
+def test_constant_rate_and_force_in_closed_form():
+    w, f, t = 1.3, np.array([2.0, 0.0, 9.8]), 4.0
+    stamps = np.arange(-2, 43) * 0.1
+    steps = split_at_epochs(stamps, np.tile([0.0, 0.0, w], (45, 1)), np.tile(f, (45, 1)),
+                            np.array([0.0, t]))
+    interval = preintegrate(steps, ZERO, ZERO, *NOISE)
+    assert np.allclose(interval.R[0], Rotation.from_rotvec([0.0, 0.0, w * t]).as_matrix(),
+                       atol=1e-13)
+    expected = [2.0 * np.sin(w * t) / w, 2.0 * (1 - np.cos(w * t)) / w, 9.8 * t]
+    assert np.allclose(interval.v[0], expected, atol=1e-12)
+    expected = [2.0 * (1 - np.cos(w * t)) / w ** 2, 2.0 * (w * t - np.sin(w * t)) / w ** 2,
+                9.8 * t * t / 2]
+    assert np.allclose(interval.p[0], expected, atol=2e-4)
+    assert np.allclose(interval.omega[0], [0.0, 0.0, w])
+    assert np.allclose(interval.f[0], f)
+
+
+@pytest.mark.parametrize('jitter', (0.0, 0.4))
+@pytest.mark.parametrize('inner', (
+    [1.0], [0.0137], [1.003, 1.0049], [0.5, 0.5], [0.2, 0.4, 0.6, 1.9999],
+    list(np.linspace(0.01, 1.97, 97))))
+def test_split_at_any_epochs_is_the_unsplit(inner, jitter):
+    whole = chained(integrated([0.0, 2.0], jitter=jitter))
+    parts = chained(integrated([0.0, *inner, 2.0], jitter=jitter))
+    assert angle(whole[0], parts[0]) < 1e-8
+    assert np.allclose(whole[1], parts[1], atol=1e-7)
+    assert np.allclose(whole[2], parts[2], atol=1e-6)
+
+
+def test_intervals_in_one_batch_are_those_one_by_one():
+    epochs = [0.0, 0.213, 0.4, 1.0, 1.001, 2.0]
+    stamps, gyro, accel = samples(2.0, jitter=0.3)
+    batch = preintegrate(split_at_epochs(stamps, gyro, accel, np.array(epochs)), ZERO, ZERO,
+                         *NOISE)
+    for k in range(len(epochs) - 1):
+        one = preintegrate(split_at_epochs(stamps, gyro, accel, np.array(epochs[k:k + 2])),
+                           ZERO, ZERO, *NOISE)
+        for name, array in vars(one).items():
+            assert np.allclose(array[0], getattr(batch, name)[k], rtol=1e-12, atol=1e-14), name
+
+
+def test_values_at_an_epoch_are_interpolated():
+    epochs = np.array([0.0, 0.5037, 1.0])
+    interval = integrated(epochs)
+    assert np.allclose(interval.omega, omega_of(epochs[1:]), atol=1e-6)
+    assert np.allclose(interval.f, force_of(epochs[1:]), atol=1e-5)
+
+
+def test_interval_without_length_turns_nothing():
+    interval = integrated([0.4, 0.4, 1.0])
+    assert interval.duration[0] == 0
+    assert np.array_equal(interval.R[0], np.eye(3))
+    assert np.all(interval.v[0] == 0) and np.all(interval.p[0] == 0) and np.all(
+        interval.Q[0] == 0)
+    assert np.allclose(interval.omega[0], omega_of(0.4), atol=1e-6)
+
+
+@pytest.mark.parametrize('axis', range(3))
+def test_jacobians_are_the_derivatives_of_the_integration(axis):
+    step = 1e-5
+    epochs = [0.0, 1.5]
+    at = integrated(epochs)
+    for name, size in (('gyro_bias', step), ('accel_bias', step)):
+        bias = size * np.eye(3)[axis]
+        plus, minus = (integrated(epochs, **{name: sign * bias}) for sign in (1, -1))
+        turn = Rotation.from_matrix(plus.R[0] @ minus.R[0].T).as_rotvec() / (2 * size)
+        J_v = (plus.v[0] - minus.v[0]) / (2 * size)
+        J_p = (plus.p[0] - minus.p[0]) / (2 * size)
+        if name == 'gyro_bias':
+            expected = at.J_Rg, at.J_vg, at.J_pg
+        else:
+            expected = np.zeros((1, 3, 3)), at.J_Rg, at.J_pa
+        assert np.allclose(turn, expected[0][0][:, axis], atol=1e-4)
+        assert np.allclose(J_v, expected[1][0][:, axis], atol=2e-3)
+        assert np.allclose(J_p, expected[2][0][:, axis], atol=2e-3)
+
+
+def test_bias_correction_is_re_integration_to_first_order():
+    gyro_bias, accel_bias = np.array([2e-3, -1e-3, 1.5e-3]), np.array([0.05, -0.02, 0.03])
+    corrected = integrated([0.0, 0.2]).bias_corrected(gyro_bias, accel_bias)
+    again = integrated([0.0, 0.2], gyro_bias=gyro_bias, accel_bias=accel_bias)
+    # Second order: 1/2 (2.7e-3 * 0.2)^2 for angles.
+    assert angle(corrected.R[0], again.R[0]) < 3e-7
+    assert np.allclose(corrected.v[0], again.v[0], atol=3e-6)
+    assert np.allclose(corrected.p[0], again.p[0], atol=1e-6)
+    assert np.allclose(corrected.omega[0], again.omega[0], atol=1e-15)
+    assert np.allclose(corrected.f[0], again.f[0], atol=1e-15)
+
+
+def test_bias_correction_takes_a_bias_for_each_interval():
+    interval = integrated([0.0, 0.2, 0.4])
+    gyro, accel = np.array([[1e-3, 0, 0], [0, 2e-3, 0]]), np.array([[0, 0.1, 0], [0.1, 0, 0]])
+    both = interval.bias_corrected(gyro, accel)
+    for k in range(2):
+        one = interval.take(slice(k, k + 1)).bias_corrected(gyro[k], accel[k])
+        assert np.allclose(one.v[0], both.v[k]) and np.allclose(one.R[0], both.R[k])
+
+
+def test_noise_covariance_is_that_of_many_runs():
+    # The noise of neighbouring intervals telescopes at their ends; over one second that is 1 %.
+    duration, rate, runs = 1.0, 100.0, 2000
+    random = np.random.default_rng(11)
+    index = np.arange(-3, int(duration * rate) + 4)
+    stamps = index / rate
+    shape = (runs, stamps.size, 3)
+    gyro = omega_of(stamps) + NOISE[0] * np.sqrt(rate) * random.standard_normal(shape)
+    accel = force_of(stamps) + NOISE[1] * np.sqrt(rate) * random.standard_normal(shape)
+    epochs = np.array([0.0, duration])
+    clean = integrated(epochs, rate=rate)
+    errors = np.empty((runs, 9))
+    for run in range(runs):
+        noisy = preintegrate(split_at_epochs(stamps, gyro[run], accel[run], epochs), ZERO, ZERO,
+                             0.0, 0.0)
+        errors[run, :3] = Rotation.from_matrix(noisy.R[0] @ clean.R[0].T).as_rotvec()
+        errors[run, 3:6] = noisy.v[0] - clean.v[0]
+        errors[run, 6:] = noisy.p[0] - clean.p[0]
+    sample = errors.T @ errors / runs
+    sigma = np.sqrt(np.diag(clean.Q[0]))
+    assert np.allclose(np.sqrt(np.diag(sample)) / sigma, 1.0, atol=0.05)
+    correlation = clean.Q[0] / np.outer(sigma, sigma)
+    assert np.allclose(sample / np.outer(sigma, sigma), correlation, atol=0.09)
+    # Mean normalised squared error: 9 +- 3 sigma of its mean.
+    nees = np.mean(np.sum(errors * np.linalg.solve(clean.Q[0], errors.T).T, axis=1))
+    assert nees == pytest.approx(9.0, rel=0.05)
+
+
+def test_noise_covariance_chains():
+    """Covariance over the whole is that of the parts, propagated."""
+    whole = integrated([0.0, 2.0]).Q[0]
+    parts = integrated([0.0, 0.3, 0.7, 2.0])
+    P, R = np.zeros((9, 9)), np.eye(3)
+    for k, h in enumerate(parts.duration):
+        u, w = R @ parts.v[k], R @ parts.p[k]
+        F = np.eye(9)
+        F[3:6, :3] = -np.cross(np.eye(3), u)
+        F[6:, :3] = -np.cross(np.eye(3), w)
+        F[6:, 3:6] = h * np.eye(3)
+        T = np.kron(np.eye(3), R)
+        P = F @ P @ F.T + T @ parts.Q[k] @ T.T
+        R = R @ parts.R[k]
+    assert np.allclose(P, whole, rtol=2e-3, atol=2e-3 * np.sqrt(np.outer(
+        np.diag(whole), np.diag(whole))))
+
+
+def test_noise_may_differ_from_step_to_step():
+    epochs = np.array([0.0, 1.0])
+    stamps, gyro, accel = samples(1.0)
+    steps = split_at_epochs(stamps, gyro, accel, epochs)
+    uniform = preintegrate(steps, ZERO, ZERO, 1e-3, 0.0).Q[0]
+    first_half = np.where(np.cumsum(steps.dt, axis=1) <= 0.5 + 1e-9, 2e-3, 0.0)
+    halved = preintegrate(steps, ZERO, ZERO, first_half, 0.0).Q[0]
+    assert np.allclose(np.diag(halved)[:3], 2 * np.diag(uniform)[:3], rtol=1e-9)
+    # Angle errors of the first half act longer on the velocity.
+    assert np.all(np.diag(halved)[3:5] > 3 * np.diag(uniform)[3:5])
+
+
+@pytest.mark.parametrize('jitter', (0.0, 0.4))
+@pytest.mark.parametrize('rate', (100.0, 400.0))
+def test_white_noise_is_measured_through_motion(rate, jitter):
+    random = np.random.default_rng(5)
+    count = 6000
+    stamps = (np.arange(count) + jitter * random.uniform(-1, 1, count)) / rate
+    density = 2e-4, 5e-3
+    sample = np.hstack([
+        omega_of(stamps) + density[0] * np.sqrt(rate) * random.standard_normal((count, 3)),
+        force_of(stamps) + density[1] * np.sqrt(rate) * random.standard_normal((count, 3))])
+    # 3 * 6000 correlated differences: a percent or two.
+    assert np.allclose(white_noise(stamps, sample), density, rtol=0.05)
+
+
+def test_white_noise_of_motion_alone_is_nearly_none():
+    stamps = np.arange(1000) / RATE
+    assert np.all(white_noise(stamps, np.hstack([omega_of(stamps), force_of(stamps)])) < 1e-6)
+
+
+def test_white_noise_of_a_handful_of_samples_is_not_told():
+    stamps = np.arange(7) / RATE
+    assert np.array_equal(white_noise(stamps, np.ones((7, 6))), [0.0, 0.0])
+
+
+def test_storage_gives_back_what_was_put():
+    interval = integrated([0.0, 0.2, 0.5])
+    store = Intervals.empty(3)
+    store.put(2, interval, 1)
+    for name, array in vars(store.take(slice(2, 3))).items():
+        assert np.array_equal(array[0], getattr(interval, name)[1]), name
