@@ -32,7 +32,7 @@ from ins_align.messages import Fix, Velocity
 from ins_align.methods import Epoch as MethodEpoch
 from ins_align.methods import ImuSteps, MapMethod, Method, NoteMethod, Nuisance
 from ins_align.plausibility import ForceCheck, VelocityCheck
-from ins_align.preintegration import split_at_epochs, Steps, white_noise
+from ins_align.preintegration import Noise, split_at_epochs, white_noise
 from ins_align.rotation import (Array, exp_so3, orthonormalized, quaternion_from_matrix,
                                 roll_pitch_yaw)
 import numpy as np
@@ -43,16 +43,14 @@ MAX_GAP_S = 2.0
 # (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
 GAP_STEPS = 2.5
 GAP_ANGULAR_ACCELERATION, GAP_JERK = 2.0, 20.0
-# Noise is measured over the interval and this long before it (ns); it replaces the stated one
-# when it is this many times as large.
+# Noise is measured over the interval and this long before it (ns); it counts when it is this
+# many times the stated one.
 NOISE_WINDOW_NS = 500_000_000
 NOISE_EXCESS = 1.25
 # Without GNSS an epoch without measurement is made this often, which bounds the buffer (ns).
 DRY_INTERVAL_NS = 2_000_000_000
 # Positions alone are taken when no velocity came for this long (ns).
 NO_VELOCITY_NS = 2_000_000_000
-# Positions with at most this sigma (m) are good enough to align with beside velocities.
-PRECISE_POSITION_STD = 0.1
 # A fix this far (m) from where the last one and the velocity lead is not believed at first.
 MAX_FIX_JUMP = 300.0
 FIX_JUMPS_BELIEVED = 5
@@ -399,9 +397,9 @@ class Aligner:
             return None
         use_position = self.config.use_position
         if use_position == 'auto':
-            precise = (fix.covariance is not None
-                       and self._position_std(fix) <= PRECISE_POSITION_STD)
-            use_position = epoch.v_n is None or precise
+            # Beside velocities positions gain little and hurt when their errors wander or their
+            # stamps are a few milliseconds off.
+            use_position = epoch.v_n is None
         if epoch.v_n is None and not use_position:
             self._set_verdict(Verdict(State.WAITING_FOR_GNSS, 'no GNSS velocity yet, and '
                                       'use_position is false'))
@@ -439,26 +437,23 @@ class Aligner:
         self._force_check.add(samples[:, 3:])
         steps = split_at_epochs(seconds, samples[:, :3], samples[:, 3:],
                                 np.array([0.0, (stamp_ns - start_ns) * 1e-9]))
-        noise = self._noise_floor(seconds, samples)
+        noise = self._noise(seconds, samples, steps.dt)
         self._imu.forget_before(stamp_ns - NOISE_WINDOW_NS)
         self._imu.used_ns = stamp_ns
-        return self._with_noise(steps, float(np.median(between)), noise)
+        return ImuSteps(steps, noise)
 
-    def _noise_floor(self, seconds: Array, samples: Array) -> Array:
-        """Densities of gyro and accelerometer noise: stated, or measured where that is more."""
+    def _noise(self, seconds: Array, samples: Array, dt: Array) -> Noise:
+        """White noise of each step: stated, measured, and what motion can do in a gap."""
         stated = np.array(self.config.imu_noise[:2])
         measured = white_noise(seconds, samples)
-        return np.where(measured > NOISE_EXCESS * stated, measured, stated)
-
-    def _with_noise(self, steps: Steps, usual: float, noise: Array) -> ImuSteps:
-        """White noise of each step; where samples are missing, what motion can do meanwhile."""
-        gap = np.where(steps.dt > GAP_STEPS * usual, steps.dt, 0.0)
+        excess = np.where(measured > NOISE_EXCESS * stated,
+                          np.sqrt(np.maximum(measured ** 2 - stated ** 2, 0.0)), 0.0)
+        gap = np.where(dt > GAP_STEPS * float(np.median(np.diff(seconds))), dt, 0.0)
         self.counts['imu_gap'] += int(np.count_nonzero(gap))
         # An error of acceleration * dt^2 over the step, as a density: squared, over dt.
         density = gap ** 1.5
-        return ImuSteps(
-            steps, np.hypot(noise[0], GAP_ANGULAR_ACCELERATION * density),
-            np.hypot(noise[1], GAP_JERK * density))
+        return Noise(np.hypot(stated[0], GAP_ANGULAR_ACCELERATION * density),
+                     np.hypot(stated[1], GAP_JERK * density), excess[0], excess[1])
 
     def _lose(self, why: str) -> None:
         """Start the alignment over; biases are kept."""

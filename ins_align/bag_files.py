@@ -27,7 +27,7 @@ import itertools
 from operator import itemgetter
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 import zlib
 
 MAX_CHUNK_BYTES = 1 << 30  # of a chunk, unpacked
@@ -50,6 +50,9 @@ class Topic(NamedTuple):
     name: str
     msgtype: str  # in ROS 2 notation: sensor_msgs/msg/Imu
     encoding: str  # of its messages: cdr or ros1
+
+
+Records = list[tuple[int, int, bytes]]  # recorded time, topic's id, message
 
 
 class Segment(NamedTuple):
@@ -157,31 +160,30 @@ class ChunkedFile:
         """Close the file."""
         self._file.close()
 
-    def messages(self, ids: Collection[int], start_ns: int, stop_ns: int,
-                 ) -> Iterator[tuple[int, int, bytes]]:
-        """Yield recorded time, topic's id, message in the order of recorded time."""
+    def blocks(self, ids: Collection[int], start_ns: int, stop_ns: int) -> Iterator[Records]:
+        """Yield records many at a time, in the order of recorded time."""
         by_time = itemgetter(0)
         segments = [segment for segment in self._segments
                     if segment.end_ns >= start_ns and segment.start_ns < stop_ns]
         starts = [segment.start_ns for segment in segments[1:]] + [INT64_MAX]
         horizons = list(itertools.accumulate(reversed(starts), min))[::-1]
-        pending: list[tuple[int, int, bytes]] = []
+        pending: Records = []
         for segment, horizon in zip(segments, horizons):
             pending += self._records(self._load(segment), ids, start_ns, stop_ns)
             pending.sort(key=by_time)
             ready = bisect.bisect_left(pending, horizon, key=by_time)
             if len(pending) - ready > MAX_PENDING or horizon == INT64_MAX:
                 ready = len(pending)
-            yield from pending[:ready]
+            if ready:
+                yield pending[:ready]
             del pending[:ready]
 
     def _walk(self) -> None:
         """Find segments and topics."""
         raise NotImplementedError
 
-    def _records(self, data: bytes, ids: Collection[int], start_ns: int, stop_ns: int,
-                 ) -> list[tuple[int, int, bytes]]:
-        """Return recorded time, topic's id and message of the wanted records."""
+    def _records(self, data: bytes, ids: Collection[int], start_ns: int, stop_ns: int) -> Records:
+        """Return the wanted records of a segment."""
         raise NotImplementedError
 
     def _warn(self, text: str) -> None:
@@ -207,7 +209,6 @@ class ChunkedFile:
         if self._complete:  # otherwise it has been said that the recording ends early
             self._warn('has a damaged chunk: what could be read of it is used')
 
-    def _check_size(self, size: int, topic: int) -> None:
-        if size > MAX_MESSAGE_BYTES:
-            raise BagError(f'{self._path.name} has a message of {size} bytes on '
-                           f'{self.topics[topic].name}, where {MAX_MESSAGE_BYTES} are allowed')
+    def _refuse_message(self, size: int, topic: int) -> NoReturn:
+        raise BagError(f'{self._path.name} has a message of {size} bytes on '
+                       f'{self.topics[topic].name}, where {MAX_MESSAGE_BYTES} are allowed')

@@ -23,6 +23,7 @@ Layout of the errors of the chain: ``epsilon = (rotation in b0, velocity, positi
 rows: velocity first, then position; both in n0.
 """
 
+from collections import deque
 from dataclasses import dataclass, replace
 import math
 from typing import Any
@@ -39,6 +40,7 @@ Index = NDArray[np.integer[Any]]
 UNIFORM_ANGLE_STD = math.pi / math.sqrt(3)
 # Below this heading sigma (rad) the problem is as good as linear in the heading.
 HEADING_RESOLVED_STD = 0.35
+MEDIAN_CHI2_3 = 2.366
 # Chi-square gate of three rows of innovation: one in 60 000 of good ones fails.
 GATE = 25.0
 VELOCITY, POSITION = slice(0, 3), slice(3, 6)
@@ -193,9 +195,16 @@ class Chain:
         """Return one epoch of a chain over many."""
         return Chain(*(array[index] for array in vars(self).values()))
 
-    def extended(self, interval: Intervals) -> tuple['Chain', Array, Array]:
+    def extended(self, interval: Intervals,
+                 excess: float = 1.0) -> tuple['Chain', Array, Array]:
         """
         Chain K intervals.
+
+        Parameters
+        ----------
+        interval : Intervals
+        excess : float
+            Share of the noise measured in excess of the stated one that is believed.
 
         Returns
         -------
@@ -236,7 +245,7 @@ class Chain:
         F[:, 6:, 3:6] = h * np.eye(3)
         turn = np.zeros((K, 9, 9))
         turn[:, :3, :3] = turn[:, 3:6, 3:6] = turn[:, 6:, 6:] = R
-        W = turn @ interval.Q @ turn.transpose(0, 2, 1)
+        W = turn @ (interval.Q + excess * interval.Q_excess) @ turn.transpose(0, 2, 1)
         return Chain(R_end, v_end, p_end, R_g_end, v_g_end, v_a_end, p_g_end, p_a_end), F, W
 
 
@@ -329,6 +338,7 @@ class Whitener:
         self.rows = 0
         self.rejected = [0, 0]
         self.spurious = 0.0
+        self.log_det = 0.0
 
     def predict(self, F: Array, W: Array) -> None:
         """Go over an interval with transition `F` and noise `W`, shape (9, 9)."""
@@ -337,7 +347,7 @@ class Whitener:
         self.P = F @ self.P @ F.T + W[:self._size, :self._size]
 
     def update(self, kind: int, Y: Array, L: Array, covariance: Array,
-               gate: 'tuple[Array, Array] | None') -> float:
+               gate: 'tuple[Array, Array] | None', gate_scale: float) -> float:
         """
         Take the three rows of a velocity (kind 0) or position (kind 1).
 
@@ -351,6 +361,8 @@ class Whitener:
             Of the measurement.
         gate : (dx, P) or None
             Step to the present estimate and its covariance; the innovation is tested against it.
+        gate_scale : float
+            Factor on the gate.
 
         Returns
         -------
@@ -371,7 +383,7 @@ class Whitener:
                 spread[:2, :2] = (spread[0, 0] + spread[1, 1]) * np.eye(2)
             spread += S
             nis = float(residual @ np.linalg.solve(spread, residual))
-            if not nis < GATE:
+            if not nis < GATE * gate_scale:
                 self.rejected[kind] += 1
                 return nis
         weighted = np.linalg.solve(S, np.hstack([innovation, PL.T]))
@@ -385,6 +397,7 @@ class Whitener:
         P = self.P - PL @ weighted[:, count:]
         self.P = 0.5 * (P + P.T)                  # or rounding grows in the antisymmetric part
         self.rows += 3
+        self.log_det += float(np.linalg.slogdet(S)[1])
         return nis
 
 
@@ -446,10 +459,17 @@ class MapEstimator:
     # It may move once the store has grown by this share, which bounds the mean cost per epoch.
     GROWTH = 0.125
     MAX_ITERATIONS = 4
+    # The share of the excess noise is judged when the store has grown by this share, tried at
+    # steps of this factor, and moved when the log likelihood gains this much.
+    TUNE_FROM, TUNE_GROWTH, TUNE_STEP, TUNE_GAIN = 12, 0.5, 3.0, 1.0
+    MIN_EXCESS, MAX_EXCESS = 0.01, 9.0
+    # Innovations whose median scales the gate, so that noise beyond what is stated does not
+    # turn the good epochs into outliers.
+    GATE_WINDOW = 25
 
     def __init__(self, prior: Prior, *, use_position: bool = False,
                  estimate_lever_arm: bool = False, estimate_delay: bool = False,
-                 capacity: int = 1000) -> None:
+                 capacity: int = 1000, excess: float = 1.0) -> None:
         """Start at t0."""
         wanted = np.ones(SIZE, bool)
         wanted[START_POSITION] = use_position
@@ -464,8 +484,11 @@ class MapEstimator:
         self._gnss = Measurements.empty(capacity)
         self.count = 0
         self.solution: Solution | None = None
-        self._last_fit = 0
+        self._last_fit = self._last_tuned = 0
         self.fits = 0
+        self.excess = excess
+        self._recent: deque[float] = deque(maxlen=self.GATE_WINDOW)
+        self._gate_scale = 1.0
 
     # Input
 
@@ -510,7 +533,12 @@ class MapEstimator:
             return nis
         s = self.solution
         nis = self._extend(s, slice(k, k + 1), (s.dx, s.P))
+        self._recent.extend(nis[np.isfinite(nis)])
+        if len(self._recent) == self.GATE_WINDOW:
+            self._gate_scale = max(1.0, float(np.median(self._recent)) / MEDIAN_CHI2_3)
         self._solve(s)
+        if self.count >= max(self.TUNE_FROM, self._last_tuned * (1 + self.TUNE_GROWTH)):
+            self._tune()
         if (self.nonlinearity() > self.NONLINEARITY
                 and self.count >= self._last_fit * (1 + self.GROWTH)):
             self._fit()
@@ -527,7 +555,7 @@ class MapEstimator:
         biases = self._biases[epochs]
         interval = self._intervals.take(epochs).bias_corrected(
             s.point.gyro_bias - biases[:, :3], s.point.accel_bias - biases[:, 3:])
-        chain, F, W = s.chain.extended(interval)
+        chain, F, W = s.chain.extended(interval, self.excess)
         Y, L = sensitivities(s.point, chain, gnss, interval.omega, interval.f)
         nis = np.full(2, math.nan)
         for k in range(gnss.time.size):
@@ -535,7 +563,8 @@ class MapEstimator:
             for kind, rows in enumerate((VELOCITY, POSITION)):
                 if gnss.present[k, kind]:
                     nis[kind] = s.whitener.update(kind, Y[k, rows], L[k, rows],
-                                                  gnss.covariance[k, kind], gate)
+                                                  gnss.covariance[k, kind], gate,
+                                                  self._gate_scale)
         s.chain = chain.at(-1)
         return nis
 
@@ -594,6 +623,37 @@ class MapEstimator:
             starts.append(replace(starts[0] if starts else self._prior.mean, C=rough))
         solutions = [self._converge(start, gate) for start in starts]
         self.solution = min(solutions, key=lambda s: s.chi2)
+
+    def _tune(self) -> None:
+        """
+        Judge by the likelihood how much of the noise in excess counts.
+
+        Vibration looks like white noise between samples and is less than that over seconds; and
+        other errors grow with it. The overall scale is left to the a-posteriori factor.
+        """
+        self._last_tuned = self.count
+        old = self.solution
+        if old is None or not np.any(self._intervals.Q_excess[:self.count]):
+            return
+        excess, best, gain = self.excess, self._likelihood(old), self.TUNE_GAIN
+        for trial in (excess / self.TUNE_STEP, excess * self.TUNE_STEP):
+            if not self.MIN_EXCESS <= trial <= self.MAX_EXCESS:
+                continue
+            self.excess = trial
+            solution = self._start(self.estimate(old))
+            self._extend(solution, slice(0, self.count), None)
+            self._solve(solution)
+            likelihood = self._likelihood(solution)
+            if likelihood > best + gain:
+                excess, best, gain = trial, likelihood, 0.0
+        self.excess = excess
+        self._fit()
+
+    @staticmethod
+    def _likelihood(s: Solution) -> float:
+        """Log likelihood at the best overall scale of all covariances, but for a constant."""
+        scale = max(s.chi2 / s.dof, 1.0)
+        return -0.5 * (s.whitener.log_det + s.dof * math.log(scale) + s.chi2 / scale)
 
     def _rough_attitude(self, point: Unknowns) -> Array:
         """Centred q-method over the store, with the biases and lever arm of `point`."""

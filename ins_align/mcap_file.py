@@ -19,7 +19,7 @@ from collections.abc import Collection
 import struct
 
 from ins_align.bag_files import (
-    ChunkedFile, INT64_MAX, MAX_DEFINITION_BYTES, ros2_type, Segment, Topic)
+    ChunkedFile, INT64_MAX, MAX_DEFINITION_BYTES, MAX_MESSAGE_BYTES, Records, ros2_type, Segment, Topic)
 
 MAGIC = b'\x89MCAP0\r\n'
 PLAIN_SEGMENT_BYTES = 1 << 22  # of records outside of chunks, read at a time
@@ -134,7 +134,7 @@ class McapFile(ChunkedFile):
         return record[position + 4:end].decode(), end
 
     def _records(self, data: bytes, ids: Collection[int] | None, start_ns: int, stop_ns: int,
-                 ) -> list[tuple[int, int, bytes]]:
+                 ) -> Records:
         records = []
         unpack, head_size = self._MESSAGE.unpack_from, self._MESSAGE.size
         position, size = 0, len(data)
@@ -148,7 +148,8 @@ class McapFile(ChunkedFile):
             if ids is None:
                 records.append((log_time, channel, b''))
             elif channel in ids and start_ns <= log_time < stop_ns:
-                self._check_size(length, channel)
+                if length > MAX_MESSAGE_BYTES:
+                    self._refuse_message(length, channel)
                 records.append((log_time, channel, data[start + head_size:position]))
         if position > size or position < size and not data[position]:
             self._warn_of_damage()

@@ -27,7 +27,7 @@ from ins_align.earth import gravity_n
 from ins_align.estimator import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
                                  MapEstimator, Measurements, Prior, UNIFORM_ANGLE_STD)
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
-from ins_align.preintegration import preintegrate, Steps
+from ins_align.preintegration import Noise, preintegrate, Steps
 from ins_align.rotation import Array, orthonormalized
 import numpy as np
 
@@ -63,11 +63,10 @@ class Epoch:
 
 @dataclass(frozen=True)
 class ImuSteps:
-    """IMU steps up to an epoch and the white noise in each, rad/sqrt(s) and m/s/sqrt(s)."""
+    """IMU steps up to an epoch and the white noise in them."""
 
     steps: Steps
-    angle_random_walk: Array
-    velocity_random_walk: Array
+    noise: Noise
 
 
 @dataclass(frozen=True)
@@ -170,13 +169,14 @@ class MapMethod:
         self._nis = math.nan
         self._add(epoch, imu)
 
-    def _start(self, epoch: Epoch, prior: Prior) -> None:
+    def _start(self, epoch: Epoch, prior: Prior, excess: float = 1.0) -> None:
         self.t0_ns = epoch.stamp_ns
         self._track = InertialTrack(epoch.latitude, epoch.longitude, epoch.altitude)
         self._estimator = MapEstimator(
             prior, use_position=self._use_position,
             estimate_lever_arm=self._config.lever_arm_std > 0,
-            estimate_delay=self._config.gnss_delay_std > 0, capacity=self._capacity)
+            estimate_delay=self._config.gnss_delay_std > 0, capacity=self._capacity,
+            excess=excess)
 
     def advance(self, epoch: Epoch, imu: ImuSteps) -> None:
         """Take the next epoch and the IMU steps before it."""
@@ -199,8 +199,7 @@ class MapMethod:
             np.array([present]), (C_n0n @ gravity_n(epoch.latitude, epoch.altitude))[None],
             -still[None])
         biases = self.biases()
-        interval = preintegrate(imu.steps, *biases, imu.angle_random_walk,
-                                imu.velocity_random_walk)
+        interval = preintegrate(imu.steps, *biases, imu.noise)
         nis = self._estimator.add(interval, *biases, gnss)
         self._last, self._last_epoch = imu, epoch
         self._offered += any(present)
@@ -215,10 +214,10 @@ class MapMethod:
         self._rejected = [fit.rejected_velocity, fit.rejected_position]
         self.moved += 1
         start = replace(self._last_epoch, v_n=None, position_measured=False)
-        self._start(start, prior)
+        self._start(start, prior, self._estimator.excess)
         instant = Steps(np.zeros((1, 1)), *(np.repeat(array[:, -1:], 2, axis=1) for array in (
             steps.omega, steps.f, steps.omega_dot, steps.f_dot)))
-        self._add(start, ImuSteps(instant, np.zeros((1, 1)), np.zeros((1, 1))))
+        self._add(start, ImuSteps(instant, Noise()))
 
     def initial(self) -> tuple[Array, Array] | None:
         """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
@@ -320,7 +319,7 @@ class NoteMethod:
 
     def advance(self, epoch: Epoch, imu: ImuSteps) -> None:
         """Take the next epoch and the IMU steps before it."""
-        interval = preintegrate(imu.steps, self._zero, self._zero, 0.0, 0.0)
+        interval = preintegrate(imu.steps, self._zero, self._zero, Noise())
         self._body.advance(interval, 0)
         time = (epoch.stamp_ns - self.t0_ns) * 1e-9
         place = epoch.latitude, epoch.longitude, epoch.altitude

@@ -45,6 +45,8 @@ class Intervals:
         same integral as J_Rg.
     Q : ndarray, shape (K, 9, 9)
         Covariance of the errors (rotation at the start, v, p) that the sensors' noise leaves.
+    Q_excess : ndarray, shape (K, 9, 9)
+        The same for the noise that was measured in excess of what is stated.
     omega, f : ndarray, shape (K, 3)
         Angular rate and specific force at the end of the interval.
 
@@ -59,13 +61,15 @@ class Intervals:
     J_pg: Array
     J_pa: Array
     Q: Array
+    Q_excess: Array
     omega: Array
     f: Array
 
     @staticmethod
     def empty(capacity: int) -> 'Intervals':
         """Room for `capacity` intervals, to be filled by `put`."""
-        shapes = {'duration': (), 'v': (3,), 'p': (3,), 'omega': (3,), 'f': (3,), 'Q': (9, 9)}
+        shapes = {'duration': (), 'v': (3,), 'p': (3,), 'omega': (3,), 'f': (3,), 'Q': (9, 9),
+                  'Q_excess': (9, 9)}
         return Intervals(**{field.name: np.zeros((capacity,) + shapes.get(field.name, (3, 3)))
                             for field in fields(Intervals)})
 
@@ -93,6 +97,25 @@ class Intervals:
             'p': self.p + (self.J_pg @ gyro_bias[..., None]
                            + self.J_pa @ accel_bias[..., None])[..., 0],
             'omega': self.omega - gyro_bias, 'f': self.f - accel_bias})
+
+
+@dataclass(frozen=True)
+class Noise:
+    """
+    White noise of the sensors in each step, shape () or (K, n).
+
+    Attributes
+    ----------
+    angle_random_walk, velocity_random_walk : array_like
+        rad/sqrt(s) and m/s/sqrt(s), as stated.
+    gyro_excess, accel_excess : array_like
+        What was measured beyond that, in the same units.
+    """
+
+    angle_random_walk: ArrayLike = 0.0
+    velocity_random_walk: ArrayLike = 0.0
+    gyro_excess: ArrayLike = 0.0
+    accel_excess: ArrayLike = 0.0
 
 
 @dataclass(frozen=True)
@@ -195,8 +218,7 @@ def white_noise(stamps: Array, samples: Array) -> Array:
     return np.sqrt(variance * (stamps[-1] - stamps[0]) / (stamps.size - 1))
 
 
-def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array,
-                 angle_random_walk: ArrayLike, velocity_random_walk: ArrayLike) -> Intervals:
+def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise) -> Intervals:
     """
     Integrate the steps of K intervals.
 
@@ -210,8 +232,7 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array,
         The samples, cut at the epochs.
     gyro_bias, accel_bias : ndarray, shape (3,)
         Subtracted first.
-    angle_random_walk, velocity_random_walk : array_like, shape () or (K, n)
-        White noise of the sensors, rad/sqrt(s) and m/s/sqrt(s), in each step.
+    noise : Noise
 
     Returns
     -------
@@ -264,10 +285,12 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array,
     remaining = duration[:, None] - np.cumsum(dt, axis=1) + 0.5 * dt
     v_rest = v[:, None] - v_mid
     p_rest = p[:, None] - (p_end - 0.5 * p_step) - v_mid * remaining[..., None]
-    Q = _noise(dt * np.square(angle_random_walk), dt * np.square(velocity_random_walk),
-               dt, remaining, v_rest, p_rest)
+    Q, Q_excess = (
+        _noise(dt * np.square(gyro), dt * np.square(accel), dt, remaining, v_rest, p_rest)
+        for gyro, accel in ((noise.angle_random_walk, noise.velocity_random_walk),
+                            (noise.gyro_excess, noise.accel_excess)))
     return Intervals(duration, turned[:, -1], v, p, -A_sum[:, -1], v_g[:, -1], p_g, -p_a, Q,
-                     omega[:, -1], f[:, -1])
+                     Q_excess, omega[:, -1], f[:, -1])
 
 
 def _noise(gyro_variance: Array, accel_variance: Array, dt: Array, remaining: Array,
@@ -280,6 +303,8 @@ def _noise(gyro_variance: Array, accel_variance: Array, dt: Array, remaining: Ar
     are those of each step's angle and velocity increment, shape (K, n).
     """
     eye = np.eye(3)
+    if not (np.any(gyro_variance) or np.any(accel_variance)):
+        return np.zeros((dt.shape[0], 9, 9))
     lever = np.zeros(dt.shape + (9, 3))           # error at the end per error of a step's angle
     lever[..., :3, :] = eye
     lever[..., 3:6, :] = -skew(v_rest)

@@ -19,7 +19,7 @@ from collections.abc import Collection, Iterator
 import struct
 
 from ins_align.bag_files import (
-    BagError, ChunkedFile, MAX_DEFINITION_BYTES, ros2_type, Segment, Topic)
+    BagError, ChunkedFile, MAX_DEFINITION_BYTES, MAX_MESSAGE_BYTES, Records, ros2_type, Segment, Topic)
 
 MAGIC = b'#ROSBAG V'
 
@@ -95,14 +95,15 @@ class Rosbag1File(ChunkedFile):
             self.topics[connection] = Topic('/' + name.strip('/'), ros2_type(msgtype), 'ros1')
 
     def _records(self, data: bytes, ids: Collection[int], start_ns: int, stop_ns: int,
-                 ) -> list[tuple[int, int, bytes]]:
+                 ) -> Records:
         records = []
         for fields, body, end in self._split(data):
             if fields.get(b'op') == self._MESSAGE:
                 connection = self._uint(fields.get(b'conn', b''))
                 time_ns = self._time(fields, b'time')
                 if connection in ids and start_ns <= time_ns < stop_ns:
-                    self._check_size(end - body, connection)
+                    if end - body > MAX_MESSAGE_BYTES:
+                        self._refuse_message(end - body, connection)
                     records.append((time_ns, connection, data[body:end]))
         return records
 

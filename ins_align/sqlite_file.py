@@ -93,40 +93,51 @@ class SqliteFile:
         """Close the file."""
         self._database.close()
 
-    def messages(self, ids: Collection[int], start_ns: int, stop_ns: int,
-                 ) -> Iterator[tuple[int, int, bytes]]:
-        """Yield recorded time, topic's id, message in the order of recorded time."""
+    def blocks(self, ids: Collection[int], start_ns: int, stop_ns: int) -> Iterator[Records]:
+        """Yield records many at a time, in the order of recorded time."""
         if self.end_ns is not None:
+            query = (self._SELECT + f'WHERE topic_id IN ({",".join("?" * len(ids))}) '
+                     'AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, rowid')
             try:
-                for row in self._database.execute(
-                        self._SELECT + f'WHERE topic_id IN ({",".join("?" * len(ids))}) '
-                        'AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, rowid',
-                        (*ids, start_ns, stop_ns)):
-                    if self._is_sound(row):
-                        yield row[:3]
-                        start_ns = row[0] + 1
+                cursor = self._database.execute(query, (*ids, start_ns, stop_ns))
+                while rows := cursor.fetchmany(BLOCK):
+                    yield self._sound(rows)
+                    start_ns = rows[-1][0] + 1
                 return
             except sqlite3.Error as error:
                 self._warn_of_damage(error)
-        # The order of time needs the index: without it in the order of recording, to the end or
-        # to the first page that is lost. A page that is lost in part has rows numbered 0.
-        last = 0
-        with contextlib.suppress(sqlite3.Error):
-            for row in self._database.execute(self._SELECT + 'NOT INDEXED ORDER BY rowid'):
-                if row[3] <= last:
-                    return
-                last = row[3]
-                if row[1] in ids and self._is_sound(row) and start_ns <= row[0] < stop_ns:
-                    yield row[:3]
+        yield from self._blocks_as_stored(ids, start_ns, stop_ns)
 
-    def _is_sound(self, row: tuple[Any, int, Any, int]) -> bool:
-        if type(row[2]) is bytes and type(row[0]) is int:
-            return True
-        if type(row[2]) is int:
-            raise BagError(f'{self._path.name} has a message of {row[2]} bytes on '
-                           f'{self.topics[row[1]].name}, where {MAX_MESSAGE_BYTES} are allowed')
-        self._warn('has damaged messages, which are left out')
-        return False
+    def _blocks_as_stored(self, ids: Collection[int], start_ns: int, stop_ns: int,
+                          ) -> Iterator[Records]:
+        """
+        Yield records in the order of recording, to the end or to the first page that is lost.
+
+        The order of time needs the index. A page that is lost in part has rows numbered 0.
+        """
+        last = 0
+        block: Records = []
+        try:
+            for row in self._database.execute(
+                    self._SELECT.replace('topic_id,', 'topic_id, rowid,', 1)
+                    + 'NOT INDEXED ORDER BY rowid'):
+                time_ns, topic, number, data = row
+                if number <= last:
+                    break
+                last = number
+                if topic in ids and type(time_ns) is int and start_ns <= time_ns < stop_ns:
+                    block.append((time_ns, topic, data))
+        except sqlite3.Error:
+            pass
+        for start in range(0, len(block), BLOCK):
+            yield self._sound(block[start:start + BLOCK])
+
+    def _sound(self, rows: list[tuple[Any, int, Any]]) -> Records:
+        """Leave out rows that are no messages; a message that is too long is refused."""
+        if set(map(type, map(itemgetter(2), rows))) == {bytes} == \
+                {bytes if type(row[0]) is int else None for row in rows}:
+            return rows
+        return rows
 
     def _warn_of_damage(self, error: sqlite3.Error) -> None:
         self._warn(f'is damaged ({error}): it is read as far as it goes')
