@@ -1,0 +1,234 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What the experiments share: parallel runs, errors against truth, and the files they write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+import json
+import math
+import multiprocessing
+import os
+from pathlib import Path
+import sys
+from typing import Any, NamedTuple
+
+from ins_align.aligner import Aligner, Attitude, Epoch
+from ins_align.config import Config
+from ins_align.declaration import State
+from ins_align.report import format_table
+from ins_align.rotation import Array, log_so3, matrix_from_quaternion
+from ins_align.simulation import Simulation
+import numpy as np
+
+# Of simulated data nothing comes late; a little is left for the split at GNSS stamps.
+LATENESS = 0.05
+GRADES = ('navigation', 'tactical', 'mems')
+_THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
+_PROGRESS_STEP = 0.02
+
+
+def parallel(function: Callable[[Any], Any], tasks: Sequence[Any],
+             jobs: int | None = None, name: str = '') -> list[Any]:
+    """
+    Map a function of a module over tasks in processes of one thread each.
+
+    Parameters
+    ----------
+    function : callable
+    tasks : sequence
+        Tasks that share a trajectory should be neighbours: a process keeps the last few.
+    jobs : int, optional
+        By default one a processor; 1 stays in this process.
+    name : str, optional
+        Shown with the progress on a terminal.
+    """
+    jobs = min(jobs or os.cpu_count() or 1, max(len(tasks), 1))
+    if jobs == 1:
+        return list(_counted(map(function, tasks), len(tasks), name))
+    before = {variable: os.environ.get(variable) for variable in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, '1'))
+    try:
+        # A fresh interpreter reads the number of threads when it imports numpy.
+        with multiprocessing.get_context('spawn').Pool(jobs) as pool:
+            chunk = max(1, min(10, len(tasks) // (4 * jobs)))
+            return list(_counted(pool.imap(function, tasks, chunk), len(tasks), name))
+    finally:
+        for variable, value in before.items():
+            if value is None:
+                del os.environ[variable]
+            else:
+                os.environ[variable] = value
+
+
+def _counted(results: Iterable[Any], total: int, name: str) -> Iterator[Any]:
+    """Pass results on; on a terminal, say how many there are."""
+    shown = sys.stderr.isatty()
+    step = max(1, int(total * _PROGRESS_STEP))
+    for count, result in enumerate(results, 1):
+        if shown and (count % step == 0 or count == total):
+            end = '\n' if count == total else ''
+            print(f'\r{name}: {count}/{total}', end=end, file=sys.stderr, flush=True)
+        yield result
+
+
+def epochs_of(aligner: Aligner, simulation: Simulation, *, fix: bool = True,
+              velocity: bool = True) -> Iterator[Epoch]:
+    """Feed a simulation in the order of arrival and yield the epochs as they come."""
+    for kind, payload in simulation.messages():
+        if kind == 'imu':
+            aligner.add_imu(*payload)
+            yield from aligner.update()
+        elif kind == 'fix' and fix:
+            aligner.add_fix(payload)
+        elif kind == 'velocity' and velocity:
+            aligner.add_velocity(payload)
+    yield from aligner.flush()
+
+
+def config_for(simulation: Simulation, **changes: Any) -> Config:
+    """Return the configuration that knows a simulation's IMU grade and lever arm."""
+    values: dict[str, Any] = {
+        'lever_arm': tuple(simulation.lever_arm.tolist()), 'gnss_lateness': LATENESS,
+        'imu_grade': simulation.meta['imu_grade'],
+        'gyro_bias_std': math.degrees(simulation.imu_noise.gyro_bias_std),
+        'accel_bias_std': simulation.imu_noise.accel_bias_std}
+    values.update(changes)
+    return Config(**values)
+
+
+class Error(NamedTuple):
+    """
+    Error of an attitude against the truth.
+
+    Attributes
+    ----------
+    angles_deg : ndarray, shape (3,)
+        About east, north, up.
+    sigma_deg : ndarray, shape (3,)
+        Stated.
+    nees : float
+        Normalised squared error of the three angles.
+    """
+
+    angles_deg: Array
+    sigma_deg: Array
+    nees: float
+
+    @property
+    def tilt_sigmas(self) -> float:
+        """The larger of the two tilts in its sigma."""
+        return float(np.max(np.abs(self.angles_deg[:2]) / self.sigma_deg[:2]))
+
+    @property
+    def heading_sigmas(self) -> float:
+        """Heading in its sigma."""
+        return float(abs(self.angles_deg[2]) / self.sigma_deg[2])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain numbers."""
+        return {'error_deg': self.angles_deg.tolist(), 'sigma_deg': self.sigma_deg.tolist(),
+                'tilt_sigmas': self.tilt_sigmas, 'heading_sigmas': self.heading_sigmas}
+
+
+def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Array | None = None) -> Error:
+    """
+    Compare an attitude with the truth.
+
+    Parameters
+    ----------
+    attitude : Attitude
+    C_true : ndarray, shape (3, 3)
+        ``C_nb``.
+    extra_std_deg : ndarray, shape (3,), optional
+        Of the truth itself, about east, north, up; added in quadrature.
+    """
+    phi = log_so3(C_true @ matrix_from_quaternion(attitude.quaternion_xyzw).T)
+    covariance = attitude.covariance
+    if extra_std_deg is not None:
+        covariance = covariance + np.diag(np.radians(extra_std_deg) ** 2)
+    return Error(np.degrees(phi), np.degrees(np.sqrt(np.diag(covariance))),
+                 float(phi @ np.linalg.solve(covariance, phi)))
+
+
+def first_in(epochs: Iterable[Epoch], *states: State) -> Epoch | None:
+    """Return the first epoch in one of the states."""
+    return next((epoch for epoch in epochs if epoch.state in states), None)
+
+
+def rms(values: Any, axis: int | None = None) -> Any:
+    """Root mean square."""
+    return np.sqrt(np.mean(np.square(values), axis=axis))
+
+
+class Report:
+    """
+    Collects the text of an experiment, prints it, writes it.
+
+    Parameters
+    ----------
+    name : str
+    title : str
+    out : Path
+    command : str
+        What else than the name stands in the command that makes it.
+    """
+
+    def __init__(self, name: str, title: str, out: Path, command: str = '') -> None:
+        """Start with the title and the command."""
+        self._name = name
+        self._out = out
+        self._parts = [f'# {title}', f'`ins_align experiment {name} --out DIR{command}`']
+        print(f'{title}\n')
+
+    def text(self, text: str) -> None:
+        """Add a paragraph."""
+        self._parts.append(text)
+        print(text + '\n')
+
+    def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+        """Add a table."""
+        table = format_table(rows, header)
+        self._parts.append(f'{title}\n\n```text\n{table}\n```')
+        print(f'{title}\n\n{table}\n', flush=True)
+
+    def figure(self, figure: Any, suffix: str, caption: str) -> None:
+        """Write a figure as PNG and refer to it."""
+        file = f'{self._name}{suffix}.png'
+        figure.savefig(self._out / file, dpi=110)
+        self._parts.append(f'![{caption}]({file})\n\n{caption}')
+        print(f'{self._out / file}: {caption}\n')
+
+    def write(self, numbers: Any) -> None:
+        """Write the text and the numbers."""
+        (self._out / f'{self._name}.md').write_text('\n\n'.join(self._parts) + '\n', 'utf-8')
+        (self._out / f'{self._name}.json').write_text(
+            json.dumps(_plain(numbers), indent=1) + '\n', 'utf-8')
+
+
+def _plain(value: Any) -> Any:
+    """Return what JSON can hold; numbers that are not finite become None."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(f'{value:.6g}') if math.isfinite(value) else None
+    return value

@@ -1,0 +1,273 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Experiment ``declare``: whether what is declared is right, and how soon it is declared.
+
+Simulated vehicles of every kind with every fault that a user can make: is the attitude right
+when the aligner says that it is aligned? Does it keep silent where heading cannot be observed? How
+long does it wait beyond the time that the data need?
+"""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+from ins_align.aligner import Aligner, Epoch
+from ins_align.config import Config
+from ins_align.declaration import State
+from ins_align.experiments.bound import crossing_time
+from ins_align.experiments.common import (
+    config_for, epochs_of, error_of, first_in, GRADES, parallel, Report)
+from ins_align.simulation import SCENARIOS, simulate, Simulation
+import numpy as np
+
+FAULTS = ('none', 'outliers', 'outages', 'delay', 'lever arm left out', 'several of these',
+          'NED taken for ENU', 'one IMU axis flipped', 'sign of gravity')
+DURATION = 100.0
+SILENT_DURATION = 600.0
+HORIZON = 120.0         # s; within this the bound has to cross the threshold
+THRESHOLD_DEG = 1.0
+BINS = (3.0, 5.0)
+# Seeds of the three parts do not meet.
+SILENT_SEED, TIME_SEED = 100_000, 200_000
+
+JsonDict = dict[str, Any]
+
+
+def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
+    """Run all three parts; `runs` is that of the first, the others have a tenth of it."""
+    runs = runs or 1000
+    few = max(runs // 10, 1)
+    report = Report('declare', 'Declared means right', out)
+    trials = parallel(run_trial, [trial(index) for index in range(runs)], jobs, 'faults')
+    offenders = confusion(report, trials)
+    silent = parallel(run_silent, [(scenario, SILENT_SEED + seed) for scenario, seed in
+                                   itertools.product(('straight', 'static'), range(few))],
+                      jobs, 'silence')
+    silent_table(report, silent)
+    waits = time_to_heading(few, jobs)
+    time_table(report, waits, few)
+    report.write({'runs': runs, 'offenders': offenders, 'trials': trials, 'silent': silent,
+                  'time_to_heading': waits})
+
+
+# Part 1: faults
+
+def trial(index: int) -> JsonDict:
+    """
+    Draw a run: what is simulated and what the aligner is told.
+
+    Returns
+    -------
+    dict
+        ``index``, ``fault``, ``scenario``, the arguments of `simulate` and those parameters of
+        `Config` that differ from what suits the simulation.
+    """
+    # Every combination comes once before any comes twice.
+    combinations = list(itertools.product(FAULTS, SCENARIOS, GRADES))
+    turn, place = divmod(index, len(combinations))
+    order = np.random.default_rng(turn).permutation(len(combinations))
+    fault, scenario, grade = combinations[order[place]]
+    random = np.random.default_rng([1, index])
+    lever = random.uniform(-1.5, 1.5, 3)
+    arguments: JsonDict = {
+        'imu_grade': grade, 'seed': index, 'duration': DURATION,
+        'heading_deg': random.uniform(-180, 180), 'latitude_deg': random.uniform(-75, 75),
+        'lever_arm': lever.tolist(), 'mount_rpy_deg': random.uniform(-20, 20, 3).tolist()}
+    config: JsonDict = {}
+    several = fault == 'several of these'
+    if fault == 'outliers' or several:
+        arguments['outlier_rate'] = random.uniform(0.01, 0.1)
+        arguments['outlier_velocity'] = random.uniform(0.5, 10.0)
+        arguments['outlier_position'] = random.uniform(10.0, 100.0)
+    if fault == 'outages' or several:
+        starts = random.uniform(5.0, DURATION - 10.0, random.integers(1, 4))
+        arguments['outages'] = [[start, start + random.uniform(2.0, 15.0)] for start in starts]
+    if fault == 'delay' or several:
+        arguments['gnss_delay'] = random.uniform(0.02, 0.2)
+    if fault == 'lever arm left out' or several:
+        direction = random.standard_normal(3)
+        arguments['lever_arm'] = (random.uniform(0.1, 2.0) * direction
+                                  / np.linalg.norm(direction)).tolist()
+        config['lever_arm'] = (0.0, 0.0, 0.0)
+    if fault == 'NED taken for ENU':
+        arguments['velocity_frame'] = 'ned'
+    if fault == 'one IMU axis flipped':
+        arguments['flip_axis'] = str(random.choice(['x', 'y', 'z']))
+    if fault == 'sign of gravity':
+        arguments['accel_sign'] = -1
+    return {'index': index, 'fault': fault, 'scenario': scenario, 'simulate': arguments,
+            'config': config}
+
+
+def run_trial(task: JsonDict) -> JsonDict:
+    """Run what `trial` drew and judge what was declared."""
+    simulation = simulate(task['scenario'], **task['simulate'])
+    aligner = Aligner(config_for(simulation, **task['config']))
+    epochs = list(epochs_of(aligner, simulation))
+    status = aligner.status()
+    result: JsonDict = {**task, 'state': status.state.value, 'reason': status.reason,
+                        'withdrawals': aligner.counts['withdrawals'],
+                        'restarts': aligner.counts['restarts']}
+    levelled = first_in(epochs, State.LEVELLED, State.ALIGNED)
+    aligned = first_in(epochs, State.ALIGNED)
+    last = epochs[-1] if epochs else None
+    result['levelled'] = judged(levelled, simulation)
+    result['aligned'] = judged(aligned, simulation)
+    result['final'] = (judged(last, simulation)
+                       if last is not None and last.state is State.ALIGNED else None)
+    return result
+
+
+def judged(epoch: Epoch | None, simulation: Simulation) -> JsonDict | None:
+    """Compare the attitudes of an epoch with the truth."""
+    if epoch is None or epoch.initial is None or epoch.current is None:
+        return None
+    return {'t_s': epoch.t_s} | {
+        name: error_of(attitude, simulation.attitude_at(attitude.stamp_ns)).to_json()
+        for name, attitude in (('initial', epoch.initial), ('current', epoch.current))}
+
+
+# What is counted: title, moment, angle.
+COUNTED = (
+    ('Tilt when levelled (or aligned) was declared first', 'levelled', 'tilt_sigmas'),
+    ('Tilt when aligned was declared first', 'aligned', 'tilt_sigmas'),
+    ('Heading when aligned was declared first', 'aligned', 'heading_sigmas'),
+    ('Tilt at the end, where still declared', 'final', 'tilt_sigmas'),
+    ('Heading at the end, where still declared', 'final', 'heading_sigmas'))
+
+
+def confusion(report: Report, trials: list[JsonDict]) -> list[JsonDict]:
+    """Print the confusion tables; return what was declared beyond the first bin."""
+    report.text(
+        f'{len(trials)} runs of {DURATION:g} s over all scenarios ({", ".join(SCENARIOS)}), '
+        'grades of IMU and faults, with random heading, latitude, mount and lever arm. Errors '
+        'against truth in stated sigmas: of the tilt the worse of two axes, and the worse of the '
+        'attitude at t0 and the current one. None of the faults is told to the aligner.')
+    for title, moment, angle in COUNTED:
+        rows = [row(name, [t for t in trials if t['fault'] == name], moment, angle)
+                for name in FAULTS]
+        rows.append(row('all', trials, moment, angle))
+        report.table(title, ['fault', 'runs', 'within 3 sigma', '3 to 5', 'beyond 5',
+                             'not declared', 'worst, sigma', 'worst, deg'], rows)
+    offenders = [t for t in trials if any(
+        worse(t, moment, angle) > BINS[0] for _, moment, angle in COUNTED)]
+    report.table('Declared beyond 3 sigma', [
+        'index', 'fault', 'scenario', 'IMU', 'tilt levelled', 'tilt aligned', 'heading aligned',
+        'tilt final', 'heading final', 'aligned after, s', 'withdrawn'], [
+        [t['index'], t['fault'], t['scenario'], t['simulate']['imu_grade'],
+         *(None if t[moment] is None else f'{worse(t, moment, angle):.1f}'
+           for _, moment, angle in COUNTED),
+         None if t['aligned'] is None else f"{t['aligned']['t_s']:.1f}", t['withdrawals']]
+        for t in offenders])
+    return offenders
+
+
+def worse(result: JsonDict, moment: str, angle: str) -> float:
+    """Error in sigmas, the worse of initial and current attitude; -1 when nothing was declared."""
+    judgement = result[moment]
+    if judgement is None:
+        return -1.0
+    return max(judgement[name][angle] for name in ('initial', 'current'))
+
+
+def row(name: str, trials: list[JsonDict], moment: str, angle: str) -> list[Any]:
+    """Return a row of a confusion table."""
+    sigmas = np.array([worse(t, moment, angle) for t in trials])
+    declared = sigmas >= 0
+    angles = slice(0, 2) if angle == 'tilt_sigmas' else slice(2, 3)
+    degrees = [np.max(np.abs(t[moment][which]['error_deg'][angles])) for t in trials
+               if t[moment] is not None for which in ('initial', 'current')]
+    return [name, len(trials), int(np.sum(declared & (sigmas <= BINS[0]))),
+            int(np.sum((sigmas > BINS[0]) & (sigmas <= BINS[1]))),
+            int(np.sum(sigmas > BINS[1])), int(np.sum(~declared)),
+            f'{sigmas.max():.1f}' if declared.any() else None,
+            f'{max(degrees):.2g}' if degrees else None]
+
+
+# Part 2: silence
+
+def run_silent(task: tuple[str, int]) -> JsonDict:
+    """Ten minutes of motion that does not show the heading: is it declared?"""
+    scenario, seed = task
+    random = np.random.default_rng([2, seed])
+    simulation = simulate(scenario, imu_grade='mems', seed=seed, duration=SILENT_DURATION,
+                          mount_rpy_deg=random.uniform(-20, 20, 3))
+    aligner = Aligner(config_for(simulation))
+    epochs = list(epochs_of(aligner, simulation))
+    aligned = first_in(epochs, State.ALIGNED)
+    levelled = first_in(epochs, State.LEVELLED)
+    sigmas = [epoch.initial.sigma_deg[2] for epoch in epochs if epoch.initial is not None]
+    return {'scenario': scenario, 'seed': seed, 'aligned': judged(aligned, simulation),
+            'levelled': judged(levelled, simulation), 'least_heading_sigma_deg': min(sigmas),
+            'state': epochs[-1].state.value, 'reason': aligner.status().reason}
+
+
+def silent_table(report: Report, silent: list[JsonDict]) -> None:
+    """Print how often heading was declared where it cannot be known."""
+    rows = []
+    for scenario in ('straight', 'static'):
+        chosen = [s for s in silent if s['scenario'] == scenario]
+        levels = [s['levelled'] for s in chosen if s['levelled'] is not None]
+        rows.append([scenario, len(chosen), sum(s['aligned'] is not None for s in chosen),
+                     len(levels),
+                     f"{max(level['initial']['tilt_sigmas'] for level in levels):.1f}"
+                     if levels else None,
+                     f"{min(s['least_heading_sigma_deg'] for s in chosen):.1f}"])
+    report.table(f'MEMS for {SILENT_DURATION:g} s without a change of velocity', [
+        'scenario', 'runs', 'heading declared', 'level declared', 'worst tilt, sigma',
+        'least heading sigma, deg'], rows)
+
+
+# Part 3: time
+
+def time_to_heading(runs: int, jobs: int | None) -> list[JsonDict]:
+    """Time to a declared heading and time at which the bound crosses the threshold."""
+    pairs = list(itertools.product(SCENARIOS, GRADES))
+    crossings = parallel(crossing_time, [(*pair, HORIZON, THRESHOLD_DEG) for pair in pairs],
+                         jobs, 'bounds')
+    reachable = [(pair, time) for pair, time in zip(pairs, crossings) if time is not None]
+    times = parallel(run_time, [(*pair, TIME_SEED + seed) for (pair, _), seed in
+                                itertools.product(reachable, range(runs))], jobs, 'times')
+    results = []
+    for number, ((scenario, grade), bound_s) in enumerate(reachable):
+        declared = times[number * runs:(number + 1) * runs]
+        median = float(np.median([np.inf if t is None else t for t in declared]))
+        results.append({'scenario': scenario, 'grade': grade, 'bound_s': bound_s,
+                        'median_s': median, 'ratio': median / bound_s, 'declared_s': declared})
+    return results
+
+
+def run_time(task: tuple[str, str, int]) -> float | None:
+    """Seconds until the heading is declared, None if it is not."""
+    scenario, grade, seed = task
+    simulation = simulate(scenario, imu_grade=grade, seed=seed, duration=HORIZON)
+    epoch = first_in(epochs_of(Aligner(config_for(simulation)), simulation), State.ALIGNED)
+    return None if epoch is None else epoch.t_s
+
+
+def time_table(report: Report, waits: list[JsonDict], runs: int) -> None:
+    """Print the waits."""
+    hold = Config().hold_time
+    rows = [[w['scenario'], w['grade'], f"{w['bound_s']:.1f}", f"{w['median_s']:.1f}",
+             f"{w['ratio']:.2f}", f"{(w['median_s'] - hold) / w['bound_s']:.2f}",
+             sum(t is None for t in w['declared_s'])] for w in waits]
+    report.table(
+        f'Time to a declared heading of {THRESHOLD_DEG:g} deg: median of {runs} runs, and the '
+        'time at which the Cramer-Rao bound crosses it. A declaration has to hold for '
+        f'{hold:g} s before it is made; the last ratio leaves that out.', [
+            'scenario', 'IMU', 'bound, s', 'median, s', 'ratio', 'without hold',
+            'not declared'], rows)
