@@ -13,7 +13,7 @@
 # limitations under the License.
 """Preintegration against quadrature of closed-form motion, re-integration and Monte Carlo."""
 
-from ins_align.preintegration import Intervals, preintegrate, split_at_epochs, white_noise
+from ins_align.preintegration import Intervals, Noise, preintegrate, split_at_epochs, white_noise
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 ZERO = np.zeros(3)
 RATE = 100.0
-NOISE = 1e-3, 1e-2     # rad/sqrt(s), m/s/sqrt(s)
+NOISE = Noise(1e-3, 1e-2)     # rad/sqrt(s), m/s/sqrt(s)
 
 
 def omega_of(t):
@@ -61,7 +61,7 @@ def samples(duration, rate=RATE, jitter=0.0, seed=0):
 def integrated(epochs, rate=RATE, jitter=0.0, gyro_bias=ZERO, accel_bias=ZERO, noise=NOISE):
     stamps, gyro, accel = samples(epochs[-1], rate, jitter)
     steps = split_at_epochs(stamps, gyro, accel, np.asarray(epochs, float))
-    return preintegrate(steps, gyro_bias, accel_bias, *noise)
+    return preintegrate(steps, gyro_bias, accel_bias, noise)
 
 
 def chained(interval):
@@ -103,7 +103,7 @@ def test_constant_rate_and_force_in_closed_form():
     stamps = np.arange(-2, 43) * 0.1
     steps = split_at_epochs(stamps, np.tile([0.0, 0.0, w], (45, 1)), np.tile(f, (45, 1)),
                             np.array([0.0, t]))
-    interval = preintegrate(steps, ZERO, ZERO, *NOISE)
+    interval = preintegrate(steps, ZERO, ZERO, NOISE)
     assert np.allclose(interval.R[0], Rotation.from_rotvec([0.0, 0.0, w * t]).as_matrix(),
                        atol=1e-13)
     expected = [2.0 * np.sin(w * t) / w, 2.0 * (1 - np.cos(w * t)) / w, 9.8 * t]
@@ -131,10 +131,10 @@ def test_intervals_in_one_batch_are_those_one_by_one():
     epochs = [0.0, 0.213, 0.4, 1.0, 1.001, 2.0]
     stamps, gyro, accel = samples(2.0, jitter=0.3)
     batch = preintegrate(split_at_epochs(stamps, gyro, accel, np.array(epochs)), ZERO, ZERO,
-                         *NOISE)
+                         NOISE)
     for k in range(len(epochs) - 1):
         one = preintegrate(split_at_epochs(stamps, gyro, accel, np.array(epochs[k:k + 2])),
-                           ZERO, ZERO, *NOISE)
+                           ZERO, ZERO, NOISE)
         for name, array in vars(one).items():
             assert np.allclose(array[0], getattr(batch, name)[k], rtol=1e-12, atol=1e-14), name
 
@@ -203,14 +203,14 @@ def test_noise_covariance_is_that_of_many_runs():
     index = np.arange(-3, int(duration * rate) + 4)
     stamps = index / rate
     shape = (runs, stamps.size, 3)
-    gyro = omega_of(stamps) + NOISE[0] * np.sqrt(rate) * random.standard_normal(shape)
-    accel = force_of(stamps) + NOISE[1] * np.sqrt(rate) * random.standard_normal(shape)
+    gyro = omega_of(stamps) + NOISE.angle_random_walk * np.sqrt(rate) * random.standard_normal(shape)
+    accel = force_of(stamps) + NOISE.velocity_random_walk * np.sqrt(rate) * random.standard_normal(shape)
     epochs = np.array([0.0, duration])
     clean = integrated(epochs, rate=rate)
     errors = np.empty((runs, 9))
     for run in range(runs):
         noisy = preintegrate(split_at_epochs(stamps, gyro[run], accel[run], epochs), ZERO, ZERO,
-                             0.0, 0.0)
+                             Noise())
         errors[run, :3] = Rotation.from_matrix(noisy.R[0] @ clean.R[0].T).as_rotvec()
         errors[run, 3:6] = noisy.v[0] - clean.v[0]
         errors[run, 6:] = noisy.p[0] - clean.p[0]
@@ -246,9 +246,9 @@ def test_noise_may_differ_from_step_to_step():
     epochs = np.array([0.0, 1.0])
     stamps, gyro, accel = samples(1.0)
     steps = split_at_epochs(stamps, gyro, accel, epochs)
-    uniform = preintegrate(steps, ZERO, ZERO, 1e-3, 0.0).Q[0]
+    uniform = preintegrate(steps, ZERO, ZERO, Noise(1e-3)).Q[0]
     first_half = np.where(np.cumsum(steps.dt, axis=1) <= 0.5 + 1e-9, 2e-3, 0.0)
-    halved = preintegrate(steps, ZERO, ZERO, first_half, 0.0).Q[0]
+    halved = preintegrate(steps, ZERO, ZERO, Noise(first_half)).Q[0]
     assert np.allclose(np.diag(halved)[:3], 2 * np.diag(uniform)[:3], rtol=1e-9)
     # Angle errors of the first half act longer on the velocity.
     assert np.all(np.diag(halved)[3:5] > 3 * np.diag(uniform)[3:5])
@@ -276,6 +276,15 @@ def test_white_noise_of_motion_alone_is_nearly_none():
 def test_white_noise_of_a_handful_of_samples_is_not_told():
     stamps = np.arange(7) / RATE
     assert np.array_equal(white_noise(stamps, np.ones((7, 6))), [0.0, 0.0])
+
+
+def test_noise_in_excess_is_kept_apart():
+    stamps, gyro, accel = samples(1.0)
+    steps = split_at_epochs(stamps, gyro, accel, np.array([0.0, 1.0]))
+    interval = preintegrate(steps, ZERO, ZERO, Noise(1e-3, 1e-2, 2e-3, 3e-2))
+    assert np.allclose(interval.Q, preintegrate(steps, ZERO, ZERO, NOISE).Q)
+    assert np.allclose(interval.Q_excess, preintegrate(steps, ZERO, ZERO, Noise(2e-3, 3e-2)).Q)
+    assert not np.any(preintegrate(steps, ZERO, ZERO, NOISE).Q_excess)
 
 
 def test_storage_gives_back_what_was_put():

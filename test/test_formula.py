@@ -1,0 +1,318 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The note's formulas against noise-free motion, quadrature and brute force."""
+
+from functools import lru_cache
+
+from ins_align import formula
+from ins_align.earth import EARTH_RATE, earth_rate_n
+from ins_align.experiments.dense import bound
+from ins_align.preintegration import Noise, preintegrate, split_at_epochs
+from ins_align.simulation import simulate
+import numpy as np
+import pytest
+from scipy.integrate import quad_vec
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+LEVER = np.array([1.0, 1.0, 1.0])
+ZERO = np.zeros(3)
+PLACES = {
+    'north': {'latitude_deg': 48.0}, 'south': {'latitude_deg': -37.0},
+    'arctic': {'latitude_deg': 80.0}, 'equator': {'latitude_deg': 0.0},
+    'antimeridian': {'latitude_deg': -18.0, 'longitude_deg': 179.9999},
+}
+
+
+def angle_deg(C_1, C_2):
+    return np.degrees(Rotation.from_matrix(C_1 @ C_2.T).magnitude())
+
+
+@lru_cache(maxsize=None)
+def flight(place, duration=10.5):
+    return simulate('flight', ideal=True, duration=duration, gnss_rate=5.0, **PLACES[place])
+
+
+def run(simulation, lever=LEVER):
+    """Both sides of the formulas at every epoch."""
+    stamps = (simulation.imu_stamps_ns - simulation.gnss_stamps_ns[0]) * 1e-9
+    epochs = (simulation.gnss_stamps_ns - simulation.gnss_stamps_ns[0]) * 1e-9
+    lla = np.column_stack([np.radians(simulation.lla_deg[:, :2]), simulation.lla_deg[:, 2]])
+    intervals = preintegrate(split_at_epochs(stamps, simulation.gyro, simulation.accel, epochs),
+                             ZERO, ZERO, Noise())
+    first = preintegrate(split_at_epochs(stamps, simulation.gyro, simulation.accel,
+                                         epochs[[0, 0]]), ZERO, ZERO, Noise())
+    body = formula.BodyIntegrals(lever, first.omega[0])
+    navigation = formula.NavigationIntegrals(*lla[0], simulation.velocity[0])
+    track = formula.InertialTrack(*lla[0])
+    for k in range(1, len(epochs)):
+        body.advance(intervals, k - 1)
+        navigation.advance(epochs[k], *lla[k], simulation.velocity[k])
+        track.advance(epochs[k], *lla[k])
+        yield body, navigation, track, simulation.velocity[k]
+
+
+FORMS = {
+    'vif to the letter': (0, lambda b, n, t, v: (n.beta_v, b.alpha_v)),
+    'vif': (1, lambda b, n, t, v: (n.s_v, b.a_v, (1.0,))),
+    'pif to the letter': (0, lambda b, n, t, v: (n.beta_p, b.alpha_p)),
+    'pif': (2, lambda b, n, t, v: (n.s_p, b.a_p, (1.0, b.time))),
+    'pif of positions': (2, lambda b, n, t, v: (t.s_p, b.a_p, (1.0, b.time))),
+    'vif in n0': (1, lambda b, n, t, v: (t.s_v(v), b.a_v, (1.0,))),
+}
+
+
+def aligned(simulation, form, lever=LEVER):
+    nuisance, pair = FORMS[form]
+    moments = formula.AttitudeMoments(nuisance)
+    for sides in run(simulation, lever):
+        moments.add(*pair(*sides))
+    return moments.solve()
+
+
+@pytest.mark.parametrize('form', FORMS)
+@pytest.mark.parametrize('place', PLACES)
+def test_noise_free_attitude_after_ten_seconds(place, form):
+    simulation = flight(place)
+    C, residual, _ = aligned(simulation, form)
+    truth = simulation.attitude_at(int(simulation.gnss_stamps_ns[0]))
+    assert angle_deg(C, truth) < 1e-3
+    assert residual < 1e-4
+
+
+def test_flight_across_the_antimeridian_goes_across():
+    longitude = flight('antimeridian').lla_deg[:, 1]
+    assert longitude.min() < -179.9 and longitude.max() > 179.9
+
+
+@pytest.mark.parametrize('form', ('vif', 'vif to the letter', 'pif', 'pif of positions'))
+def test_without_lever_arm_the_attitude_is_off(form):
+    simulation = flight('north')
+    truth = simulation.attitude_at(int(simulation.gnss_stamps_ns[0]))
+    assert angle_deg(aligned(simulation, form, ZERO)[0], truth) > 0.05
+
+
+def test_body_and_navigation_side_agree_through_the_true_attitude():
+    """Beta = C alpha at every epoch: what the note claims, on python-ins' sensors."""
+    simulation = flight('north')
+    C = simulation.attitude_at(int(simulation.gnss_stamps_ns[0]))
+    for body, navigation, track, _ in run(simulation):
+        assert np.allclose(navigation.beta_v, C @ body.alpha_v, atol=2e-4)
+        assert np.allclose(navigation.beta_p, C @ body.alpha_p, atol=2e-3)
+
+
+def test_chain_rule_gives_the_current_attitude():
+    simulation = flight('south')
+    C = simulation.attitude_at(int(simulation.gnss_stamps_ns[0]))
+    for body, _, track, _ in run(simulation):
+        pass
+    truth = simulation.attitude_at(int(simulation.gnss_stamps_ns[-1]))
+    assert angle_deg(track.C_n0n.T @ C @ body.C_b0b, truth) < 1e-4
+
+
+# Short form of (9) against the exact one
+
+def turning_flight(duration=1000.0, rate=50.0):
+    """Attitude in b0, rates: a flight of turns, from python-ins."""
+    simulation = simulate('flight', ideal=True, duration=duration, imu_rate=rate)
+    time = (simulation.truth_stamps_ns - simulation.truth_stamps_ns[0]) * 1e-9
+    C_nb = simulation.truth_C_nb
+    lla = np.radians(simulation.truth_lla)
+    omega_ie_b = np.einsum('nji,nj->ni', C_nb, earth_rate_n(lla[:, 0]))
+    from pyins.transform import mat_en_from_ll
+    C_en = mat_en_from_ll(*simulation.truth_lla[:, :2].T) @ np.array(
+        [[0., 1., 0.], [1., 0., 0.], [0., 0., -1.]])
+    earth = Rotation.from_rotvec(EARTH_RATE * time[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    C_ib = earth @ C_en @ C_nb
+    return time, C_ib[0].T @ C_ib, simulation.truth_gyro, omega_ie_b
+
+
+def test_short_form_stays_within_its_bound_for_a_thousand_seconds():
+    time, C_b0b, omega_ib_b, omega_ie_b = turning_flight()
+    remainder = formula.exact_lever_remainder(time, C_b0b, omega_ib_b - omega_ie_b,
+                                              omega_ie_b[0], LEVER)
+    size = np.linalg.norm(remainder, axis=1)
+    limit = 2 * EARTH_RATE ** 2 * time * np.linalg.norm(LEVER)
+    # Rounding and the trapezoidal rule of the oracle's integral weigh 1e-8 m/s.
+    assert np.all(size <= limit + 2e-8)
+    assert size[-1] > 0.02 * limit[-1]         # and it is not nothing: the bound is a bound
+
+
+def test_exact_form_is_the_difference_of_antenna_and_imu_velocity():
+    """In inertial space v_antenna - v_imu = C_ib [omega_ib x] l: both forms lead to it."""
+    time, C_b0b, omega_ib_b, omega_ie_b = turning_flight(duration=200.0, rate=100.0)
+    omega_eb_b = omega_ib_b - omega_ie_b
+    # Left side of (9) for antenna minus IMU: relative velocity over ground and its Earth term.
+    relative = np.einsum('nij,nj->ni', C_b0b, np.cross(omega_eb_b, LEVER))
+    h = np.diff(time)[:, None]
+    omega_ie_b0 = omega_ie_b[0]
+    swept = np.cross(omega_ie_b0, relative)
+    integral = np.vstack([ZERO, np.cumsum(h / 2 * (swept[1:] + swept[:-1]), axis=0)])
+    exact = relative - relative[0] + integral
+    rate = np.einsum('nij,nj->ni', C_b0b, np.cross(omega_ib_b, LEVER))
+    short = rate - rate[0]
+    remainder = formula.exact_lever_remainder(time, C_b0b, omega_eb_b, omega_ie_b0, LEVER)
+    assert np.allclose(exact - short, remainder, atol=1e-12)
+
+
+# Positions alone against integrated velocity
+
+class ClosedForm:
+    """A turning, climbing course on the ellipsoid whose velocity is known in closed form."""
+
+    def lla(self, t):
+        return np.stack([0.8 + 2e-5 * np.sin(0.05 * t), 0.2 + 3e-5 * np.cos(0.04 * t) - 1e-6 * t,
+                         500.0 + 30.0 * np.sin(0.1 * t)], axis=-1)
+
+    def v_n(self, t):
+        from pyins.earth import principal_radii
+        latitude, _, altitude = np.moveaxis(self.lla(t), -1, 0)
+        rn, _, rp = principal_radii(np.degrees(latitude), altitude)
+        return np.stack([rp * (-1.2e-6 * np.sin(0.04 * t) - 1e-6), rn * 1e-6 * np.cos(0.05 * t),
+                         3.0 * np.cos(0.1 * t)], axis=-1)
+
+
+def test_positions_alone_are_the_integrated_velocity_form():
+    from ins_align.earth import gravity_n, LocalLevel
+    course, end = ClosedForm(), 100.0
+    start = course.lla(0.0)
+    level = LocalLevel(*start[:2])
+
+    def turned(t, vector):
+        return level.matrix(t, *course.lla(t)[:2]) @ vector
+
+    def integrand(t):
+        lla, v_n = course.lla(t), course.v_n(t)
+        coriolis = turned(t, np.cross(earth_rate_n(lla[0]), v_n))
+        gravity = turned(t, gravity_n(lla[0], lla[2]))
+        weight = end - t              # a double integral is one with the time still to go
+        return np.concatenate([coriolis, gravity, turned(t, v_n), weight * coriolis,
+                               weight * gravity])
+
+    parts = quad_vec(integrand, 0.0, end, epsabs=1e-11, epsrel=1e-13)[0].reshape(5, 3)
+    beta_v = turned(end, course.v_n(end)) - course.v_n(0.0) + parts[0] - parts[1]
+    beta_p = parts[2] - end * course.v_n(0.0) + parts[3] - parts[4]
+    track = formula.InertialTrack(*start)
+    step = 0.01                       # gravitation changes over hundreds of seconds
+    before = track.s_v(course.v_n(0.0))
+    assert np.allclose(before, course.v_n(0.0), atol=1e-12)
+    for k in range(1, int(end / step) + 1):
+        track.advance(k * step, *course.lla(k * step))
+    # Rounding of positions is 1e-9 m.
+    assert np.allclose(track.s_v(course.v_n(end)) - course.v_n(0.0), beta_v, atol=1e-8)
+    assert np.allclose(track.s_p - end * course.v_n(0.0), beta_p, atol=1e-7)
+
+
+def test_navigation_integrals_are_the_integrals_they_are_named_after():
+    course, end, step = ClosedForm(), 20.0, 0.1
+    from ins_align.earth import gravity_n, LocalLevel
+    level = LocalLevel(*course.lla(0.0)[:2])
+    navigation = formula.NavigationIntegrals(*course.lla(0.0), course.v_n(0.0))
+    for k in range(1, int(end / step) + 1):
+        navigation.advance(k * step, *course.lla(k * step), course.v_n(k * step))
+
+    def integral(vector):
+        def turned(t):
+            value = level.matrix(t, *course.lla(t)[:2]) @ vector(t)
+            return np.concatenate([value, (end - t) * value])
+        return quad_vec(turned, 0.0, end, epsabs=1e-11)[0].reshape(2, 3)
+
+    omega_v = integral(lambda t: np.cross(earth_rate_n(course.lla(t)[0]), course.v_n(t)))
+    g = integral(lambda t: gravity_n(course.lla(t)[0], course.lla(t)[2]))
+    v = integral(course.v_n)
+    assert np.allclose(navigation.int_omega_v, omega_v[0], atol=1e-7)
+    assert np.allclose(navigation.int_int_omega_v, omega_v[1], atol=1e-6)
+    assert np.allclose(navigation.int_g, g[0], atol=1e-7)
+    assert np.allclose(navigation.int_int_g, g[1], atol=1e-6)
+    assert np.allclose(navigation.int_v, v[0], atol=1e-5)
+
+
+# q-method
+
+@pytest.mark.parametrize('seed', range(5))
+def test_q_method_is_the_least_squares_attitude(seed):
+    random = np.random.default_rng(seed)
+    truth = Rotation.random(random_state=seed)
+    a = random.standard_normal((30, 3)) * [10.0, 5.0, 1.0]
+    s = truth.apply(a) + 0.3 * random.standard_normal((30, 3))
+    C, residual = formula.attitude_from_moments(s.T @ a, float(np.sum(s * s) + np.sum(a * a)))
+    expected, rssd = Rotation.align_vectors(s, a)
+    assert angle_deg(C, expected.as_matrix()) < 1e-6
+    assert residual == pytest.approx(rssd ** 2, rel=1e-9)
+    assert np.linalg.det(C) == pytest.approx(1.0)
+
+
+def test_q_method_on_vectors_of_half_a_turn():
+    truth = np.diag([1.0, -1.0, -1.0])
+    a = np.eye(3)
+    C, residual = formula.attitude_from_moments((a @ truth.T).T @ a, 6.0)
+    assert np.allclose(C, truth, atol=1e-12) and residual < 1e-12
+
+
+@pytest.mark.parametrize('nuisance', (0, 1, 2))
+def test_free_start_is_minimised_over(nuisance):
+    """Moments in constant memory against a plain minimisation over attitude and start."""
+    random = np.random.default_rng(7)
+    time = np.linspace(0.0, 5.0, 20)
+    truth = Rotation.from_rotvec([0.3, -0.2, 2.0])
+    a = np.cumsum(random.standard_normal((20, 3)), axis=0)
+    basis = np.vander(time, nuisance, increasing=True)
+    s = (truth.apply(a) + basis @ random.standard_normal((nuisance, 3)) * 20.0
+         + 0.1 * random.standard_normal((20, 3)))
+    moments = formula.AttitudeMoments(nuisance)
+    for k in range(20):
+        moments.add(s[k], a[k], tuple(basis[k]))
+
+    def cost(vector):
+        left = s - Rotation.from_rotvec(vector).apply(a)
+        if nuisance:
+            left = left - basis @ np.linalg.lstsq(basis, left, rcond=None)[0]
+        return np.sum(left ** 2)
+
+    best = minimize(cost, truth.as_rotvec(), method='Nelder-Mead',
+                    options={'xatol': 1e-9, 'fatol': 1e-12, 'maxiter': 4000})
+    C, residual, A = moments.solve()
+    assert angle_deg(C, Rotation.from_rotvec(best.x).as_matrix()) < 1e-4
+    assert residual == pytest.approx(best.fun, rel=1e-6)
+    centred = a - basis @ np.linalg.lstsq(basis, a, rcond=None)[0] if nuisance else a
+    assert np.allclose(A, centred.T @ centred)
+
+
+def test_moments_of_hundreds_of_kilometres_keep_a_centimetre():
+    """Position form after long: sums of squares of large numbers must not lose the small ones."""
+    random = np.random.default_rng(3)
+    time = np.arange(0.0, 1000.0, 0.2)
+    truth = Rotation.from_rotvec([0.1, 0.2, -1.0])
+    a = np.column_stack([50.0 * np.sin(0.1 * time), 50.0 * np.cos(0.07 * time), 4.9 * time ** 2])
+    s = truth.apply(a) + 30.0 * time[:, None] + 0.02 * random.standard_normal(a.shape)
+    moments = formula.AttitudeMoments(2)
+    for k in range(time.size):
+        moments.add(s[k], a[k], (1.0, time[k]))
+    C, _, _ = moments.solve()
+    assert angle_deg(C, truth.as_matrix()) < 1e-3
+
+
+def test_free_start_reaches_the_bound_of_a_navigation_grade_imu():
+    """Heading rms of the centred form against the Cramer-Rao bound; the letter's is worse."""
+    errors = {'vif': [], 'vif to the letter': []}
+    for seed in range(20):
+        simulation = simulate('flight', imu_grade='navigation', duration=20.0, seed=seed)
+        truth = simulation.attitude_at(int(simulation.gnss_stamps_ns[0]))
+        for form, found in errors.items():
+            C = aligned(simulation, form)[0]
+            found.append(Rotation.from_matrix(C @ truth.T).as_rotvec()[2])
+    sigma = np.sqrt(bound(simulation).covariance[-1][2, 2])
+    rms = {form: np.sqrt(np.mean(np.square(found))) for form, found in errors.items()}
+    assert 0.6 < rms['vif'] / sigma < 1.5      # 95 % of a chi-square of 20 are 0.69 to 1.31
+    assert rms['vif to the letter'] > 1.2 * rms['vif']
