@@ -30,10 +30,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 import zlib
 
-MAX_CHUNK_BYTES = 1 << 30  # of a chunk, unpacked
-MAX_MESSAGE_BYTES = 1 << 20  # of an IMU or GNSS message: the frame_id is all that can grow
+MAX_CHUNK_BYTES = 1 << 28  # of a chunk, unpacked
+MAX_MESSAGE_BYTES = 1 << 16  # of an IMU or GNSS message, which has some hundred bytes
 MAX_DEFINITION_BYTES = 1 << 24  # of a record that describes a topic
-MAX_PENDING = 1_000_000  # messages held back to bring overlapping chunks into order
+MAX_PENDING_BYTES = 1 << 28  # of messages held back to bring overlapping chunks into order
 PIECE_BYTES = 1 << 14  # fed to a decompressor: what comes after damage in a piece is lost
 
 INT64_MAX = (1 << 63) - 1
@@ -172,7 +172,8 @@ class ChunkedFile:
             pending += self._records(self._load(segment), ids, start_ns, stop_ns)
             pending.sort(key=by_time)
             ready = bisect.bisect_left(pending, horizon, key=by_time)
-            if len(pending) - ready > MAX_PENDING or horizon == INT64_MAX:
+            held_back = sum(len(record[2]) for record in pending[ready:])
+            if held_back > MAX_PENDING_BYTES or horizon == INT64_MAX:
                 ready = len(pending)
             if ready:
                 yield pending[:ready]
@@ -193,8 +194,8 @@ class ChunkedFile:
 
     def _add_segment(self, segment: Segment) -> None:
         if segment.raw_size > MAX_CHUNK_BYTES:
-            raise BagError(f'{self._path.name} claims a chunk of {segment.raw_size} bytes, more '
-                           f'than the {MAX_CHUNK_BYTES >> 30} GiB that are allowed')
+            raise BagError(f'{self._path.name} claims a chunk of {segment.raw_size} bytes, '
+                           f'where {MAX_CHUNK_BYTES >> 20} MiB are allowed')
         self._segments.append(segment)
 
     def _load(self, segment: Segment) -> bytes:

@@ -15,7 +15,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 import os
 from pathlib import Path, PurePath
@@ -56,6 +56,14 @@ class Topics(NamedTuple):
     velocity: Topic | None
     velocity_type: str | None  # as the parameter of that name has it
     reference: Topic | None
+
+
+class Block(NamedTuple):
+    """Consecutive messages, in columns."""
+
+    times_ns: Sequence[int]  # recorded time
+    topics: Sequence[int]  # index into the topics that were asked for
+    messages: Sequence[bytes]  # serialised
 
 
 class Bag:
@@ -107,32 +115,43 @@ class Bag:
         """Time at which the last message was recorded, where that is known."""
         return max((f.end_ns for f in self._files if f.end_ns is not None), default=None)
 
-    def messages(self, topics: Collection[Topic], start_ns: int | None = None,
-                 stop_ns: int | None = None) -> Iterator[tuple[Topic, int, bytes]]:
+    def blocks(self, topics: Sequence[Topic], start_ns: int | None = None,
+               stop_ns: int | None = None) -> Iterator[Block]:
         """
-        Yield topic, recorded time and serialised message in recorded order.
+        Yield the messages of some topics in recorded order, many at a time.
 
         Parameters
         ----------
-        topics : collection of Topic
+        topics : sequence of Topic
             What to read.
         start_ns, stop_ns : int, optional
             First recorded time and the one to stop before.
-
         """
         start_ns = 0 if start_ns is None else start_ns
         stop_ns = INT64_MAX if stop_ns is None else stop_ns
         for file in self._files:
-            wanted = {key: topic for key, topic in file.topics.items() if topic in topics}
-            records = file.messages(wanted, start_ns, stop_ns) if wanted else iter(())
+            wanted = {key: topics.index(topic) for key, topic in file.topics.items()
+                      if topic in topics}
+            if not wanted:
+                continue
             packed = None
-            for time_ns, key, data in records:
-                topic = wanted[key]
+            for records in file.blocks(wanted, start_ns, stop_ns):
+                times_ns, keys, messages = zip(*records)
+                indices = list(map(wanted.__getitem__, keys))
                 if packed is None:  # rosbag2 compresses every message or none
-                    packed = topic.encoding == 'cdr' and data.startswith(ZSTD_MAGIC)
+                    packed = (topics[indices[0]].encoding == 'cdr'
+                              and messages[0].startswith(ZSTD_MAGIC))
                 if packed:
-                    data = decompress(data, 'zstd', MAX_MESSAGE_BYTES)
-                yield topic, time_ns, data
+                    messages = tuple(decompress(message, 'zstd', MAX_MESSAGE_BYTES)
+                                     for message in messages)
+                yield Block(times_ns, indices, messages)
+
+    def messages(self, topics: Sequence[Topic], start_ns: int | None = None,
+                 stop_ns: int | None = None) -> Iterator[tuple[Topic, int, bytes]]:
+        """Yield topic, recorded time and message one by one, otherwise like `blocks`."""
+        for block in self.blocks(topics, start_ns, stop_ns):
+            for time_ns, index, message in zip(*block):
+                yield topics[index], time_ns, message
 
     def _open_files(self, stack: ExitStack) -> list[ChunkedFile | sqlite_file.SqliteFile]:
         """Open those files that can be; an error only if there is none."""

@@ -112,28 +112,35 @@ def _decode(messages: Sequence[bytes], topic: Topic, fields: tuple[tuple[int, in
         Makes the same of a message of the library.
 
     """
+    start = body_start(messages[0], topic.encoding) if messages else None
+    raw = None if start is None else _stacked(messages)
+    if start is not None and raw is not None:
+        return _columns(raw, start, fields) + [np.ones(len(messages), bool)]
     count = len(messages)
     columns = [np.zeros(count, np.int64)] + [np.zeros((count, width)) for _, width in fields]
     decoded = np.ones(count, bool)
-    layouts: dict[tuple, list[int]] = {}
     for index, message in enumerate(messages):
-        layouts.setdefault((len(message), message[:2], message[_FRAME_LENGTH]), []).append(index)
-    for indices in layouts.values():
-        start = body_start(messages[indices[0]], topic.encoding)
-        if start is not None:
-            part = _decode_alike([messages[index] for index in indices], start, fields)
-            for column, values in zip(columns, part):
-                column[indices] = values
+        start = body_start(message, topic.encoding)
+        try:
+            values = (convert(deserialize(message, topic)) if start is None
+                      else [column[0] for column in _columns(
+                          np.frombuffer(message, np.uint8)[None, :], start, fields)])
+        except MessageError:
+            decoded[index] = False
             continue
-        for index in indices:
-            try:
-                values = convert(deserialize(messages[index], topic))
-            except MessageError:
-                decoded[index] = False
-                continue
-            for column, value in zip(columns, values):
-                column[index] = value
+        for column, value in zip(columns, values):
+            column[index] = value
     return [column if decoded.all() else column[decoded] for column in columns] + [decoded]
+
+
+def _stacked(messages: Sequence[bytes]) -> np.ndarray | None:
+    """Return the bytes of messages of one layout in rows; None if there is more than one."""
+    if len(set(map(len, messages))) > 1:
+        return None
+    raw = np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), -1)
+    alike = ((raw[:, :2] == raw[0, :2]).all()
+             and (raw[:, _FRAME_LENGTH] == raw[0, _FRAME_LENGTH]).all())
+    return raw if alike else None
 
 
 def body_start(message: bytes, encoding: str) -> int | None:
@@ -154,11 +161,9 @@ def body_start(message: bytes, encoding: str) -> int | None:
     return start if len(message) == start + _BODY_BYTES else None
 
 
-def _decode_alike(messages: Sequence[bytes], start: int, fields: tuple[tuple[int, int], ...],
-                  ) -> list[np.ndarray]:
-    """Decode messages of one length whose numbers start at one place."""
-    raw = np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), -1)
-
+def _columns(raw: np.ndarray, start: int, fields: tuple[tuple[int, int], ...],
+             ) -> list[np.ndarray]:
+    """Decode messages in rows of bytes, whose numbers start at one place."""
     def column(offset: int, size: int, kind: str) -> np.ndarray:
         return np.ascontiguousarray(raw[:, offset:offset + size]).view(kind)
 

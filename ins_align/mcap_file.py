@@ -19,7 +19,8 @@ from collections.abc import Collection
 import struct
 
 from ins_align.bag_files import (
-    ChunkedFile, INT64_MAX, MAX_DEFINITION_BYTES, MAX_MESSAGE_BYTES, Records, ros2_type, Segment, Topic)
+    ChunkedFile, INT64_MAX, MAX_DEFINITION_BYTES, MAX_MESSAGE_BYTES, Records, ros2_type, Segment,
+    Topic)
 
 MAGIC = b'\x89MCAP0\r\n'
 PLAIN_SEGMENT_BYTES = 1 << 22  # of records outside of chunks, read at a time

@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any, NamedTuple
 
@@ -136,19 +137,20 @@ def _usable_covariance(covariance: np.ndarray,
         Stands in for single unknown variances; None: one unknown variance makes all unknown.
 
     """
-    variances = np.diag(covariance).copy()
-    known = np.isfinite(variances) & (variances > 0.0)
-    if not known.any():
+    variances = covariance.diagonal().tolist()
+    known = [0.0 < variance < math.inf for variance in variances]
+    if not any(known) or (default_std is None and not all(known)):
         return None
-    if not known.all():
-        if default_std is None:
-            return None
-        variances[~known] = np.square(default_std)[~known]
-        return np.diag(variances)
+    if default_std is not None and not all(known):
+        return np.diag([variance if given else std ** 2 for variance, given, std
+                        in zip(variances, known, default_std)])
+    diagonal = np.diag(variances)
+    if np.array_equal(covariance, diagonal):
+        return diagonal
     symmetric = 0.5 * covariance + 0.5 * covariance.T
     # Correlations without sense must not turn into a negative variance in some direction.
     if np.isfinite(symmetric).all():
         scale = 1.0 / np.sqrt(variances)
         if np.linalg.eigvalsh(symmetric * scale * scale[:, None])[0] > 1e-9:
             return symmetric
-    return np.diag(variances)
+    return diagonal

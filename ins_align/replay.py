@@ -15,7 +15,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 import dataclasses
 from dataclasses import dataclass
 import io
@@ -25,8 +25,8 @@ import os
 from typing import Any
 
 from ins_align.aligner import Aligner, Attitude, Epoch, Status
-from ins_align.bag_files import BagError
-from ins_align.bags import Bag, Topics
+from ins_align.bag_files import BagError, Topic
+from ins_align.bags import Bag, Block, Topics
 from ins_align.config import Config
 from ins_align.declaration import State
 from ins_align.decoding import decode_imu, decode_orientations, deserialize, Orientations
@@ -35,7 +35,6 @@ from ins_align.rotation import (
     Array, exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw)
 import numpy as np
 
-BLOCK = 4096  # messages read and decoded at a time
 MAX_REFERENCE_GAP_NS = 1_500_000_000  # the reference is not interpolated over more
 
 _ATTITUDE_COLUMNS = 'qx,qy,qz,qw,sigma_e_deg,sigma_n_deg,sigma_u_deg'
@@ -189,7 +188,7 @@ def replay(path: str | os.PathLike, config: Config | None = None, *, imu_topic: 
             config = dataclasses.replace(config, velocity_type=topics.velocity_type)
         run = _Run(Aligner(config), config, topics)
         try:
-            for block, done in _blocks(bag, topics, start, duration):
+            for block, done in _blocks(bag, run.read, start, duration):
                 run.feed(block)
                 if progress is not None:
                     progress(done)
@@ -198,8 +197,8 @@ def replay(path: str | os.PathLike, config: Config | None = None, *, imu_topic: 
         return run.result(str(path), bag.warnings)
 
 
-def _blocks(bag: Bag, topics: Topics, start: float | None, duration: float | None,
-            ) -> Iterator[tuple[list[tuple], float]]:
+def _blocks(bag: Bag, topics: Sequence[Topic], start: float | None, duration: float | None,
+            ) -> Iterator[tuple[Block, float]]:
     """Yield messages many at a time, and how much of the recording they end at."""
     first = bag.start_ns or 0
     start_ns = first + round((start or 0.0) * 1e9)
@@ -207,11 +206,8 @@ def _blocks(bag: Bag, topics: Topics, start: float | None, duration: float | Non
     end = bag.end_ns or start_ns
     if stop_ns is not None:
         end = min(end, stop_ns)
-    wanted = {topic for topic in (topics.imu, topics.fix, topics.velocity, topics.reference)
-              if topic is not None}
-    messages = bag.messages(wanted, start_ns, stop_ns)
-    while block := list(itertools.islice(messages, BLOCK)):
-        done = (block[-1][1] - start_ns) / (end - start_ns) if end > start_ns else 1.0
+    for block in bag.blocks(topics, start_ns, stop_ns):
+        done = (block.times_ns[-1] - start_ns) / (end - start_ns) if end > start_ns else 1.0
         yield block, min(max(done, 0.0), 1.0)
 
 
@@ -222,41 +218,42 @@ class _Run:
         self._aligner = aligner
         self._config = config
         self._topics = topics
+        self.read = tuple(topic for topic in (topics.imu, topics.fix, topics.velocity,
+                                              topics.reference) if topic is not None)
         self._epochs: list[Epoch] = []
         self._references: list[Orientations] = []
         self._fixes: list[tuple[int, float, float]] = []
 
-    def feed(self, block: Iterable[tuple]) -> None:
+    def feed(self, block: Block) -> None:
         """Give a block of messages to the aligner, the IMU's decoded all at once."""
-        imu, fix, reference = self._topics.imu, self._topics.fix, self._topics.reference
-        imu_messages: list[bytes] = []
-        reference_messages: list[bytes] = []
-        gnss: list[tuple[int, Any, bytes]] = []  # with the number of IMU messages before it
-        for topic, _, data in block:
-            if topic is imu:
-                imu_messages.append(data)
-            elif topic is reference:
-                reference_messages.append(data)
-            else:
-                gnss.append((len(imu_messages), topic, data))
-        samples = decode_imu(imu_messages, imu)
-        for _ in range(len(imu_messages) - len(samples.stamps_ns)):
-            self._aligner.reject('imu_undecodable')
-        good_before = np.concatenate([[0], np.cumsum(samples.decoded)])
+        topics = self._topics
+        kinds = np.array([0 if topic is topics.imu else 1 if topic is topics.reference else 2
+                          for topic in self.read])[np.array(block.topics)]
+        imu_messages = list(itertools.compress(block.messages, (kinds == 0).tolist()))
+        samples = decode_imu(imu_messages, topics.imu)
+        if not samples.decoded.all():
+            for _ in range(np.count_nonzero(~samples.decoded)):
+                self._aligner.reject('imu_undecodable')
+        # For each message of the block: how many usable IMU samples come before it.
+        before = np.zeros(len(kinds), np.int64)
+        before[kinds == 0] = samples.decoded
+        before = np.cumsum(before)
         position = 0
-        for messages_before, topic, data in gnss:
-            end = int(good_before[messages_before])
+        for index in np.flatnonzero(kinds == 2).tolist():
+            end = int(before[index])
             self._add_imu(samples, position, end)
             position = end
-            if topic is fix:
-                self._add_fix(data)
+            if self.read[block.topics[index]] is topics.fix:
+                self._add_fix(block.messages[index])
             else:
-                self._add_velocity(data)
+                self._add_velocity(block.messages[index])
             self._epochs += self._aligner.update()
         self._add_imu(samples, position, len(samples.stamps_ns))
         self._epochs += self._aligner.update()
-        if reference is not None and reference_messages:
-            self._references.append(decode_orientations(reference_messages, reference))
+        if topics.reference is not None and (kinds == 1).any():
+            self._references.append(decode_orientations(
+                list(itertools.compress(block.messages, (kinds == 1).tolist())),
+                topics.reference))
 
     def result(self, bag: str, warnings: list[str]) -> ReplayResult:
         """Return what came of all blocks."""

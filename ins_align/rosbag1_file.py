@@ -19,7 +19,8 @@ from collections.abc import Collection, Iterator
 import struct
 
 from ins_align.bag_files import (
-    BagError, ChunkedFile, MAX_DEFINITION_BYTES, MAX_MESSAGE_BYTES, Records, ros2_type, Segment, Topic)
+    BagError, ChunkedFile, MAX_DEFINITION_BYTES, MAX_MESSAGE_BYTES, Records, ros2_type, Segment,
+    Topic)
 
 MAGIC = b'#ROSBAG V'
 

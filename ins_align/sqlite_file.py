@@ -22,17 +22,17 @@ import sqlite3
 from typing import Any
 from urllib.parse import quote
 
-from ins_align.bag_files import BagError, MAX_MESSAGE_BYTES, ros2_type, Topic
+from ins_align.bag_files import BagError, MAX_MESSAGE_BYTES, Records, ros2_type, Topic
 
 MAGIC = b'SQLite format 3\x00'
+BLOCK = 4096  # rows read at a time
 
 
 class SqliteFile:
     """A sqlite3 file of rosbag2."""
 
-    _SELECT = ('SELECT timestamp, topic_id, '
-               f'CASE WHEN length(data) <= {MAX_MESSAGE_BYTES} THEN data ELSE length(data) END, '
-               'rowid FROM messages ')
+    _SELECT = ('SELECT timestamp, topic_id, CASE WHEN length(data) <= '
+               f'{MAX_MESSAGE_BYTES} THEN data ELSE length(data) END ')
 
     def __init__(self, path: Path) -> None:
         self.warnings: list[str] = []
@@ -96,48 +96,56 @@ class SqliteFile:
     def blocks(self, ids: Collection[int], start_ns: int, stop_ns: int) -> Iterator[Records]:
         """Yield records many at a time, in the order of recorded time."""
         if self.end_ns is not None:
-            query = (self._SELECT + f'WHERE topic_id IN ({",".join("?" * len(ids))}) '
-                     'AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, rowid')
+            query = (self._SELECT + f'FROM messages WHERE topic_id IN ({",".join("?" * len(ids))})'
+                     ' AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, rowid')
             try:
                 cursor = self._database.execute(query, (*ids, start_ns, stop_ns))
                 while rows := cursor.fetchmany(BLOCK):
-                    yield self._sound(rows)
-                    start_ns = rows[-1][0] + 1
+                    if records := self._sound(rows):
+                        yield records
+                        start_ns = records[-1][0] + 1
                 return
             except sqlite3.Error as error:
                 self._warn_of_damage(error)
-        yield from self._blocks_as_stored(ids, start_ns, stop_ns)
+        records = []
+        for row in self._rows_as_stored():
+            if row[1] in ids and type(row[0]) is int and start_ns <= row[0] < stop_ns:
+                records.append(row[:3])
+            if len(records) == BLOCK:
+                yield self._sound(records)
+                records = []
+        if records:
+            yield self._sound(records)
 
-    def _blocks_as_stored(self, ids: Collection[int], start_ns: int, stop_ns: int,
-                          ) -> Iterator[Records]:
+    def _rows_as_stored(self) -> Iterator[tuple[Any, Any, Any, int]]:
         """
-        Yield records in the order of recording, to the end or to the first page that is lost.
+        Yield rows in the order of recording, to the end or to the first page that is lost.
 
-        The order of time needs the index. A page that is lost in part has rows numbered 0.
+        The order of time would need the index. A page that is lost in part has rows numbered 0.
         """
         last = 0
-        block: Records = []
-        try:
+        with contextlib.suppress(sqlite3.Error):
             for row in self._database.execute(
-                    self._SELECT.replace('topic_id,', 'topic_id, rowid,', 1)
-                    + 'NOT INDEXED ORDER BY rowid'):
-                time_ns, topic, number, data = row
-                if number <= last:
-                    break
-                last = number
-                if topic in ids and type(time_ns) is int and start_ns <= time_ns < stop_ns:
-                    block.append((time_ns, topic, data))
-        except sqlite3.Error:
-            pass
-        for start in range(0, len(block), BLOCK):
-            yield self._sound(block[start:start + BLOCK])
+                    self._SELECT + ', rowid FROM messages NOT INDEXED ORDER BY rowid'):
+                if row[3] <= last:
+                    return
+                last = row[3]
+                yield row
 
-    def _sound(self, rows: list[tuple[Any, int, Any]]) -> Records:
-        """Leave out rows that are no messages; a message that is too long is refused."""
-        if set(map(type, map(itemgetter(2), rows))) == {bytes} == \
-                {bytes if type(row[0]) is int else None for row in rows}:
+    def _sound(self, rows: list[tuple[Any, Any, Any]]) -> Records:
+        """Leave out rows that are no messages; one that is too long is an error."""
+        if {(type(time_ns), type(data)) for time_ns, _, data in rows} == {(int, bytes)}:
             return rows
-        return rows
+        records = []
+        for time_ns, topic, data in rows:
+            if type(data) is int:
+                raise BagError(f'{self._path.name} has a message of {data} bytes on '
+                               f'{self.topics[topic].name}, where {MAX_MESSAGE_BYTES} are allowed')
+            if type(data) is bytes and type(time_ns) is int:
+                records.append((time_ns, topic, data))
+            else:
+                self._warn('has damaged messages, which are left out')
+        return records
 
     def _warn_of_damage(self, error: sqlite3.Error) -> None:
         self._warn(f'is damaged ({error}): it is read as far as it goes')

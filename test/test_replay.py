@@ -17,7 +17,7 @@ import dataclasses
 import json
 import sqlite3
 
-from ins_align import replay as replay_module
+from ins_align import sqlite_file
 from ins_align.aligner import Aligner, Attitude
 from ins_align.bag_files import BagError
 from ins_align.config import Config
@@ -65,7 +65,7 @@ def test_same_as_the_messages_without_a_recording(simulation, result):
 
 @pytest.mark.parametrize('block', [1, 7, 1000])
 def test_blocks_do_not_matter(flight, result, monkeypatch, block):
-    monkeypatch.setattr(replay_module, 'BLOCK', block)
+    monkeypatch.setattr(sqlite_file, 'BLOCK', block)
     assert numbers(replay(flight, CONFIG)) == numbers(result)
 
 
