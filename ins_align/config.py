@@ -128,10 +128,10 @@ class Config:
         0.0, "accelerometer bias, 1 sigma per axis; 0: the preset's", 'm/s^2',
         minimum=0.0, maximum=10.0)
     velocity_std: float = _parameter(
-        0.1, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none', 'm/s',
+        0.2, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none', 'm/s',
         minimum=1e-4, maximum=100.0)
     velocity_std_vertical: float = _parameter(
-        0.2, 'vertical GNSS velocity, 1 sigma, where messages carry none', 'm/s',
+        0.4, 'vertical GNSS velocity, 1 sigma, where messages carry none', 'm/s',
         minimum=1e-4, maximum=100.0)
     position_std: float = _parameter(
         2.5, 'horizontal GNSS position, 1 sigma per axis, where messages carry none', 'm',
