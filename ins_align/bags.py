@@ -126,6 +126,7 @@ class Bag:
             What to read.
         start_ns, stop_ns : int, optional
             First recorded time and the one to stop before.
+
         """
         start_ns = 0 if start_ns is None else start_ns
         stop_ns = INT64_MAX if stop_ns is None else stop_ns

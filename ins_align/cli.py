@@ -94,6 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     -------
     int
         Exit status.
+
     """
     arguments = parser().parse_args(argv)
     try:
@@ -280,7 +281,7 @@ def _show(result: ReplayResult, arguments: argparse.Namespace, label: str,
 
     for warning in result.warnings:
         progress.note(f'ins_align replay: warning: {warning}')
-    progress.print(report.summary(result) + '\n')
+    progress.say(report.summary(result) + '\n')
     if arguments.csv:
         text = result.to_csv().encode()
         _write(_with_label(arguments.csv, label), lambda file: file.write(text))
@@ -396,6 +397,7 @@ class Progress:
     ----------
     bar : tqdm or None
         Counts recordings.
+
     """
 
     def __init__(self, bar: Any) -> None:
@@ -408,7 +410,7 @@ class Progress:
         yield lambda part: self._advance(index + part)
         self._advance(index + 1.0)
 
-    def print(self, text: str) -> None:
+    def say(self, text: str) -> None:
         """Write to standard output without tearing the bar."""
         self._write(text, sys.stdout)
 

@@ -50,6 +50,7 @@ class Reference:
     ----------
     orientations : Orientations
         Those with a negative variance ("not known") or without a direction are left out.
+
     """
 
     def __init__(self, orientations: Orientations) -> None:
@@ -84,6 +85,7 @@ class Reference:
             Small rotation about east, north, up that takes the attitude to the reference.
         rpy_deg : ndarray, shape (3,)
             Differences of roll, pitch, yaw, attitude less reference.
+
         """
         C_reference = self.attitude_at(attitude.stamp_ns)
         if C_reference is None:
@@ -161,6 +163,7 @@ def replay(path: str | os.PathLike, config: Config | None = None, *, imu_topic: 
     path : path
         rosbag2 directory or file, ROS 1 bag.
     config : Config, optional
+        By default all parameters at their defaults.
     imu_topic, fix_topic, velocity_topic : str, optional
         Where there is more than one candidate.
     start, duration : float, optional
@@ -176,6 +179,7 @@ def replay(path: str | os.PathLike, config: Config | None = None, *, imu_topic: 
     ------
     BagError
         If the recording cannot be read or lacks a topic.
+
     """
     with Bag(path) as bag:
         try:

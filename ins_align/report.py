@@ -49,8 +49,10 @@ def write_whole(path: str | os.PathLike, write: Callable[[IO[bytes]], None]) -> 
     Parameters
     ----------
     path : path
+        To be made or replaced.
     write : callable
         Gets the open file. If it raises, `path` is as it was before.
+
     """
     path = Path(path)
     unfinished = path.with_name(f'.{path.name}.{os.getpid()}.part')
@@ -74,6 +76,7 @@ def format_table(rows: Sequence[Sequence[Any]], header: Sequence[str] = (),
     rows : sequence of rows
         Cells are text; floats get four significant digits, None is a dash.
     header : sequence of str, optional
+        Names of the columns.
     indent : str, optional
         In front of every line.
 
@@ -81,6 +84,7 @@ def format_table(rows: Sequence[Sequence[Any]], header: Sequence[str] = (),
     -------
     str
         Without a newline at the end.
+
     """
     cells = [[_cell(cell) for cell in row] for row in rows]
     if header:
