@@ -65,7 +65,8 @@ bench: $(VENV)/ready
 
 #: make experiments            renews the figures and tables in docs/experiments; those of real
 #:                             recordings with DATA=folder
-experiments: $(VENV)/ready
+experiments: demo
+	@cp build/demo/flight.png docs/images/
 	@$(BIN)/ins_align experiment all --out docs/experiments $(if $(DATA),--data '$(DATA)')
 
 #: make lock                   renews the pinned versions in requirements/ (needs uv)
