@@ -27,7 +27,6 @@ from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer
 from ins_align.config import Config, ConfigError, parameters
 from ins_align.declaration import Declaration, State, Verdict
 from ins_align.earth import EARTH_RATE, SEMI_MAJOR_AXIS
-from ins_align.estimator import Prior
 from ins_align.messages import Fix, Velocity
 from ins_align.methods import Epoch as MethodEpoch
 from ins_align.methods import ImuSteps, MapMethod, Method, NoteMethod, Nuisance
@@ -35,6 +34,7 @@ from ins_align.plausibility import ForceCheck, VelocityCheck
 from ins_align.preintegration import Noise, split_at_epochs, white_noise
 from ins_align.rotation import (Array, exp_so3, orthonormalized, quaternion_from_matrix,
                                 roll_pitch_yaw)
+from ins_align.unknowns import Prior
 import numpy as np
 
 # The IMU may be silent for this long; then the attitude is lost and alignment starts over (s).

@@ -18,7 +18,7 @@ Latitude and longitude are radians, altitude is metres above the ellipsoid; ever
 over leading axes.
 """
 
-from ins_align.rotation import Array
+from ins_align.rotation import Array, cross
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -31,8 +31,6 @@ GRAVITY_EQUATOR = 9.7803253359         # m/s^2
 SOMIGLIANA_K = 0.00193185265241
 # omega^2 a^2 b / GM, the ratio of centrifugal to gravitational acceleration at the equator.
 GRAVITY_RATIO = 0.00344978650684
-
-EARTH_RATE_E = np.array([0.0, 0.0, EARTH_RATE])
 
 
 def normal_gravity(latitude: ArrayLike, altitude: ArrayLike) -> Array:
@@ -66,11 +64,16 @@ def matrix_en(latitude: ArrayLike, longitude: ArrayLike) -> Array:
     """``C_en``, shape (..., 3, 3): columns are east, north and up in the Earth-fixed frame."""
     sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
     sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)
-    zero = np.zeros_like(sin_lat + sin_lon)
-    rows = [[-sin_lon + zero, -sin_lat * cos_lon, cos_lat * cos_lon],
-            [cos_lon + zero, -sin_lat * sin_lon, cos_lat * sin_lon],
-            [zero, cos_lat + zero, sin_lat + zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    matrix = np.zeros(np.broadcast_shapes(np.shape(sin_lat), np.shape(sin_lon)) + (3, 3))
+    matrix[..., 0, 0] = -sin_lon
+    matrix[..., 1, 0] = cos_lon
+    matrix[..., 0, 1] = -sin_lat * cos_lon
+    matrix[..., 1, 1] = -sin_lat * sin_lon
+    matrix[..., 2, 1] = cos_lat
+    matrix[..., 0, 2] = cos_lat * cos_lon
+    matrix[..., 1, 2] = cos_lat * sin_lon
+    matrix[..., 2, 2] = sin_lat
+    return matrix
 
 
 def matrix_earth_turned(time: ArrayLike) -> Array:
@@ -93,16 +96,40 @@ def matrix_earth_turned(time: ArrayLike) -> Array:
 
 
 def gravity_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
-    """Gravity ``g_n`` (normal) in ENU, shape (..., 3), m/s^2."""
+    """Normal gravity ``g_n`` in ENU, shape (..., 3), m/s^2."""
     magnitude = normal_gravity(latitude, altitude)
-    return np.stack([np.zeros_like(magnitude), np.zeros_like(magnitude), -magnitude], axis=-1)
+    vector = np.zeros(np.shape(magnitude) + (3,))
+    vector[..., 2] = -magnitude
+    return vector
 
 
 def earth_rate_n(latitude: ArrayLike) -> Array:
     """Earth rate ``omega_ie_n`` in ENU, shape (..., 3), rad/s."""
-    latitude = np.asarray(latitude, dtype=float)
-    return EARTH_RATE * np.stack(
-        [np.zeros_like(latitude), np.cos(latitude), np.sin(latitude)], axis=-1)
+    vector = np.zeros(np.shape(latitude) + (3,))
+    vector[..., 1] = EARTH_RATE * np.cos(latitude)
+    vector[..., 2] = EARTH_RATE * np.sin(latitude)
+    return vector
+
+
+def position_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
+    """Position from the Earth's centre in ENU axes, shape (..., 3), metres."""
+    sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
+    prime_vertical = SEMI_MAJOR_AXIS / np.sqrt(1 - ECCENTRICITY2 * sin_lat ** 2)
+    vector = np.zeros(np.broadcast_shapes(np.shape(latitude), np.shape(altitude)) + (3,))
+    vector[..., 1] = -prime_vertical * ECCENTRICITY2 * sin_lat * cos_lat
+    vector[..., 2] = prime_vertical * (1 - ECCENTRICITY2 * sin_lat ** 2) + altitude
+    return vector
+
+
+def gravitation_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
+    """Gravitation ``g_n + omega_ie x (omega_ie x r)`` in ENU, shape (..., 3), m/s^2."""
+    rate = earth_rate_n(latitude)
+    return gravity_n(latitude, altitude) + cross(rate, ground_velocity_n(latitude, altitude))
+
+
+def ground_velocity_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
+    """Inertial velocity ``omega_ie x r`` of what rests on the Earth, ENU, shape (..., 3), m/s."""
+    return cross(earth_rate_n(latitude), position_n(latitude, altitude))
 
 
 class LocalLevel:
@@ -129,21 +156,20 @@ class LocalLevel:
     def position(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike,
                  altitude: ArrayLike) -> Array:
         """Position from the Earth's centre in n0 axes, shape (..., 3), metres."""
-        r_e = ecef_from_lla(latitude, longitude, altitude)
-        return (self._C_n0e @ matrix_earth_turned(time) @ r_e[..., None])[..., 0]
+        return self._seen(time, latitude, longitude, position_n(latitude, altitude))
 
     def velocity(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike,
                  altitude: ArrayLike, v_n: ArrayLike) -> Array:
         """Inertial velocity in n0 axes, shape (..., 3), m/s: ``C_n0n (v_n + omega_ie x r)``."""
-        r_e = ecef_from_lla(latitude, longitude, altitude)
-        v_e = (matrix_en(latitude, longitude) @ np.asarray(v_n, dtype=float)[..., None])
-        inertial = v_e[..., 0] + np.cross(EARTH_RATE_E, r_e)
-        return (self._C_n0e @ matrix_earth_turned(time) @ inertial[..., None])[..., 0]
+        return self._seen(time, latitude, longitude,
+                          np.asarray(v_n, dtype=float) + ground_velocity_n(latitude, altitude))
 
     def gravitation(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike,
                     altitude: ArrayLike) -> Array:
-        """Gravitation ``g + W x (W x r)`` in n0 axes, shape (..., 3), m/s^2."""
-        r_e = ecef_from_lla(latitude, longitude, altitude)
-        g_e = (matrix_en(latitude, longitude) @ gravity_n(latitude, altitude)[..., None])[..., 0]
-        gravitation = g_e + np.cross(EARTH_RATE_E, np.cross(EARTH_RATE_E, r_e))
-        return (self._C_n0e @ matrix_earth_turned(time) @ gravitation[..., None])[..., 0]
+        """Gravitation in n0 axes, shape (..., 3), m/s^2."""
+        return self._seen(time, latitude, longitude, gravitation_n(latitude, altitude))
+
+    def _seen(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike,
+              vector_n: Array) -> Array:
+        """Turn a vector from ENU at `time` into n0 axes."""
+        return (self.matrix(time, latitude, longitude) @ vector_n[..., None])[..., 0]

@@ -18,387 +18,24 @@ The unknowns x are the initial attitude and whatever makes the integration formu
 biases, the start, the lever arm, the GNSS delay. The random-walk errors of the integrated IMU data
 are a Markov process; a small Kalman filter over them whitens the residuals and every column of
 their sensitivity to x at once, and the normal equations accumulate (docs, "Theory").
-
-Layout of the errors of the chain: ``epsilon = (rotation in b0, velocity, position)``; measurement
-rows: velocity first, then position; both in n0.
 """
 
 from collections import deque
 from dataclasses import dataclass, replace
 import math
-from typing import Any
 
 from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals
-from ins_align.rotation import Array, cross, cumulative_rotations, exp_so3, log_so3, skew
+from ins_align.rotation import Array, cross, exp_so3, skew
+from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, BODY_FIXED, DELAY, GYRO_BIAS, inverse_spd,
+                                LEVER_ARM, Prior, prior_of, SIZE, START_POSITION, START_VELOCITY,
+                                UNIFORM_ANGLE_STD, Unknowns)
+from ins_align.whitening import (Chain, HEADING_RESOLVED_STD, Measurements, POSITION,
+                                 sensitivities, VELOCITY, Whitener)
 import numpy as np
-from numpy.typing import NDArray
 
-Index = NDArray[np.integer[Any]]
-
-# A heading is never known worse than uniform on the circle.
-UNIFORM_ANGLE_STD = math.pi / math.sqrt(3)
-# Below this heading sigma (rad) the problem is as good as linear in the heading.
-HEADING_RESOLVED_STD = 0.35
+# Median of chi-square with three degrees of freedom.
 MEDIAN_CHI2_3 = 2.366
-# Chi-square gate of three rows of innovation: one in 60 000 of good ones fails.
-GATE = 25.0
-VELOCITY, POSITION = slice(0, 3), slice(3, 6)
-
-
-@dataclass(frozen=True)
-class Unknowns:
-    """
-    The unknowns, or a point to linearise at.
-
-    Attributes
-    ----------
-    C : ndarray, shape (3, 3)
-        Initial attitude ``C_nb(0)``.
-    gyro_bias, accel_bias : ndarray, shape (3,)
-        rad/s, m/s^2; measured minus true.
-    start_velocity, start_position : ndarray, shape (3,)
-        Of the IMU at t0 in n0, relative to the antenna's track (c_v, c_p of method.md).
-    lever_b : ndarray, shape (3,)
-        Metres.
-    delay : float
-        Seconds by which a GNSS measurement is older than its stamp.
-
-    """
-
-    C: Array
-    gyro_bias: Array
-    accel_bias: Array
-    start_velocity: Array
-    start_position: Array
-    lever_b: Array
-    delay: float
-
-    def vector(self) -> Array:
-        """All but the attitude, which has three zeros, shape (19,)."""
-        return np.concatenate([np.zeros(3), self.gyro_bias, self.accel_bias, self.start_velocity,
-                               self.start_position, self.lever_b, [self.delay]])
-
-    def moved(self, dx: Array) -> 'Unknowns':
-        """Return the point moved by `dx`, shape (19,)."""
-        return Unknowns(exp_so3(dx[:3]) @ self.C, self.gyro_bias + dx[3:6],
-                        self.accel_bias + dx[6:9], self.start_velocity + dx[9:12],
-                        self.start_position + dx[12:15], self.lever_b + dx[15:18],
-                        float(self.delay + dx[18]))
-
-    def minus(self, other: 'Unknowns') -> Array:
-        """Return the step from `other` to this point, shape (19,)."""
-        step = self.vector() - other.vector()
-        step[:3] = log_so3(self.C @ other.C.T)
-        return step
-
-
-# Places of the blocks in the full vector of unknowns.
-ATTITUDE, GYRO_BIAS, ACCEL_BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
-START_VELOCITY, START_POSITION = slice(9, 12), slice(12, 15)
-LEVER_ARM, DELAY = slice(15, 18), slice(18, 19)
-SIZE = 19
-# Unknowns that outlive a new t0 and do not depend on the heading.
-BODY_FIXED = np.r_[GYRO_BIAS, ACCEL_BIAS, LEVER_ARM, DELAY]
-
-
-@dataclass(frozen=True)
-class Prior:
-    """
-    What is known of x before the data: a mean and an information matrix over all 19 unknowns.
-
-    With `heading_free` the heading of the mean is arbitrary and carries no information.
-    """
-
-    mean: Unknowns
-    information: Array
-    heading_free: bool
-
-    def at(self, point: Unknowns) -> tuple[Array, Array]:
-        """Return the information about the step from `point`, and the mean of that step."""
-        mean, information = self.mean, self.information
-        if self.heading_free:
-            turn = point.C @ mean.C.T
-            psi = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-            Rz = exp_so3([0.0, 0.0, psi])
-            mean = replace(mean, C=Rz @ mean.C)
-            information = information.copy()
-            information[:3] = Rz @ information[:3]
-            information[:, :3] = information[:, :3] @ Rz.T
-        return information, mean.minus(point)
-
-
-@dataclass
-class Measurements:
-    """
-    GNSS epochs on the navigation side, in n0; K of them, the first at t0.
-
-    Attributes
-    ----------
-    time : ndarray, shape (K,)
-        Seconds since t0.
-    s : ndarray, shape (K, 6)
-        s_v and s_p of `InertialTrack`.
-    covariance : ndarray, shape (K, 2, 3, 3)
-        Of the velocity and of the position.
-    present : ndarray of bool, shape (K, 2)
-        Whether the velocity and the position rows hold a measurement.
-    gravity, offset : ndarray, shape (K, 3)
-        Gravity in n0, and what has to be added to s_v for the velocity over ground in n0.
-
-    """
-
-    time: Array
-    s: Array
-    covariance: Array
-    present: np.ndarray
-    gravity: Array
-    offset: Array
-
-    @staticmethod
-    def empty(capacity: int) -> 'Measurements':
-        """Room for `capacity` epochs."""
-        return Measurements(np.zeros(capacity), np.zeros((capacity, 6)),
-                            np.zeros((capacity, 2, 3, 3)), np.zeros((capacity, 2), bool),
-                            np.zeros((capacity, 3)), np.zeros((capacity, 3)))
-
-    def take(self, index: slice) -> 'Measurements':
-        """Return the epochs of `index`."""
-        return Measurements(*(array[index] for array in vars(self).values()))
-
-    def put(self, index: int, other: 'Measurements') -> None:
-        """Copy the single epoch of `other` into place `index`."""
-        for name, array in vars(self).items():
-            array[index] = getattr(other, name)[0]
-
-
-@dataclass
-class Chain:
-    """The integrated IMU data up to an epoch, and their derivatives to the biases."""
-
-    R: Array                # C_b0b
-    v: Array                # int C_b0b f
-    p: Array                # int int C_b0b f
-    R_g: Array              # left error of R to the gyro bias
-    v_g: Array
-    v_a: Array
-    p_g: Array
-    p_a: Array
-
-    @staticmethod
-    def start() -> 'Chain':
-        """Return the chain at t0."""
-        zero = np.zeros((3, 3))
-        return Chain(np.eye(3), np.zeros(3), np.zeros(3), zero, zero, zero, zero, zero)
-
-    def at(self, index: int) -> 'Chain':
-        """Return one epoch of a chain over many."""
-        return Chain(*(array[index] for array in vars(self).values()))
-
-    def extended(self, interval: Intervals,
-                 excess: float = 1.0) -> tuple['Chain', Array, Array]:
-        """
-        Chain K intervals.
-
-        Parameters
-        ----------
-        interval : Intervals
-        excess : float
-            Share of the noise measured in excess of the stated one that is believed.
-
-        Returns
-        -------
-        chain : Chain
-            With a leading axis of K, at the end of each interval.
-        F : ndarray, shape (K, 9, 9)
-            Transition of the chain's errors over each interval.
-        W : ndarray, shape (K, 9, 9)
-            What the interval's noise adds to their covariance.
-
-        """
-        K = interval.duration.size
-        R_end = self.R @ cumulative_rotations(interval.R)
-        R = np.concatenate([self.R[None], R_end[:-1]])
-        h = interval.duration[:, None, None]
-        u = (R @ interval.v[..., None])[..., 0]
-        w = (R @ interval.p[..., None])[..., 0]
-        skew_u, skew_w = skew(u), skew(w)
-
-        def total(start: Array, steps: Array) -> tuple[Array, Array]:
-            """Values before and after each interval."""
-            after = start + np.cumsum(steps, axis=0)
-            return after - steps, after
-
-        RJ = R @ interval.J_Rg
-        R_g, R_g_end = total(self.R_g, RJ)
-        v_g, v_g_end = total(self.v_g, R @ interval.J_vg - skew_u @ R_g)
-        v_a, v_a_end = total(self.v_a, RJ)
-        v, v_end = total(self.v, u)
-        p_end = total(self.p, w + interval.duration[:, None] * v)[1]
-        p_g_end = total(self.p_g, h * v_g + R @ interval.J_pg - skew_w @ R_g)[1]
-        p_a_end = total(self.p_a, h * v_a + R @ interval.J_pa)[1]
-
-        F = np.zeros((K, 9, 9))
-        F[:, range(9), range(9)] = 1.0
-        F[:, 3:6, :3] = -skew_u
-        F[:, 6:, :3] = -skew_w
-        F[:, 6:, 3:6] = h * np.eye(3)
-        turn = np.zeros((K, 9, 9))
-        turn[:, :3, :3] = turn[:, 3:6, 3:6] = turn[:, 6:, 6:] = R
-        W = turn @ (interval.Q + excess * interval.Q_excess) @ turn.transpose(0, 2, 1)
-        return Chain(R_end, v_end, p_end, R_g_end, v_g_end, v_a_end, p_g_end, p_a_end), F, W
-
-
-def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements, omega: Array,
-                  f: Array) -> tuple[Array, Array]:
-    """
-    Residuals of K epochs and their derivatives, at a linearisation point.
-
-    Parameters
-    ----------
-    point : Unknowns
-        Where to linearise.
-    chain : Chain
-        K epochs of it.
-    gnss : Measurements
-        The same K epochs.
-    omega, f : ndarray, shape (K, 3)
-        Angular rate and specific force at the epochs, bias-corrected.
-
-    Returns
-    -------
-    Y : ndarray, shape (K, 6, 20)
-        The residual ``s - model`` in the first column, then the derivative of the model to each
-        unknown.
-    L : ndarray, shape (K, 6, 9)
-        Derivative of the model to the chain's errors.
-
-    """
-    K = gnss.time.size
-    C, lever = point.C, point.lever_b
-    CR = C @ chain.R
-    spun = cross(omega, lever)
-    lever_v = (CR @ spun[..., None])[..., 0]               # in n0
-    lever_p = CR @ lever
-    Ca_v = chain.v @ C.T + lever_v
-    Ca_p = chain.p @ C.T + lever_p
-    acceleration = (CR @ f[..., None])[..., 0] + gnss.gravity
-    ground_velocity = point.start_velocity + Ca_v + gnss.offset
-    Y = np.zeros((K, 6, 1 + SIZE))
-    Y[:, VELOCITY, 0] = (gnss.s[:, VELOCITY] - point.start_velocity - Ca_v
-                         + point.delay * acceleration)
-    Y[:, POSITION, 0] = (gnss.s[:, POSITION] - point.start_position
-                         - gnss.time[:, None] * point.start_velocity - Ca_p
-                         + point.delay * (ground_velocity - 0.5 * point.delay * acceleration))
-    H = Y[:, :, 1:]
-    lever_v_skew, lever_p_skew = skew(lever_v), skew(lever_p)
-    eye = np.eye(3)
-    H[:, VELOCITY, ATTITUDE] = -skew(Ca_v)
-    H[:, POSITION, ATTITUDE] = -skew(Ca_p)
-    C_R_g = C @ chain.R_g
-    H[:, VELOCITY, GYRO_BIAS] = C @ chain.v_g - lever_v_skew @ C_R_g + CR @ skew(lever)
-    H[:, POSITION, GYRO_BIAS] = C @ chain.p_g - lever_p_skew @ C_R_g
-    H[:, VELOCITY, ACCEL_BIAS] = C @ chain.v_a
-    H[:, POSITION, ACCEL_BIAS] = C @ chain.p_a
-    H[:, VELOCITY, START_VELOCITY] = eye
-    H[:, POSITION, START_VELOCITY] = (gnss.time - point.delay)[:, None, None] * eye
-    H[:, POSITION, START_POSITION] = eye
-    H[:, VELOCITY, LEVER_ARM] = CR @ skew(omega)
-    H[:, POSITION, LEVER_ARM] = CR
-    H[:, VELOCITY, 18] = -acceleration
-    H[:, POSITION, 18] = -(ground_velocity - point.delay * acceleration)
-    L = np.zeros((K, 6, 9))
-    L[:, VELOCITY, :3] = -lever_v_skew @ C
-    L[:, POSITION, :3] = -lever_p_skew @ C
-    L[:, VELOCITY, 3:6] = C
-    L[:, POSITION, 6:] = C
-    return Y, L
-
-
-class Whitener:
-    """
-    The small Kalman filter over the chain's errors, and the normal equations that it feeds.
-
-    Parameters
-    ----------
-    columns : ndarray of int
-        Unknowns that are estimated, out of the 19.
-    size : int
-        9 when positions are used, 6 when velocities alone are.
-
-    """
-
-    def __init__(self, columns: Index, size: int) -> None:
-        """Start at t0, where the chain has no error."""
-        self._columns = np.concatenate([[0], 1 + columns])
-        self._size = size
-        self.P = np.zeros((size, size))
-        self.X = np.zeros((size, self._columns.size))
-        self.normal = np.zeros((self._columns.size, self._columns.size))
-        self.rows = 0
-        self.rejected = [0, 0]
-        self.spurious = 0.0
-        self.log_det = 0.0
-
-    def predict(self, F: Array, W: Array) -> None:
-        """Go over an interval with transition `F` and noise `W`, shape (9, 9)."""
-        F = F[:self._size, :self._size]
-        self.X = F @ self.X
-        self.P = F @ self.P @ F.T + W[:self._size, :self._size]
-
-    def update(self, kind: int, Y: Array, L: Array, covariance: Array,
-               gate: 'tuple[Array, Array] | None', gate_scale: float) -> float:
-        """
-        Take the three rows of a velocity (kind 0) or position (kind 1).
-
-        Parameters
-        ----------
-        kind : int
-            0 or 1.
-        Y, L : ndarray, shapes (3, 20), (3, 9)
-            From `sensitivities`.
-        covariance : ndarray, shape (3, 3)
-            Of the measurement.
-        gate : (dx, P) or None
-            Step to the present estimate and its covariance; the innovation is tested against it.
-        gate_scale : float
-            Factor on the gate.
-
-        Returns
-        -------
-        float
-            Normalised innovation squared, nan where it was not tested.
-
-        """
-        L = L[:, :self._size]
-        innovation = Y[:, self._columns] - L @ self.X
-        PL = self.P @ L.T
-        S = L @ PL + covariance
-        nis = math.nan
-        if gate is not None:
-            residual = innovation[:, 0] - innovation[:, 1:] @ gate[0]
-            spread = innovation[:, 1:] @ gate[1] @ innovation[:, 1:].T
-            if gate[1][2, 2] > HEADING_RESOLVED_STD ** 2:
-                # A large error of heading shows along the motion too, not only across.
-                spread[:2, :2] = (spread[0, 0] + spread[1, 1]) * np.eye(2)
-            spread += S
-            nis = float(residual @ np.linalg.solve(spread, residual))
-            if not nis < GATE * gate_scale:
-                self.rejected[kind] += 1
-                return nis
-        weighted = np.linalg.solve(S, np.hstack([innovation, PL.T]))
-        count = self._columns.size
-        self.normal += innovation.T @ weighted[:, :count]
-        # The heading's column is made of integrated IMU data, whose own errors look like motion:
-        # this is the information that they would feign, in expectation (errors in variables).
-        feigned = weighted[:, count:] @ L.T
-        self.spurious += float(feigned[0, 0] + feigned[1, 1])
-        self.X = self.X + PL @ weighted[:, :count]
-        P = self.P - PL @ weighted[:, count:]
-        self.P = 0.5 * (P + P.T)                  # or rounding grows in the antisymmetric part
-        self.rows += 3
-        self.log_det += float(np.linalg.slogdet(S)[1])
-        return nis
 
 
 @dataclass
@@ -575,7 +212,7 @@ class MapEstimator:
         information = s.information + s.whitener.normal[1:, 1:]
         right = s.whitener.normal[1:, 0] + s.information @ s.mean_step
         information[ATTITUDE, ATTITUDE] += np.eye(3) / UNIFORM_ANGLE_STD ** 2
-        s.P = _inverse(information)
+        s.P = inverse_spd(information)
         s.dx = s.P @ right
         column = s.P[:, 2]
         feigned = min(s.whitener.spurious, 1 / column[2] - 1 / UNIFORM_ANGLE_STD ** 2)
@@ -824,7 +461,7 @@ class MapEstimator:
         unknowns = np.concatenate([unknowns, self._columns[kept]])
         mean = Unknowns(C_n0n.T @ C, x.gyro_bias, x.accel_bias, C_n0n.T @ (v + shift_v),
                         C_n0n.T @ (p + shift_p), x.lever_b, x.delay)
-        return _prior(mean, joint[np.ix_(places, places)], unknowns, heading_free)
+        return prior_of(mean, joint[np.ix_(places, places)], unknowns, heading_free)
 
     def prior_without_attitude(self) -> Prior:
         """Return what is known of biases, lever arm and delay as the prior of a fresh start."""
@@ -833,44 +470,4 @@ class MapEstimator:
         unknowns = self._columns[np.isin(self._columns, BODY_FIXED)]
         mean = replace(self.estimate(), C=np.eye(3), start_velocity=np.zeros(3),
                        start_position=np.zeros(3))
-        return _prior(mean, self.covariance[np.ix_(unknowns, unknowns)], unknowns, False)
-
-
-def _prior(mean: Unknowns, covariance: Array, unknowns: Index, heading_free: bool) -> Prior:
-    """Prior from the covariance of some unknowns; nothing is known of the others."""
-    information = np.zeros((SIZE, SIZE))
-    information[np.ix_(unknowns, unknowns)] = _inverse(covariance)
-    return Prior(mean, information, heading_free)
-
-
-def _inverse(matrix: Array) -> Array:
-    """Inverse of a symmetric positive definite matrix whose rows differ widely in scale."""
-    scale = 1 / np.sqrt(np.diag(matrix))
-    inverse = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
-    return 0.5 * (inverse + inverse.T)
-
-
-def first_prior(gyro_bias_std: float, accel_bias_std: float, lever_b: Array,
-                lever_std: float, delay: float, delay_std: float) -> Prior:
-    """
-    Return the prior before any data: biases, lever arm and delay; nothing else.
-
-    Parameters
-    ----------
-    gyro_bias_std, accel_bias_std : float
-        rad/s, m/s^2, per axis.
-    lever_b : array_like, shape (3,)
-        Lever arm, metres.
-    lever_std, delay, delay_std : float
-        Metres per axis, seconds.
-
-    """
-    std = np.full(SIZE, math.inf)
-    std[GYRO_BIAS], std[ACCEL_BIAS] = gyro_bias_std, accel_bias_std
-    if lever_std > 0:
-        std[LEVER_ARM] = lever_std
-    if delay_std > 0:
-        std[DELAY] = delay_std
-    mean = Unknowns(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
-                    np.asarray(lever_b, dtype=float), delay)
-    return Prior(mean, np.diag(std ** -2.0), False)
+        return prior_of(mean, self.covariance[np.ix_(unknowns, unknowns)], unknowns, False)

@@ -19,7 +19,8 @@ coarse alignment'", and the free start, the position form (Remark 2.3) and the f
 non-rotating frame that this package adds (docs, "Theory").
 """
 
-from ins_align.earth import earth_rate_n, gravity_n, LocalLevel
+from ins_align.earth import (earth_rate_n, gravitation_n, gravity_n, ground_velocity_n,
+                             LocalLevel, position_n)
 from ins_align.preintegration import Intervals
 from ins_align.rotation import Array, cross, matrix_from_quaternion, orthonormalized, skew
 import numpy as np
@@ -181,37 +182,38 @@ class InertialTrack:
     def __init__(self, latitude: float, longitude: float, altitude: float) -> None:
         """Start at t0."""
         self._n0 = LocalLevel(latitude, longitude)
-        lla = latitude, longitude, altitude
-        self._r0 = self._n0.position(0.0, *lla)
-        self._v0 = self._n0.velocity(0.0, *lla, np.zeros(3))
-        self._gravitation = self._n0.gravitation(0.0, *lla)
-        self._lla = lla
         self.time = 0.0
         self.C_n0n = np.eye(3)
+        self._see(latitude, altitude)
+        self._r0, self._v0 = self._r, self._ground_velocity
         self.int_gravitation, self.int_int_gravitation = np.zeros(3), np.zeros(3)
 
     def advance(self, time: float, latitude: float, longitude: float, altitude: float) -> None:
         """Move to `time` seconds after t0, where the antenna is at the given position."""
         h = time - self.time
-        self._lla = latitude, longitude, altitude
-        g0, g1 = self._gravitation, self._n0.gravitation(time, *self._lla)
+        self.time = time
+        self.C_n0n = self._n0.matrix(time, latitude, longitude)
+        g0 = self._gravitation
+        self._see(latitude, altitude)
+        g1 = self._gravitation
         self.int_int_gravitation = (self.int_int_gravitation + h * self.int_gravitation
                                     + h * h / 6 * (2 * g0 + g1))
         self.int_gravitation = self.int_gravitation + h / 2 * (g0 + g1)
-        self._gravitation = g1
-        self.time = time
-        self.C_n0n = self._n0.matrix(time, latitude, longitude)
+
+    def _see(self, latitude: float, altitude: float) -> None:
+        """Bring what belongs to a place into n0 axes."""
+        self._r = self.C_n0n @ position_n(latitude, altitude)
+        self._ground_velocity = self.C_n0n @ ground_velocity_n(latitude, altitude)
+        self._gravitation = self.C_n0n @ gravitation_n(latitude, altitude)
 
     def s_v(self, v_n: Array) -> Array:
         """Velocity side for the antenna velocity `v_n` (ENU, m/s) at the present time."""
-        return (self._n0.velocity(self.time, *self._lla, v_n) - self._v0
-                - self.int_gravitation)
+        return self.C_n0n @ v_n + self._ground_velocity - self._v0 - self.int_gravitation
 
     @property
     def s_p(self) -> Array:
         """Position side at the present time and position."""
-        return (self._n0.position(self.time, *self._lla) - self._r0 - self.time * self._v0
-                - self.int_int_gravitation)
+        return self._r - self._r0 - self.time * self._v0 - self.int_int_gravitation
 
 
 class AttitudeMoments:

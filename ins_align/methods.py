@@ -24,11 +24,13 @@ from typing import Protocol
 
 from ins_align.config import Config
 from ins_align.earth import gravity_n
-from ins_align.estimator import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
-                                 MapEstimator, Measurements, Prior, UNIFORM_ANGLE_STD)
+from ins_align.estimator import MapEstimator
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
 from ins_align.preintegration import Noise, preintegrate, Steps
 from ins_align.rotation import Array, orthonormalized
+from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
+                                Prior, UNIFORM_ANGLE_STD)
+from ins_align.whitening import Measurements
 import numpy as np
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-CORE = ('rotation', 'earth', 'preintegration', 'formula', 'estimator', 'methods', 'buffers',
+CORE = ('rotation', 'earth', 'preintegration', 'formula', 'estimator', 'unknowns', 'whitening', 'methods', 'buffers',
         'plausibility', 'declaration', 'aligner', 'config', 'messages')
 
 

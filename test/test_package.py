@@ -25,7 +25,7 @@ from ins_align.config import parameters
 import pytest
 
 ROOT = Path(__file__).parents[1]
-CORE = ('rotation', 'earth', 'preintegration', 'formula', 'estimator', 'methods', 'buffers',
+CORE = ('rotation', 'earth', 'preintegration', 'formula', 'estimator', 'unknowns', 'whitening', 'methods', 'buffers',
         'plausibility', 'declaration', 'aligner', 'config', 'messages')
 OPTIONAL = ('rosbags', 'matplotlib', 'pyins', 'pandas', 'numba', 'scipy', 'tqdm')
 

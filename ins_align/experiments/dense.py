@@ -20,7 +20,7 @@ the random-walk errors of all epochs is one dense matrix. On the true motion its
 information is the Cramer-Rao bound; on the measured data it gives the estimate that the recursion
 must match. Cost grows with the cube of the number of epochs: 500 take about a second.
 
-The unknowns are in the order of `ins_align.estimator`; velocity rows come before position rows.
+The unknowns are in the order of `ins_align.unknowns`; velocity rows come before position rows.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from dataclasses import dataclass
 import math
 
 from ins_align.config import ImuNoise
-from ins_align.estimator import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO_BIAS, LEVER_ARM, SIZE,
-                                 START_POSITION, START_VELOCITY)
 from ins_align.messages import ENU_FROM_NED
 from ins_align.rotation import Array, skew
 from ins_align.simulation import Simulation
+from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO_BIAS, LEVER_ARM, SIZE,
+                                START_POSITION, START_VELOCITY)
 import numpy as np
 
 # Nothing more than "somewhere on the circle" is known of an angle (rad): keeps the information

@@ -1,0 +1,151 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+The unknowns of an alignment and what is known of them beforehand.
+
+All 19 of them have their place in one vector; an estimator takes those columns that it estimates.
+"""
+
+from dataclasses import dataclass, replace
+import math
+from typing import Any
+
+from ins_align.rotation import Array, exp_so3, log_so3
+import numpy as np
+from numpy.typing import NDArray
+
+Index = NDArray[np.integer[Any]]
+
+# A heading is never known worse than uniform on the circle.
+UNIFORM_ANGLE_STD = math.pi / math.sqrt(3)
+@dataclass(frozen=True)
+class Unknowns:
+    """
+    The unknowns, or a point to linearise at.
+
+    Attributes
+    ----------
+    C : ndarray, shape (3, 3)
+        Initial attitude ``C_nb(0)``.
+    gyro_bias, accel_bias : ndarray, shape (3,)
+        rad/s, m/s^2; measured minus true.
+    start_velocity, start_position : ndarray, shape (3,)
+        Of the IMU at t0 in n0, relative to the antenna's track (c_v, c_p of method.md).
+    lever_b : ndarray, shape (3,)
+        Metres.
+    delay : float
+        Seconds by which a GNSS measurement is older than its stamp.
+
+    """
+
+    C: Array
+    gyro_bias: Array
+    accel_bias: Array
+    start_velocity: Array
+    start_position: Array
+    lever_b: Array
+    delay: float
+
+    def vector(self) -> Array:
+        """All but the attitude, which has three zeros, shape (19,)."""
+        return np.concatenate([np.zeros(3), self.gyro_bias, self.accel_bias, self.start_velocity,
+                               self.start_position, self.lever_b, [self.delay]])
+
+    def moved(self, dx: Array) -> 'Unknowns':
+        """Return the point moved by `dx`, shape (19,)."""
+        return Unknowns(exp_so3(dx[:3]) @ self.C, self.gyro_bias + dx[3:6],
+                        self.accel_bias + dx[6:9], self.start_velocity + dx[9:12],
+                        self.start_position + dx[12:15], self.lever_b + dx[15:18],
+                        float(self.delay + dx[18]))
+
+    def minus(self, other: 'Unknowns') -> Array:
+        """Return the step from `other` to this point, shape (19,)."""
+        step = self.vector() - other.vector()
+        step[:3] = log_so3(self.C @ other.C.T)
+        return step
+
+
+# Places of the blocks in the full vector of unknowns.
+ATTITUDE, GYRO_BIAS, ACCEL_BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
+START_VELOCITY, START_POSITION = slice(9, 12), slice(12, 15)
+LEVER_ARM, DELAY = slice(15, 18), slice(18, 19)
+SIZE = 19
+# Unknowns that outlive a new t0 and do not depend on the heading.
+BODY_FIXED = np.r_[GYRO_BIAS, ACCEL_BIAS, LEVER_ARM, DELAY]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """
+    What is known of x before the data: a mean and an information matrix over all 19 unknowns.
+
+    With `heading_free` the heading of the mean is arbitrary and carries no information.
+    """
+
+    mean: Unknowns
+    information: Array
+    heading_free: bool
+
+    def at(self, point: Unknowns) -> tuple[Array, Array]:
+        """Return the information about the step from `point`, and the mean of that step."""
+        mean, information = self.mean, self.information
+        if self.heading_free:
+            turn = point.C @ mean.C.T
+            psi = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+            Rz = exp_so3([0.0, 0.0, psi])
+            mean = replace(mean, C=Rz @ mean.C)
+            information = information.copy()
+            information[:3] = Rz @ information[:3]
+            information[:, :3] = information[:, :3] @ Rz.T
+        return information, mean.minus(point)
+
+
+def first_prior(gyro_bias_std: float, accel_bias_std: float, lever_b: Array,
+                lever_std: float, delay: float, delay_std: float) -> Prior:
+    """
+    Return the prior before any data: biases, lever arm and delay; nothing else.
+
+    Parameters
+    ----------
+    gyro_bias_std, accel_bias_std : float
+        rad/s, m/s^2, per axis.
+    lever_b : array_like, shape (3,)
+        Lever arm, metres.
+    lever_std, delay, delay_std : float
+        Metres per axis, seconds.
+
+    """
+    std = np.full(SIZE, math.inf)
+    std[GYRO_BIAS], std[ACCEL_BIAS] = gyro_bias_std, accel_bias_std
+    if lever_std > 0:
+        std[LEVER_ARM] = lever_std
+    if delay_std > 0:
+        std[DELAY] = delay_std
+    mean = Unknowns(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
+                    np.asarray(lever_b, dtype=float), delay)
+    return Prior(mean, np.diag(std ** -2.0), False)
+
+
+def prior_of(mean: Unknowns, covariance: Array, unknowns: Index, heading_free: bool) -> Prior:
+    """Prior from the covariance of some unknowns; nothing is known of the others."""
+    information = np.zeros((SIZE, SIZE))
+    information[np.ix_(unknowns, unknowns)] = inverse_spd(covariance)
+    return Prior(mean, information, heading_free)
+
+
+def inverse_spd(matrix: Array) -> Array:
+    """Inverse of a symmetric positive definite matrix whose rows differ widely in scale."""
+    scale = 1 / np.sqrt(np.diag(matrix))
+    inverse = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
+    return 0.5 * (inverse + inverse.T)
