@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-CORE = ('rotation', 'earth', 'preintegration', 'formula', 'estimator', 'unknowns', 'whitening', 'methods', 'buffers',
-        'plausibility', 'declaration', 'aligner', 'config', 'messages')
+CORE = ('rotation', 'earth', 'preintegration', 'formula', 'unknowns', 'whitening', 'estimator',
+        'methods', 'buffers', 'plausibility', 'declaration', 'aligner', 'config', 'messages')
 
 
 @pytest.mark.linter

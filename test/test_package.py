@@ -25,8 +25,8 @@ from ins_align.config import parameters
 import pytest
 
 ROOT = Path(__file__).parents[1]
-CORE = ('rotation', 'earth', 'preintegration', 'formula', 'estimator', 'unknowns', 'whitening', 'methods', 'buffers',
-        'plausibility', 'declaration', 'aligner', 'config', 'messages')
+CORE = ('rotation', 'earth', 'preintegration', 'formula', 'unknowns', 'whitening', 'estimator',
+        'methods', 'buffers', 'plausibility', 'declaration', 'aligner', 'config', 'messages')
 OPTIONAL = ('rosbags', 'matplotlib', 'pyins', 'pandas', 'numba', 'scipy', 'tqdm')
 
 
