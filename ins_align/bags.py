@@ -77,7 +77,7 @@ class Bag:
 
     """
 
-    def __init__(self, path: str | os.PathLike) -> None:
+    def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         self._warnings: list[str] = []
         with ExitStack() as stack:
@@ -218,12 +218,8 @@ class Bag:
 
         """
         velocity_topic = velocity_type = None
-        imu_topic = self._choose('IMU', '--imu-topic', [IMU_TYPE], imu)
-        fix_topic = self._choose('position', '--fix-topic', [FIX_TYPE], fix)
-        for topic, what in ((imu_topic, 'IMU'), (fix_topic, 'position')):
-            if topic is None:
-                kind = (IMU_TYPE if what == 'IMU' else FIX_TYPE).replace('/msg/', '/')
-                raise BagError(f'{self.path} has no {what} topic ({kind}); {self._listing()}')
+        imu_topic = self._required('IMU', '--imu-topic', IMU_TYPE, imu)
+        fix_topic = self._required('position', '--fix-topic', FIX_TYPE, fix)
         if velocity is not None or config.use_velocity is not False:
             preferred = VELOCITY_TYPES[config.velocity_type]
             others = [kind for kind in VELOCITY_TYPES.values() if kind != preferred]
@@ -237,6 +233,13 @@ class Bag:
         reference = next((topic for topic in self.topics if topic.name == REFERENCE_TOPIC
                           and topic.msgtype == IMU_TYPE), None)
         return Topics(imu_topic, fix_topic, velocity_topic, velocity_type, reference)
+
+    def _required(self, what: str, option: str, kind: str, name: str | None) -> Topic:
+        topic = self._choose(what, option, [kind], name)
+        if topic is None:
+            raise BagError(f'{self.path} has no {what} topic ({kind.replace("/msg/", "/")}); '
+                           f'{self._listing()}')
+        return topic
 
     def _choose(self, what: str, option: str, kinds: list[str], name: str | None) -> Topic | None:
         if name is not None:

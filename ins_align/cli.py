@@ -26,7 +26,6 @@ from typing import Any, IO, NoReturn, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ins_align.config import Config
-    from ins_align.replay import ReplayResult
 
 # Everything else is imported where it is used: --help must not wait for numpy.
 
@@ -99,7 +98,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     try:
         return int(arguments.run(arguments))
-    except UsageError as error:
+    except (UsageError, ModuleNotFoundError) as error:
+        if isinstance(error, ModuleNotFoundError):
+            error = _missing(error)
         print(f'ins_align {arguments.command}: {error}', file=sys.stderr)
         return UNUSABLE
     except KeyboardInterrupt:
@@ -138,7 +139,15 @@ def _seconds(text: str) -> float:
     return value
 
 
-_seconds.__name__ = 'number of seconds'  # what argparse calls it in its message
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise ValueError
+    return value
+
+
+# What argparse calls them in its messages.
+_seconds.__name__, _count.__name__ = 'number of seconds', 'number of 1 or more'
 
 
 def _add_replay(commands: Any) -> None:
@@ -156,6 +165,8 @@ def _add_replay(commands: Any) -> None:
     group.add_argument('--start', type=_seconds, metavar='S',
                        help='skip this many seconds of the recording')
     group.add_argument('--duration', type=_seconds, metavar='S', help='read this many seconds')
+    group.add_argument('--jobs', type=_count, metavar='N',
+                       help='recordings at a time, each in a process (default: one a processor)')
     group = command.add_argument_group('output')
     group.add_argument('--json', metavar='FILE', help='write the result')
     group.add_argument('--csv', metavar='FILE', help='write a row for every GNSS epoch')
@@ -223,8 +234,8 @@ def _add_experiment(commands: Any) -> None:
     command.add_argument('name', metavar='NAME', help='an unknown name lists those there are')
     command.add_argument('--out', required=True, metavar='DIR', help='where to write')
     command.add_argument('--data', metavar='DIR', help='folder of the real recordings')
-    command.add_argument('--runs', type=int, metavar='N', help='of a Monte Carlo experiment')
-    command.add_argument('--jobs', type=int, metavar='N', help='processes at a time')
+    command.add_argument('--runs', type=_count, metavar='N', help='of a Monte Carlo experiment')
+    command.add_argument('--jobs', type=_count, metavar='N', help='processes at a time')
 
 
 def run_replay(arguments: argparse.Namespace) -> int:
@@ -232,63 +243,45 @@ def run_replay(arguments: argparse.Namespace) -> int:
     for path in (arguments.json, arguments.csv, arguments.plot):
         _check_writable(path)
     config = _config(arguments)
-    labels = _labels(arguments.bags)
     if arguments.plot:
         _check_plot(arguments.plot)
+    from ins_align.batch import process_all, Task
+
     several = len(arguments.bags) > 1
+    labels = _labels(arguments.bags) if several else ['']
+    tasks = [Task(bag, config, arguments.imu_topic, arguments.fix_topic, arguments.velocity_topic,
+                  arguments.start, arguments.duration, _with_label(arguments.csv, label),
+                  _with_label(arguments.plot, label))
+             for bag, label in zip(arguments.bags, labels)]
     objects = []
     statuses = []
-    with _progress(len(arguments.bags)) as progress:
-        for index, (bag, label) in enumerate(zip(arguments.bags, labels)):
-            with progress.bag(index) as advance:
-                try:
-                    result = _replay(bag, config, arguments, advance)
-                except UsageError as error:
-                    if not several:
-                        raise
-                    progress.note(f'ins_align replay: {error}')
-                    objects.append({'bag': bag, 'aligned': False, 'error': str(error)})
-                    statuses.append(UNUSABLE)
-                    continue
-            objects.append(result.to_json())
-            statuses.append(ALIGNED if result.aligned else NOT_ALIGNED)
-            _show(result, arguments, label if several else '', progress)
+    with _progress(len(tasks)) as progress:
+        for outcome in process_all(tasks, arguments.jobs or os.cpu_count() or 1,
+                                   progress.advance):
+            if outcome.error:
+                if not several:
+                    raise UsageError(outcome.error)
+                progress.note(f'ins_align replay: {outcome.error}')
+                statuses.append(UNUSABLE)
+            else:
+                for warning in outcome.warnings:
+                    progress.note(f'ins_align replay: warning: {warning}')
+                progress.say(outcome.summary + '\n')
+                statuses.append(ALIGNED if outcome.json['aligned'] else NOT_ALIGNED)
+            objects.append(outcome.json)
     if arguments.json:
-        text = json.dumps(objects if several else objects[0], indent=2, allow_nan=False)
-        _write(arguments.json, lambda file: file.write(text.encode() + b'\n'))
+        _write_json(arguments.json, objects if several else objects[0])
     return max(statuses)
 
 
-def _replay(bag: str, config: Config, arguments: argparse.Namespace,
-            advance: Callable[[float], None]) -> ReplayResult:
-    from ins_align.bag_files import BagError
-    from ins_align.replay import replay
+def _write_json(path: str, content: Any) -> None:
+    from ins_align.report import write_whole
 
+    text = json.dumps(content, indent=2, allow_nan=False) + '\n'
     try:
-        return replay(bag, config, imu_topic=arguments.imu_topic, fix_topic=arguments.fix_topic,
-                      velocity_topic=arguments.velocity_topic, start=arguments.start,
-                      duration=arguments.duration, progress=advance)
-    except BagError as error:
-        raise UsageError(error) from None
-    except ModuleNotFoundError as error:
-        raise UsageError(_missing(error)) from None
-
-
-def _show(result: ReplayResult, arguments: argparse.Namespace, label: str,
-          progress: Progress) -> None:
-    """Print and write what belongs to one recording."""
-    from ins_align import report
-
-    for warning in result.warnings:
-        progress.note(f'ins_align replay: warning: {warning}')
-    progress.say(report.summary(result) + '\n')
-    if arguments.csv:
-        text = result.to_csv().encode()
-        _write(_with_label(arguments.csv, label), lambda file: file.write(text))
-    if arguments.plot:
-        figure = report.plot(result)
-        path = _with_label(arguments.plot, label)
-        _write(path, lambda file: report.save_figure(figure, file, Path(path).suffix))
+        write_whole(path, lambda file: file.write(text.encode()))
+    except OSError as error:
+        raise UsageError(f'cannot write {path}: {error.strerror}') from None
 
 
 def _config(arguments: argparse.Namespace) -> Config:
@@ -309,8 +302,8 @@ def _labels(bags: Sequence[str]) -> list[str]:
             for index, name in enumerate(names)]
 
 
-def _with_label(path: str, label: str) -> str:
-    if not label:
+def _with_label(path: str | None, label: str) -> str | None:
+    if not path or not label:
         return path
     return str(Path(path).with_stem(f'{Path(path).stem}_{label}'))
 
@@ -341,25 +334,17 @@ def _check_plot(path: str) -> None:
                          'pip install matplotlib')
 
 
-def _write(path: str, write: Callable[[IO[bytes]], Any]) -> None:
-    from ins_align.report import write_whole
-
-    try:
-        write_whole(path, write)
-    except OSError as error:
-        raise UsageError(f'cannot write {path}: {error.strerror}') from None
-
-
-def _missing(error: ModuleNotFoundError) -> str:
+def _missing(error: ModuleNotFoundError) -> UsageError:
     """Say what to install; a module of our own that is missing is a bug."""
     if (error.name or 'ins_align').startswith('ins_align'):
         raise error
-    return f'{error.name} is not installed: pip install rosbags python-ins'
+    return UsageError(f'{error.name} is not installed: pip install rosbags python-ins')
 
 
 def run_simulate(arguments: argparse.Namespace) -> int:
     """Run ``ins_align simulate``."""
-    from ins_align.simulation import simulate, SimulationError, write_bag
+    from ins_align.simulation import simulate, write_bag
+    from ins_align.simulation_arguments import SimulationError
 
     options = {name: value for name, value in vars(arguments).items()
                if name not in ('command', 'run', 'out', 'storage', 'scenario')}
@@ -367,8 +352,6 @@ def run_simulate(arguments: argparse.Namespace) -> int:
         write_bag(simulate(arguments.scenario, **options), arguments.out, arguments.storage)
     except SimulationError as error:
         raise UsageError(error) from None
-    except ModuleNotFoundError as error:
-        raise UsageError(_missing(error)) from None
     except OSError as error:
         raise UsageError(f'cannot write {arguments.out}: {error.strerror}') from None
     print(f'{arguments.out}: {arguments.scenario}, {arguments.imu_grade} IMU, '
@@ -403,13 +386,6 @@ class Progress:
     def __init__(self, bar: Any) -> None:
         self._bar = bar
 
-    @contextmanager
-    def bag(self, index: int) -> Iterator[Callable[[float], None]]:
-        """Give the function that says how much of recording `index` has been read."""
-        self._advance(float(index))
-        yield lambda part: self._advance(index + part)
-        self._advance(index + 1.0)
-
     def say(self, text: str) -> None:
         """Write to standard output without tearing the bar."""
         self._write(text, sys.stdout)
@@ -418,7 +394,8 @@ class Progress:
         """Write to standard error without tearing the bar."""
         self._write(text, sys.stderr)
 
-    def _advance(self, position: float) -> None:
+    def advance(self, position: float) -> None:
+        """Say how many recordings have been read, whole ones and parts."""
         if self._bar is not None and position > self._bar.n:
             self._bar.update(position - self._bar.n)
 

@@ -98,7 +98,7 @@ def _orientation_from_msg(msg: Any) -> tuple[int, list[float], np.ndarray]:
 
 
 def _decode(messages: Sequence[bytes], topic: Topic, fields: tuple[tuple[int, int], ...],
-            convert: Callable[[Any], tuple]) -> list[np.ndarray]:
+            convert: Callable[[Any], tuple[Any, ...]]) -> list[np.ndarray]:
     """
     Return stamps, the fields and which messages could be decoded.
 

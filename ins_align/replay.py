@@ -151,8 +151,9 @@ class ReplayResult:
         return out.getvalue()
 
 
-def replay(path: str | os.PathLike, config: Config | None = None, *, imu_topic: str | None = None,
-           fix_topic: str | None = None, velocity_topic: str | None = None,
+def replay(path: str | os.PathLike[str], config: Config | None = None, *,
+           imu_topic: str | None = None, fix_topic: str | None = None,
+           velocity_topic: str | None = None,
            start: float | None = None, duration: float | None = None,
            progress: Callable[[float], None] | None = None) -> ReplayResult:
     """

@@ -42,7 +42,7 @@ LOST_SIGMA_DEG = 60.0  # above this a heading is not worth drawing
 PLOT_SUFFIXES = ('.png', '.pdf', '.svg', '.jpg', '.jpeg', '.webp', '.eps', '.tif', '.tiff')
 
 
-def write_whole(path: str | os.PathLike, write: Callable[[IO[bytes]], None]) -> None:
+def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any]) -> None:
     """
     Write a file whole or not at all.
 
@@ -175,7 +175,8 @@ def plot(result: ReplayResult) -> Figure:
     after = '' if status.time_to_align_s is None else f' after {status.time_to_align_s:.1f} s'
     name = Path(result.bag).name or result.bag
     figure.suptitle(f'{name}: {status.state.value}{after}', fontsize=13)
-    left, right = figure.subfigures(1, 2, width_ratios=(3, 2))
+    columns = figure.add_gridspec(1, 2, width_ratios=(3, 2))
+    left, right = figure.add_subfigure(columns[0]), figure.add_subfigure(columns[1])
     tilt, heading, sigma = left.subplots(3, 1, sharex=True)
     series = _Series(result)
     _plot_angles(tilt, series, ((0, 'roll', ROLL), (1, 'pitch', PITCH)))
@@ -189,7 +190,7 @@ def plot(result: ReplayResult) -> Figure:
         track = right.subplots()
     else:
         error, track = right.subplots(2, 1, height_ratios=(1, 2))
-        _plot_errors(error, series)
+        _plot_errors(error, series, series.errors)
         error.set_xlabel('time since t0 (s)')
         time_axes.append(error)
     _plot_track(track, result)
@@ -280,21 +281,21 @@ def _plot_sigma(axes: Axes, series: _Series, result: ReplayResult) -> None:
                       color=colour)
 
 
-def _plot_errors(axes: Axes, series: _Series) -> None:
+def _plot_errors(axes: Axes, series: _Series, errors: np.ndarray) -> None:
     axes.set_ylabel('error against the reference (deg)')
-    finite = np.isfinite(series.errors).all(axis=1)
+    finite = np.isfinite(errors).all(axis=1)
     if not finite.any():
         axes.set_title('the reference does not cover these epochs', fontsize=10)
         return
     for column, name, colour in ((0, 'roll', ROLL), (1, 'pitch', PITCH), (2, 'yaw', HEADING)):
-        axes.plot(series.time, series.errors[:, column], color=colour, linewidth=1.0, label=name)
+        axes.plot(series.time, errors[:, column], color=colour, linewidth=1.0, label=name)
     for sign, label in ((1.0, 'heading, 3 sigma'), (-1.0, None)):
         axes.plot(series.time, sign * 3.0 * series.sigma[:, 2], color=HEADING, linewidth=0.8,
                   linestyle=':', label=label)
     # What is seen of an error is its end: its first seconds are as large as an angle can be.
     settled = finite & (series.time >= (series.declared[0] if series.declared
                                         else np.median(series.time[finite])))
-    largest = np.abs(series.errors[settled if settled.any() else finite]).max()
+    largest = np.abs(errors[settled if settled.any() else finite]).max()
     limit = max(1.0, 2.0 * largest)
     axes.set_ylim(-limit, limit)
 

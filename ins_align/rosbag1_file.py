@@ -102,7 +102,7 @@ class Rosbag1File(ChunkedFile):
             if fields.get(b'op') == self._MESSAGE:
                 connection = self._uint(fields.get(b'conn', b''))
                 time_ns = self._time(fields, b'time')
-                if connection in ids and start_ns <= time_ns < stop_ns:
+                if connection is not None and connection in ids and start_ns <= time_ns < stop_ns:
                     if end - body > MAX_MESSAGE_BYTES:
                         self._refuse_message(end - body, connection)
                     records.append((time_ns, connection, data[body:end]))

@@ -127,6 +127,19 @@ def test_several_recordings(flight, standing, tmp_path, capsys):
     assert results[1]['state']
 
 
+def test_jobs_do_not_change_the_output(flight, standing, tmp_path, capsys):
+    bags = [str(flight), str(standing), str(tmp_path / 'none'), str(flight)]
+    outputs = []
+    for jobs in ('1', '3'):
+        assert main(['replay', *bags, '--jobs', jobs, '--json', str(tmp_path / 'a.json'),
+                     '--csv', str(tmp_path / 'a.csv')]) == 2
+        captured = capsys.readouterr()
+        files = {path.name: path.read_text() for path in tmp_path.iterdir()}
+        outputs.append((captured.out, captured.err, files))
+    assert outputs[0] == outputs[1]
+    assert set(outputs[0][2]) == {'a.json', 'a_flight_1.csv', 'a_flight_4.csv', 'a_standing.csv'}
+
+
 def test_same_name_twice(standing, tmp_path, capsys):
     assert main(['replay', str(standing), str(standing), '--csv', str(tmp_path / 'a.csv')]) == 1
     assert {path.name for path in tmp_path.iterdir()} == {'a_standing_1.csv', 'a_standing_2.csv'}
@@ -153,8 +166,9 @@ def test_wrong_arguments(standing, capsys, arguments, message):
 
 @pytest.mark.parametrize('arguments', [
     [], ['replay'], ['fly'], ['replay', 'x', '--start', '-1'], ['replay', 'x', '--start', 'nan'],
-    ['replay', 'x', '--nothing'], ['simulate'], ['simulate', 'x', '--seed', 'a'],
-    ['simulate', 'x', '--lever-arm', '1', '2'], ['experiment', 'x']])
+    ['replay', 'x', '--nothing'], ['replay', 'x', '--jobs', '0'], ['simulate'],
+    ['simulate', 'x', '--seed', 'a'], ['simulate', 'x', '--lever-arm', '1', '2'],
+    ['experiment', 'x']])
 def test_wrong_usage(capsys, arguments):
     with pytest.raises(SystemExit) as info:
         main(arguments)
@@ -263,9 +277,10 @@ def test_help_imports_nothing_heavy(arguments):
                    stdout=subprocess.DEVNULL, cwd=Path(__file__).parents[1])
 
 
-def test_interrupt(flight):
-    """Ctrl-C leaves without a traceback."""
-    process = subprocess.Popen([*COMMAND, 'replay', *[str(flight)] * 200],
+@pytest.mark.parametrize('jobs', ['1', '2'])
+def test_interrupt(flight, jobs):
+    """Ctrl-C leaves without a traceback, and with all its processes."""
+    process = subprocess.Popen([*COMMAND, 'replay', *[str(flight)] * 200, '--jobs', jobs],
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
                                cwd=Path(__file__).parents[1])
     process.stdout.readline()
