@@ -34,6 +34,8 @@ from ins_align.rotation import Array, skew
 from ins_align.simulation import Simulation
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO_BIAS, LEVER_ARM, SIZE,
                                 START_POSITION, START_VELOCITY)
+from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO_BIAS, LEVER_ARM, SIZE,
+                                START_POSITION, START_VELOCITY)
 import numpy as np
 
 # Nothing more than "somewhere on the circle" is known of an angle (rad): keeps the information

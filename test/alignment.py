@@ -1,0 +1,66 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What the tests of the core share: simulated recordings through the aligner, errors against truth."""
+
+from functools import lru_cache
+
+from ins_align.aligner import Aligner
+from ins_align.config import Config
+from ins_align.rotation import log_so3, matrix_from_quaternion
+from ins_align.simulation import feed, simulate
+import numpy as np
+
+LEVER = (1.0, 1.0, 1.0)
+
+
+@lru_cache(maxsize=64)
+def simulated(scenario, **options):
+    """Return a simulation; the same arguments give the same object."""
+    return simulate(scenario, **options)
+
+
+def config_for(simulation, **changes):
+    """Return a configuration that states the truth about a simulation."""
+    settings = {'imu_grade': simulation.meta['imu_grade'],
+                'lever_arm': tuple(simulation.lever_arm.tolist()),
+                'gnss_delay': float(simulation.meta['gnss_delay'])}
+    return Config(**{**settings, **changes})
+
+
+def aligned(simulation, *, fix=True, velocity=True, **changes):
+    """Feed a simulation to an aligner; return it and its epochs."""
+    aligner = Aligner(config_for(simulation, **changes))
+    return aligner, feed(aligner, simulation, fix=fix, velocity=velocity)
+
+
+def error_of(attitude, simulation):
+    """Error of an attitude as a rotation about east, north, up, radians, shape (3,)."""
+    truth = simulation.attitude_at(attitude.stamp_ns)
+    return log_so3(matrix_from_quaternion(attitude.quaternion_xyzw) @ truth.T)
+
+
+def error_deg(attitude, simulation):
+    """Angle between an attitude and the truth, degrees."""
+    return float(np.degrees(np.linalg.norm(error_of(attitude, simulation))))
+
+
+def normalised_error(attitude, simulation):
+    """Squared error of an attitude over its covariance; 3 on average where that is honest."""
+    error = error_of(attitude, simulation)
+    return float(error @ np.linalg.solve(attitude.covariance, error))
+
+
+def estimator_of(aligner):
+    """Return the estimator inside an aligner: the only place that looks there."""
+    return aligner._method._estimator

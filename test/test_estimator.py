@@ -1,0 +1,306 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The recursive estimator against the dense reference and the truth."""
+
+from functools import partial
+
+from alignment import (aligned, config_for, error_of, estimator_of, LEVER, normalised_error,
+                       simulated)
+from ins_align.estimator import MapEstimator
+from ins_align.experiments.dense import bound, dense_solution
+from ins_align.methods import MapMethod
+from ins_align.preintegration import Noise, preintegrate, Steps
+from ins_align.rotation import log_so3
+from ins_align.unknowns import first_prior, SIZE, UNIFORM_ANGLE_STD
+from ins_align.whitening import Measurements
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+ZERO = np.zeros(3)
+
+
+def test_a_full_store_says_so():
+    estimator = MapEstimator(first_prior(1e-3, 0.05, LEVER, 0.0, 0.0, 0.0), capacity=3)
+    steps = Steps(np.zeros((1, 1)), *np.ones((2, 1, 2, 3)), *np.zeros((2, 1, 2, 3)))
+    interval, gnss = preintegrate(steps, ZERO, ZERO, Noise()), Measurements.empty(1)
+    for _ in range(3):
+        estimator.add(interval, ZERO, ZERO, gnss)
+    assert estimator.full
+    with pytest.raises(RuntimeError, match='full'):
+        estimator.add(interval, ZERO, ZERO, gnss)
+
+
+# The whole against the dense reference
+
+CASES = {
+    'velocity': ({}, {}),
+    'position': ({'use_velocity': False, 'use_position': True}, {}),
+    'both': ({'use_position': True}, {}),
+    'lever arm': ({'lever_arm_std': 1.0}, {}),
+    'delay': ({'gnss_delay_std': 0.1}, {}),
+    'everything': ({'use_position': True, 'lever_arm_std': 1.0, 'gnss_delay_std': 0.1}, {}),
+}
+
+
+def settled(aligner):
+    """Bring the linearisation point to convergence and return the estimator."""
+    estimator = estimator_of(aligner)
+    estimator.NONLINEARITY = 1e-7
+    estimator.settle()
+    return estimator
+
+
+def stated_covariance(estimator):
+    """Covariance before the allowance for what IMU noise feigns, shape (19, 19)."""
+    solution = estimator.solution
+    information = solution.information + solution.whitener.normal[1:, 1:]
+    information[:3, :3] += np.eye(3) / UNIFORM_ANGLE_STD ** 2
+    wanted = np.flatnonzero(np.diag(estimator.covariance))
+    full = np.zeros((SIZE, SIZE))
+    full[np.ix_(wanted, wanted)] = np.linalg.inv(information)
+    return full
+
+
+@pytest.mark.parametrize('case', CASES)
+@pytest.mark.parametrize('scenario, grade', [('flight', 'navigation'), ('flight', 'mems'),
+                                             ('car', 'tactical')])
+def test_recursion_is_the_dense_solution(scenario, grade, case):
+    changes, _ = CASES[case]
+    s = simulated(scenario, imu_grade=grade, duration=20.0, seed=3, position_std=0.5)
+    aligner, _ = aligned(s, **changes)
+    estimator = settled(aligner)
+    dense = dense_solution(
+        s, use_velocity=changes.get('use_velocity', True),
+        use_position=changes.get('use_position', False),
+        lever_arm_std=changes.get('lever_arm_std', 0.0),
+        delay_std=changes.get('gnss_delay_std', 0.0))
+    delayed = 'gnss_delay_std' in changes
+    # Reference and recursion differ by the rule of integration, and by how they turn a delay
+    # into a change of the measurement: hundredths of a sigma.
+    tolerance = 0.3 if delayed else 0.03
+    late = round(dense.unknowns[18] * 1e9)
+    first, last = int(s.gnss_stamps_ns[0]), int(s.gnss_stamps_ns[-1])
+    x = estimator.estimate()
+    step = x.vector() - dense.unknowns
+    step[:3] = log_so3(x.C @ (dense.C @ s.attitude_at(first - late).T @ s.attitude_at(first)).T)
+    step[9:15] = 0.0                               # counted from different origins
+    sigma = np.sqrt(np.diag(dense.covariance))
+    assert np.all(np.abs(step) <= tolerance * sigma + 1e-12)
+    found = np.sqrt(np.diag(stated_covariance(estimator)))
+    assert np.allclose(found[:9], sigma[:9], rtol=0.02 if delayed else 2e-3)
+    assert np.allclose(found[15:], sigma[15:], rtol=0.02 if delayed else 2e-3)
+    assert estimator.solution.chi2 == pytest.approx(dense.chi2, rel=0.01 if delayed else 1e-3)
+    # The allowance only takes information away.
+    stated = np.diag(estimator.covariance)[:3]
+    assert np.all(stated >= found[:3] ** 2 * (1 - 1e-9)) and np.all(
+        stated <= 1.1 * found[:3] ** 2)
+
+    C_n0b, covariance = estimator.current()
+    truth = dense.C_n0b @ s.attitude_at(last - late).T @ s.attitude_at(last)
+    sigma = np.sqrt(np.diag(dense.current_covariance))
+    assert np.all(np.abs(log_so3(C_n0b @ truth.T)) <= tolerance * sigma)
+    assert np.allclose(np.sqrt(np.diag(covariance)), sigma, rtol=0.02 if delayed else 5e-3)
+
+
+@pytest.mark.parametrize('grade', ('navigation', 'mems'))
+@pytest.mark.parametrize('scenario', ('flight', 'car'))
+def test_covariance_without_noise_is_the_cramer_rao_bound_at_every_time(scenario, grade):
+    s = simulated(scenario, imu_grade=grade, duration=30.0, ideal=True)
+    limit = bound(s)
+    _, epochs = aligned(s)
+    # While the heading is open, sigma depends on the point where it is worked out.
+    for epoch in epochs[60:]:
+        expected = np.sqrt(np.diag(limit.at(epoch.t_s)))
+        if np.degrees(expected[2]) < 5.0:
+            assert np.allclose(np.sqrt(np.diag(epoch.initial.covariance)), expected, rtol=0.03)
+
+
+# Handover
+
+@pytest.mark.parametrize('changes', (
+    {}, {'use_position': True}, {'use_velocity': False, 'use_position': True},
+    {'lever_arm_std': 0.5, 'gnss_delay_std': 0.05}))
+def test_handover_gives_the_attitude_of_one_that_never_handed_over(changes, monkeypatch):
+    s = simulated('car', imu_grade='mems', duration=40.0, seed=2, position_std=0.5)
+    whole, _ = aligned(s, **changes)
+    monkeypatch.setattr('ins_align.aligner.MapMethod', partial(MapMethod, capacity=75))
+    parts, _ = aligned(s, **changes)
+    assert parts.status().counts['rebases'] >= 2 and whole.status().counts['rebases'] == 0
+    one, other = whole.status().current, parts.status().current
+    sigma = np.radians(one.sigma_deg)
+    difference = error_of(other, s) - error_of(one, s)
+    assert np.all(np.abs(difference) < 0.2 * sigma)
+    assert np.allclose(other.sigma_deg, one.sigma_deg, rtol=0.1)
+    assert np.allclose(parts.status().gyro_bias, whole.status().gyro_bias,
+                       atol=0.2 * np.max(whole.status().gyro_bias_std))
+    assert np.allclose(parts.status().gyro_bias_std, whole.status().gyro_bias_std, rtol=0.1)
+
+
+def test_handover_while_standing_still_keeps_tilt_and_biases(monkeypatch):
+    """Standing long must neither spoil the estimate nor delay it."""
+    monkeypatch.setattr('ins_align.aligner.MapMethod', partial(MapMethod, capacity=60))
+    s = simulated('car', imu_grade='mems', duration=75.0, stand_still=40.0, seed=4)
+    status = aligned(s)[0].status()
+    assert status.counts['rebases'] >= 3
+    assert normalised_error(status.current, s) < chi2.ppf(0.9999, 3)
+    assert status.current.sigma_deg[2] < 0.5
+
+
+def test_store_is_bounded(monkeypatch):
+    monkeypatch.setattr('ins_align.aligner.MapMethod', partial(MapMethod, capacity=40))
+    aligner, _ = aligned(simulated('car', imu_grade='mems', duration=30.0, seed=2))
+    estimator = estimator_of(aligner)
+    assert estimator.count <= 40
+    assert len(estimator._gnss.time) == 40
+
+
+# Consistency
+
+@pytest.fixture(scope='module')
+def many_flights():
+    """Initial and current attitude of MEMS flights of 50 s with their simulations."""
+    runs = []
+    for seed in range(24):
+        s = simulated('flight', imu_grade='mems', duration=50.0, seed=seed, gnss_rate=2.0)
+        runs.append((s, aligned(s)[0]))
+    return runs
+
+
+@pytest.mark.parametrize('which', ('initial', 'current'))
+def test_errors_are_as_large_as_stated_and_no_smaller(many_flights, which):
+    total = sum(normalised_error(getattr(aligner.status(), which), s)
+                for s, aligner in many_flights)
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * len(many_flights))
+    assert low < total < high
+
+
+def test_biases_are_found_within_their_sigmas(many_flights):
+    total = 0.0
+    for s, aligner in many_flights:
+        status = aligner.status()
+        total += np.sum(((status.gyro_bias - s.gyro_bias) / status.gyro_bias_std) ** 2)
+        # A tilt takes the place of a horizontal accelerometer bias: they hang together.
+        assert np.all(np.abs(status.accel_bias - s.accel_bias) < 5 * status.accel_bias_std)
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * len(many_flights))
+    assert low / 2 < total < 2 * high              # the three axes are not independent
+
+
+def test_residuals_have_their_degrees_of_freedom(many_flights):
+    solutions = [estimator_of(aligner).solution for _, aligner in many_flights]
+    dof = sum(s.dof for s in solutions)
+    # 50 s at 2 Hz, three rows an epoch, minus attitude and start; biases have priors.
+    assert solutions[0].dof == 3 * 100 - 6
+    low, high = chi2.ppf([0.0005, 0.9995], dof)
+    assert low < sum(s.chi2 for s in solutions) < high
+
+
+def test_unknown_lever_arm_and_delay_are_found_within_their_sigmas():
+    s = simulated('flight', imu_grade='mems', duration=50.0, seed=1, gnss_delay=0.12)
+    aligner, _ = aligned(s, lever_arm=(0.0, 0.0, 0.0), lever_arm_std=1.0, gnss_delay=0.0,
+                         gnss_delay_std=0.1)
+    status = aligner.status()
+    assert np.all(np.abs(status.lever_arm - s.lever_arm) < 4 * status.lever_arm_std)
+    assert np.all(status.lever_arm_std < 1.0)
+    assert abs(status.gnss_delay - 0.12) < 4 * status.gnss_delay_std < 0.04
+    assert normalised_error(status.initial, s) < chi2.ppf(0.9999, 3)
+
+
+# Robustness
+
+def test_outliers_are_rejected_and_counted():
+    s = simulated('flight', imu_grade='mems', duration=40.0, seed=5, outlier_rate=0.08)
+    clean = simulated('flight', imu_grade='mems', duration=40.0, seed=5)
+    spoilt = int(np.count_nonzero(s.outlier))
+    assert spoilt > 8
+    status = aligned(s)[0].status()
+    assert abs(status.counts['epochs_rejected_velocity'] - spoilt) <= 3
+    assert normalised_error(status.initial, s) < chi2.ppf(0.9999, 3)
+    assert aligned(clean)[0].status().counts['epochs_rejected_velocity'] <= 1
+
+
+def test_receiver_that_comes_back_after_an_outage_goes_on():
+    s = simulated('flight', imu_grade='mems', duration=60.0, seed=6, outages=((20.0, 35.0),))
+    status = aligned(s)[0].status()
+    assert status.counts['epochs_rejected_velocity'] <= 3
+    assert status.counts.get('restarts', 0) == 0
+    assert normalised_error(status.current, s) < chi2.ppf(0.9999, 3)
+
+
+def test_attitude_is_carried_on_by_the_gyros_during_an_outage():
+    s = simulated('flight', imu_grade='mems', duration=40.0, seed=6, outages=((20.0, 60.0),))
+    before = simulated('flight', imu_grade='mems', duration=20.0, seed=6)
+    status, earlier = aligned(s)[0].status(), aligned(before)[0].status()
+    assert status.stamp_ns - earlier.stamp_ns > 15e9
+    assert normalised_error(status.current, s) < chi2.ppf(0.9999, 3)
+    assert np.all(status.current.sigma_deg > earlier.current.sigma_deg)
+    assert np.allclose(status.initial.sigma_deg, earlier.initial.sigma_deg, rtol=0.02)
+
+
+@pytest.mark.parametrize('scenario, options', [
+    ('launch', {'imu_grade': 'mems', 'seed': 1}),
+    ('car', {'imu_grade': 'tactical', 'seed': 3, 'position_std': 0.02}),
+    ('car', {'imu_grade': 'navigation', 'seed': 3, 'position_std': 0.02}),
+])
+@pytest.mark.parametrize('position', (False, True))
+def test_sudden_observability_finds_the_right_heading(scenario, options, position):
+    """A heading open over the whole circle that a throw or the first metres settle at once."""
+    s = simulated(scenario, duration=20.0, **options)
+    status = aligned(s, use_velocity=not position, use_position=position)[0].status()
+    assert status.initial is not None
+    assert normalised_error(status.initial, s) < chi2.ppf(0.99999, 3)
+
+
+@pytest.mark.parametrize('heading', (0.0, 90.0, 179.0, -120.0))
+def test_any_heading_is_found_from_a_stand_still(heading):
+    s = simulated('car', imu_grade='mems', duration=25.0, seed=8, heading_deg=heading)
+    status = aligned(s)[0].status()
+    assert normalised_error(status.initial, s) < chi2.ppf(0.99999, 3)
+    assert abs(np.degrees(error_of(status.initial, s)[2])) < 5.0
+
+
+def test_few_rows_and_many_dry_epochs_break_nothing():
+    s = simulated('flight', imu_grade='mems', duration=60.0, seed=6, outages=((0.3, 50.0),))
+    status = aligned(s)[0].status()
+    assert np.all(np.isfinite(status.gyro_bias))
+    assert status.initial is None or np.all(np.isfinite(status.initial.covariance))
+
+
+def test_static_navigation_grade_finds_north_by_the_turning_earth():
+    s = simulated('static', imu_grade='navigation', duration=150.0, seed=1, gnss_rate=1.0,
+                  imu_rate=50.0, heading_deg=70.0)
+    limit = bound(s)
+    status = aligned(s)[0].status()
+    error = np.degrees(error_of(status.initial, s)[2])
+    sigma = status.initial.sigma_deg[2]
+    assert sigma < 4.0
+    assert sigma == pytest.approx(np.degrees(np.sqrt(limit.covariance[-1][2, 2])), rel=0.15)
+    assert abs(error) < 3.5 * sigma
+
+
+@pytest.mark.parametrize('scenario', ('static', 'straight'))
+def test_mems_without_manoeuvre_never_claims_a_heading(scenario):
+    s = simulated(scenario, imu_grade='mems', duration=120.0, seed=2, gnss_rate=2.0, imu_rate=50.0)
+    _, epochs = aligned(s)
+    # Uniform on the circle is 104 deg.
+    assert min(e.initial.sigma_deg[2] for e in epochs if e.initial is not None) > 50.0
+
+
+def test_configuration_reaches_the_estimator():
+    s = simulated('flight', imu_grade='mems', duration=20.0, seed=3)
+    assert config_for(s).lever_arm == LEVER
+    status = aligned(s, lever_arm_std=0.3)[0].status()
+    assert np.all((0 < status.lever_arm_std) & (status.lever_arm_std <= 0.3))
+    status = aligned(s)[0].status()
+    assert np.all(status.lever_arm_std == 0) and status.gnss_delay_std == 0

@@ -1,0 +1,75 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The vector of unknowns and what is known of it before the data."""
+
+from dataclasses import replace
+
+from alignment import LEVER
+from ins_align.rotation import exp_so3
+from ins_align.unknowns import first_prior, inverse_spd, Prior, SIZE, Unknowns
+import numpy as np
+import pytest
+
+
+def some_unknowns(seed=0):
+    r = np.random.default_rng(seed)
+    return Unknowns(exp_so3(r.standard_normal(3)), 1e-3 * r.standard_normal(3),
+                    1e-2 * r.standard_normal(3), r.standard_normal(3), r.standard_normal(3),
+                    r.standard_normal(3), 0.03)
+
+
+def test_moving_and_comparing_points_are_inverse():
+    x = some_unknowns()
+    step = 0.3 * np.random.default_rng(1).standard_normal(SIZE)
+    assert np.allclose(x.moved(step).minus(x), step, atol=1e-12)
+
+
+def test_first_prior_knows_what_it_was_told():
+    prior = first_prior(1e-3, 0.05, LEVER, 0.5, 0.02, 0.1)
+    information, step = prior.at(some_unknowns())
+    assert np.allclose(np.diag(information)[3:9], [1e6] * 3 + [400.0] * 3)
+    assert np.allclose(np.diag(information)[15:], [4.0] * 3 + [100.0])
+    assert np.all(information[:3] == 0) and np.all(information[9:15] == 0)
+    assert np.allclose(step[15:18], np.array(LEVER) - some_unknowns().lever_b)
+    fixed = first_prior(1e-3, 0.05, LEVER, 0.0, 0.0, 0.0)
+    assert np.all(fixed.information[15:] == 0)
+
+
+@pytest.mark.parametrize('turn', (0.0, 0.5, 3.0))
+def test_prior_of_free_heading_says_the_same_at_any_heading(turn):
+    """Tilt known, heading not: turning the point about up changes nothing but axes."""
+    mean = replace(some_unknowns(), C=exp_so3([0.05, -0.1, 0.0]))
+    information = np.zeros((SIZE, SIZE))
+    information[:2, :2] = [[9.0, 1.0], [1.0, 4.0]]
+    information[:2, 3:5] = [[0.5, 0.1], [-0.2, 0.3]]
+    information[3:5, :2] = information[:2, 3:5].T
+    information[3:5, 3:5] = 2.0 * np.eye(2)
+    prior = Prior(mean, information, True)
+    Rz = exp_so3([0.0, 0.0, turn])
+    tilted = exp_so3([0.02, 0.01, 0.0])
+    at, step = prior.at(replace(mean, C=Rz @ tilted @ mean.C))
+    plain, plain_step = Prior(mean, information, False).at(replace(mean, C=tilted @ mean.C))
+    assert step @ at @ step == pytest.approx(plain_step @ plain @ plain_step, rel=1e-3)
+    assert np.allclose(Rz.T @ step[:3], plain_step[:3], atol=1e-3)
+    assert abs(step[2]) < 1e-3
+    assert np.all(at[2] == 0) and np.all(at[:, 2] == 0)
+
+
+def test_inverse_of_rows_of_any_scale():
+    root = np.random.default_rng(0).standard_normal((6, 6))
+    scale = np.diag(10.0 ** np.array([-8, -4, 0, 3, 6, 8]))
+    matrix = scale @ (root @ root.T + np.eye(6)) @ scale
+    inverse = inverse_spd(matrix)
+    assert np.allclose(scale @ inverse @ scale, np.linalg.inv(root @ root.T + np.eye(6)))
+    assert np.array_equal(inverse, inverse.T)
