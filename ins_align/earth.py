@@ -96,7 +96,7 @@ def matrix_earth_turned(time: ArrayLike) -> Array:
 
 
 def gravity_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
-    """Normal gravity ``g_n`` in ENU, shape (..., 3), m/s^2."""
+    """Gravity ``g_n`` (normal) in ENU, shape (..., 3), m/s^2."""
     magnitude = normal_gravity(latitude, altitude)
     vector = np.zeros(np.shape(magnitude) + (3,))
     vector[..., 2] = -magnitude
@@ -117,7 +117,8 @@ def position_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
     prime_vertical = SEMI_MAJOR_AXIS / np.sqrt(1 - ECCENTRICITY2 * sin_lat ** 2)
     vector = np.zeros(np.broadcast_shapes(np.shape(latitude), np.shape(altitude)) + (3,))
     vector[..., 1] = -prime_vertical * ECCENTRICITY2 * sin_lat * cos_lat
-    vector[..., 2] = prime_vertical * (1 - ECCENTRICITY2 * sin_lat ** 2) + altitude
+    vector[..., 2] = (prime_vertical * (1 - ECCENTRICITY2 * sin_lat ** 2)
+                      + np.asarray(altitude, dtype=float))
     return vector
 
 

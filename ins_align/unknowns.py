@@ -29,6 +29,8 @@ Index = NDArray[np.integer[Any]]
 
 # A heading is never known worse than uniform on the circle.
 UNIFORM_ANGLE_STD = math.pi / math.sqrt(3)
+
+
 @dataclass(frozen=True)
 class Unknowns:
     """

@@ -53,6 +53,7 @@ def run(name: str, out_dir: str | Path, data_dir: str | Path | None = None,
     ------
     ExperimentError
         If there is no such experiment or it lacks its input.
+
     """
     if name not in (*NAMES, 'all'):
         raise ExperimentError(f'no experiment {name!r}: there are {", ".join(NAMES)}, all')

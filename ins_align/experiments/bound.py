@@ -125,6 +125,7 @@ def crossing_time(task: tuple[str, str, float, float]) -> float | None:
     ----------
     task : tuple
         Scenario, grade, seconds to look at, degrees.
+
     """
     scenario, grade, horizon, threshold_deg = task
     bound = dense.bound(simulate(scenario, imu_grade=grade, duration=horizon))

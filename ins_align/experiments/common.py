@@ -47,12 +47,14 @@ def parallel(function: Callable[[Any], Any], tasks: Sequence[Any],
     Parameters
     ----------
     function : callable
+        Takes one task.
     tasks : sequence
         Tasks that share a trajectory should be neighbours: a process keeps the last few.
     jobs : int, optional
         By default one a processor; 1 stays in this process.
     name : str, optional
         Shown with the progress on a terminal.
+
     """
     jobs = min(jobs or os.cpu_count() or 1, max(len(tasks), 1))
     if jobs == 1:
@@ -120,6 +122,7 @@ class Error(NamedTuple):
         Stated.
     nees : float
         Normalised squared error of the three angles.
+
     """
 
     angles_deg: Array
@@ -128,7 +131,7 @@ class Error(NamedTuple):
 
     @property
     def tilt_sigmas(self) -> float:
-        """The larger of the two tilts in its sigma."""
+        """Larger one of the two tilts, each in its sigma."""
         return float(np.max(np.abs(self.angles_deg[:2]) / self.sigma_deg[:2]))
 
     @property
@@ -149,10 +152,12 @@ def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Array | None = No
     Parameters
     ----------
     attitude : Attitude
+        The estimate.
     C_true : ndarray, shape (3, 3)
         ``C_nb``.
     extra_std_deg : ndarray, shape (3,), optional
         Of the truth itself, about east, north, up; added in quadrature.
+
     """
     phi = log_so3(C_true @ matrix_from_quaternion(attitude.quaternion_xyzw).T)
     covariance = attitude.covariance
@@ -183,6 +188,7 @@ class Report:
     out : Path
     command : str
         What else than the name stands in the command that makes it.
+
     """
 
     def __init__(self, name: str, title: str, out: Path, command: str = '') -> None:

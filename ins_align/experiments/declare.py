@@ -75,6 +75,7 @@ def trial(index: int) -> JsonDict:
     dict
         ``index``, ``fault``, ``scenario``, the arguments of `simulate` and those parameters of
         `Config` that differ from what suits the simulation.
+
     """
     # Every combination comes once before any comes twice.
     combinations = list(itertools.product(FAULTS, SCENARIOS, GRADES))
@@ -201,7 +202,7 @@ def row(name: str, trials: list[JsonDict], moment: str, angle: str) -> list[Any]
 # Part 2: silence
 
 def run_silent(task: tuple[str, int]) -> JsonDict:
-    """Ten minutes of motion that does not show the heading: is it declared?"""
+    """Run ten minutes of motion that does not show the heading; see whether it is declared."""
     scenario, seed = task
     random = np.random.default_rng([2, seed])
     simulation = simulate(scenario, imu_grade='mems', seed=seed, duration=SILENT_DURATION,
