@@ -201,7 +201,8 @@ def plot(result: ReplayResult) -> Figure:
         if axes.get_legend_handles_labels()[0]:
             # Above the axes: nothing that is drawn can lie under it.
             axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), fontsize=8, frameon=False,
-                        ncols=7, borderpad=0.2, columnspacing=1.2, handletextpad=0.5)
+                        ncols=7 if axes.figure is left else 4, borderpad=0.2,
+                        columnspacing=1.2, handletextpad=0.5)
     if not len(series.time):
         tilt.text(0.5, 0.5, 'no attitude', transform=tilt.transAxes, ha='center')
     return figure
@@ -276,9 +277,9 @@ def _plot_sigma(axes: Axes, series: _Series, result: ReplayResult) -> None:
         axes.semilogy(series.time, first, color=colour, linewidth=1.0, linestyle=':',
                       label=f'{name}, at t0')
         axes.axhline(threshold, color=colour, linewidth=0.8, linestyle='--', alpha=0.7)
-        axes.annotate(f'{name} threshold', (1.0, threshold), xycoords=('axes fraction', 'data'),
-                      xytext=(-4, 2), textcoords='offset points', ha='right', fontsize=7,
-                      color=colour)
+        axes.annotate('threshold', (1.0, threshold), xycoords=('axes fraction', 'data'),
+                      xytext=(3, 0), textcoords='offset points', ha='left', va='center',
+                      fontsize=7, color=colour)
 
 
 def _plot_errors(axes: Axes, series: _Series, errors: np.ndarray) -> None:
