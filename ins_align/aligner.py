@@ -476,7 +476,8 @@ class Aligner:
             verdict = Verdict(State.ALIGNING, f'{fit.offered} GNSS epochs so far: more are '
                                               'needed')
         else:
-            verdict = self._declaration.update(time_s, (initial[1], current[1]), fit)
+            verdict = self._declaration.update(time_s, (initial[1], current[1]), fit,
+                                               method.unconfirmed)
             scale = fit.factor ** 2 if math.isfinite(fit.factor) else 1.0
             self._initial = Attitude.of(method.t0_ns, initial[0], initial[1] * scale)
             self._current = Attitude.of(stamp_ns, current[0], current[1] * scale)

@@ -87,7 +87,7 @@ class Config:
         (0.0, 0.0, 0.0), 'lever arm from the IMU to the GNSS antenna, in the IMU frame '
         '(x forward, y left, z up)', 'm', minimum=-1000.0, maximum=1000.0)
     lever_arm_std: float = _parameter(
-        0.0, 'how well the lever arm is known, 1 sigma per axis; above 0 it is estimated too',
+        1.0, 'how well the lever arm is known, 1 sigma per axis; above 0 it is estimated too',
         'm', minimum=0.0, maximum=100.0)
     use_velocity: str | bool = _parameter(
         'auto', 'align with GNSS velocities; auto: when they arrive', choices=AUTO_OR_BOOL)
@@ -107,7 +107,7 @@ class Config:
         0.0, 'a GNSS measurement is older than its stamp by this much', 's',
         minimum=-10.0, maximum=10.0)
     gnss_delay_std: float = _parameter(
-        0.0, 'how well the delay is known, 1 sigma; above 0 it is estimated too', 's',
+        0.1, 'how well the delay is known, 1 sigma; above 0 it is estimated too', 's',
         minimum=0.0, maximum=10.0)
     gnss_lateness: float = _parameter(
         1.0, 'how much later than newer IMU samples a GNSS or IMU message may arrive and '

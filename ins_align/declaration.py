@@ -18,6 +18,7 @@ A declared attitude must be right: the stated sigma, inflated by how badly the d
 under its threshold; the residuals must pass; both must have held for a while.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 import math
@@ -77,7 +78,8 @@ class Declaration:
         self.aligned = False
         self._recent_nis = 1.0
 
-    def update(self, time_s: float, covariances: tuple[Array, ...], fit: Fit) -> Verdict:
+    def update(self, time_s: float, covariances: tuple[Array, ...], fit: Fit,
+               unconfirmed: Callable[[], str]) -> Verdict:
         """
         Judge an epoch.
 
@@ -111,13 +113,18 @@ class Declaration:
             self.levelled = self.aligned = False
             return Verdict(State.ALIGNING, contradiction)
         self.levelled = self.levelled or self._held(self._level_since_s, time_s)
-        self.aligned = self.aligned or self._held(self._heading_since_s, time_s)
+        doubt = ''
+        if not self.aligned and self._held(self._heading_since_s, time_s):
+            doubt = unconfirmed()
+            self.aligned = not doubt
         if self.aligned:
             # What was declared stays declared until the data contradict it or its sigma has
             # clearly grown.
             self.aligned = heading <= 2 * self.config.heading_std_threshold
         if self.levelled:
             self.levelled = tilt <= 2 * self.config.tilt_std_threshold
+        if doubt:
+            return Verdict(State.LEVELLED if self.levelled else State.ALIGNING, doubt)
         return self._verdict(tilt, heading, fit)
 
     def _verdict(self, tilt: float, heading: float, fit: Fit) -> Verdict:

@@ -100,6 +100,9 @@ class MapEstimator:
     # steps of this factor, and moved when the log likelihood gains this much.
     TUNE_FROM, TUNE_GROWTH, TUNE_STEP, TUNE_GAIN = 12, 0.5, 3.0, 1.0
     MIN_EXCESS, MAX_EXCESS = 0.01, 9.0
+    MAX_REJECTED = 0.3
+    # Epochs from which the signs of the sensors are judged.
+    EVIDENCE_EPOCHS = 150
     # Innovations whose median scales the gate, so that noise beyond what is stated does not
     # turn the good epochs into outliers.
     GATE_WINDOW = 25
@@ -193,7 +196,7 @@ class MapEstimator:
         interval = self._intervals.take(epochs).bias_corrected(
             s.point.gyro_bias - biases[:, :3], s.point.accel_bias - biases[:, 3:])
         chain, F, W = s.chain.extended(interval, self.excess)
-        Y, L = sensitivities(s.point, chain, gnss, interval.omega, interval.f)
+        Y, L = sensitivities(s.point, chain, gnss, interval)
         nis = np.full(2, math.nan)
         for k in range(gnss.time.size):
             s.whitener.predict(F[k], W[k])
@@ -236,6 +239,10 @@ class MapEstimator:
             s = self._start(point)
             self._extend(s, slice(0, self.count),
                          None if P is None else (np.zeros(self._columns.size), P))
+            if sum(s.whitener.rejected) > self.MAX_REJECTED * self.count:
+                # Not a few outliers but a wrong picture: look at everything again.
+                s, P = self._start(point), None
+                self._extend(s, slice(0, self.count), None)
             self._solve(s)
             self.fits += 1
             if self.nonlinearity(s) <= self.NONLINEARITY:
@@ -333,6 +340,45 @@ class MapEstimator:
         """Move the linearisation point now if it is worth it at all, growth or not."""
         if self.solution is not None and self.nonlinearity() > self.NONLINEARITY:
             self._fit()
+
+    def sign_evidence(self, prior: Prior) -> dict[tuple[int, int], float]:
+        """
+        Fit the latest epochs afresh with the signs of gyros and accelerometers as they are or not.
+
+        A wrong sign, or one wrong axis (which is all three wrong in a body frame turned half
+        around), fits as well as the right ones until the vehicle has turned.
+
+        Parameters
+        ----------
+        prior : Prior
+            Of the biases alone, with zero mean.
+
+        Returns
+        -------
+        dict
+            Chi-square by (sign of the gyros, sign of the accelerometers), in units of what is
+            usual for (1, 1).
+        """
+        epochs = slice(max(0, self.count - self.EVIDENCE_EPOCHS), self.count)
+        raw = self._intervals.take(epochs).bias_corrected(-self._biases[epochs, :3],
+                                                          -self._biases[epochs, 3:])
+        gnss = self._gnss.take(epochs)
+        chi2 = {}
+        scale = 1.0
+        for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            trial = MapEstimator(prior, use_position=self._size == 9,
+                                 estimate_lever_arm=LEVER_ARM.start in self._columns,
+                                 estimate_delay=DELAY.start in self._columns,
+                                 capacity=gnss.time.size, excess=self.excess)
+            trial._intervals, trial._gnss = raw.mirrored(*signs), gnss
+            trial.count = gnss.time.size
+            trial._fit()
+            trial._fit()
+            assert trial.solution is not None
+            if signs == (1, 1):
+                scale = max(1.0, trial.solution.chi2 / max(trial.solution.dof, 1))
+            chi2[signs] = trial.solution.chi2 / scale
+        return chi2
 
     # Results
 

@@ -33,6 +33,16 @@ from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_B
 from ins_align.whitening import Measurements
 import numpy as np
 
+# The signs of the sensors are judged again when the data have grown by this share; they are
+# confirmed when every other choice of signs has so much more chi-square.
+EVIDENCE_GROWTH = 0.1
+EVIDENCE_GAIN = 20.0
+WRONG_SIGNS = {
+    (1, -1): 'the accelerations reversed (sign of gravity instead of specific force?)',
+    (-1, 1): 'the angular rates reversed',
+    (-1, -1): 'one IMU axis reversed (left-handed axes?)',
+}
+
 
 @dataclass(frozen=True)
 class Epoch:
@@ -124,6 +134,9 @@ class Method(Protocol):
     def settle(self) -> None:
         """Bring the estimate to its best before a decision."""
 
+    def unconfirmed(self) -> str:
+        """Return why the data do not show yet that the sensors' signs are right, or nothing."""
+
     def nuisance(self) -> Nuisance:
         """Return biases, lever arm and delay."""
 
@@ -160,11 +173,14 @@ class MapMethod:
         self._use_position = use_position
         self._capacity = capacity
         self.moved = 0
+        noise = config.imu_noise
+        self._first_prior = first_prior(noise.gyro_bias_std, noise.accel_bias_std,
+                                        np.array(config.lever_arm), config.lever_arm_std,
+                                        0.0, config.gnss_delay_std)
         if prior is None:
-            noise = config.imu_noise
-            prior = first_prior(noise.gyro_bias_std, noise.accel_bias_std,
-                                np.array(config.lever_arm), config.lever_arm_std,
-                                0.0, config.gnss_delay_std)
+            prior = self._first_prior
+        self._doubt = 'the signs of the IMU axes are not judged yet'
+        self._next_evidence = 0.0
         self._offered = 0
         self._rejected = [0, 0]
         self._start(epoch, prior)
@@ -250,6 +266,22 @@ class MapMethod:
     def settle(self) -> None:
         """Relinearise now if that is worth it at all."""
         self._estimator.settle()
+
+    def unconfirmed(self) -> str:
+        """Return why the data do not show yet that the sensors' signs are right, or nothing."""
+        if self._offered >= self._next_evidence and self._doubt:
+            self._next_evidence = self._offered * (1 + EVIDENCE_GROWTH)
+            chi2 = self._estimator.sign_evidence(self._first_prior)
+            right = chi2.pop((1, 1))
+            rival = min(chi2, key=chi2.__getitem__)
+            if chi2[rival] > right + EVIDENCE_GAIN:
+                self._doubt = ''
+            elif chi2[rival] > right - EVIDENCE_GAIN:
+                self._doubt = ('the signs of the IMU axes are not confirmed by the motion yet: '
+                               'turn')
+            else:
+                self._doubt = f'the data fit better with {WRONG_SIGNS[rival]}: check the IMU axes'
+        return self._doubt
 
     def nuisance(self) -> Nuisance:
         """Return biases, lever arm and delay."""
@@ -387,6 +419,10 @@ class NoteMethod:
 
     def settle(self) -> None:
         """Nothing to bring: the estimate is closed form."""
+
+    def unconfirmed(self) -> str:
+        """Return nothing: there is no test of the signs."""
+        return ''
 
     def nuisance(self) -> Nuisance:
         """Return what is assumed: no biases, lever arm and delay as configured."""

@@ -65,6 +65,17 @@ class Intervals:
     omega: Array
     f: Array
 
+    @property
+    def f_dot(self) -> Array:
+        """
+        Change of the specific force per second, shape (K, 3), in the body frame at the end.
+
+        From its value at the end and its mean over the interval, which vibration hardly moves.
+        """
+        duration = np.maximum(self.duration, 1e-3)[:, None]
+        mean = (self.R.transpose(0, 2, 1) @ self.v[..., None])[..., 0] / duration
+        return np.where(self.duration[:, None] > 0, 2 * (self.f - mean) / duration, 0.0)
+
     @staticmethod
     def empty(capacity: int) -> 'Intervals':
         """Room for `capacity` intervals, to be filled by `put`."""
@@ -81,6 +92,21 @@ class Intervals:
     def take(self, index: 'slice | Array') -> 'Intervals':
         """Return the intervals of `index`."""
         return Intervals(**{name: array[index] for name, array in vars(self).items()})
+
+    def mirrored(self, gyro_sign: float, accel_sign: float) -> 'Intervals':
+        """
+        Return what the intervals would be with the signs of the sensors changed, +1 or -1 each.
+
+        To first order in the rotation over an interval: good for telling the signs apart.
+        """
+        R, v, p = self.R, self.v, self.p
+        if gyro_sign < 0:
+            back = R.transpose(0, 2, 1)
+            R, v, p = back, (back @ v[..., None])[..., 0], (back @ p[..., None])[..., 0]
+        return Intervals(**{
+            **vars(self), 'R': R, 'v': accel_sign * v, 'p': accel_sign * p,
+            'J_vg': accel_sign * self.J_vg, 'J_pg': accel_sign * self.J_pg,
+            'omega': gyro_sign * self.omega, 'f': accel_sign * self.f})
 
     def bias_corrected(self, gyro_bias: Array, accel_bias: Array) -> 'Intervals':
         """

@@ -155,8 +155,8 @@ class Chain:
         return Chain(R_end, v_end, p_end, R_g_end, v_g_end, v_a_end, p_g_end, p_a_end), F, W
 
 
-def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements, omega: Array,
-                  f: Array) -> tuple[Array, Array]:
+def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
+                  interval: Intervals) -> tuple[Array, Array]:
     """
     Residuals of K epochs and their derivatives, at a linearisation point.
 
@@ -168,8 +168,8 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements, omega: Arra
         K epochs of it.
     gnss : Measurements
         The same K epochs.
-    omega, f : ndarray, shape (K, 3)
-        Angular rate and specific force at the epochs, bias-corrected.
+    interval : Intervals
+        Those that end at the epochs, bias-corrected.
 
     Returns
     -------
@@ -183,19 +183,24 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements, omega: Arra
     K = gnss.time.size
     C, lever = point.C, point.lever_b
     CR = C @ chain.R
-    spun = cross(omega, lever)
+    spun = cross(interval.omega, lever)
     lever_v = (CR @ spun[..., None])[..., 0]               # in n0
     lever_p = CR @ lever
     Ca_v = chain.v @ C.T + lever_v
     Ca_p = chain.p @ C.T + lever_p
-    acceleration = (CR @ f[..., None])[..., 0] + gnss.gravity
+    # Over the delay the acceleration is taken linear, from the specific force at the epoch and
+    # its mean over the interval.
+    delay = point.delay
+    acceleration = (CR @ interval.f[..., None])[..., 0] + gnss.gravity
+    jerk = (CR @ interval.f_dot[..., None])[..., 0]
+    acceleration_then = acceleration - delay * jerk
     ground_velocity = point.start_velocity + Ca_v + gnss.offset
     Y = np.zeros((K, 6, 1 + SIZE))
     Y[:, VELOCITY, 0] = (gnss.s[:, VELOCITY] - point.start_velocity - Ca_v
-                         + point.delay * acceleration)
+                         + delay * (acceleration - 0.5 * delay * jerk))
     Y[:, POSITION, 0] = (gnss.s[:, POSITION] - point.start_position
                          - gnss.time[:, None] * point.start_velocity - Ca_p
-                         + point.delay * (ground_velocity - 0.5 * point.delay * acceleration))
+                         + delay * (ground_velocity - 0.5 * delay * acceleration))
     H = Y[:, :, 1:]
     lever_v_skew, lever_p_skew = skew(lever_v), skew(lever_p)
     eye = np.eye(3)
@@ -207,12 +212,12 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements, omega: Arra
     H[:, VELOCITY, ACCEL_BIAS] = C @ chain.v_a
     H[:, POSITION, ACCEL_BIAS] = C @ chain.p_a
     H[:, VELOCITY, START_VELOCITY] = eye
-    H[:, POSITION, START_VELOCITY] = (gnss.time - point.delay)[:, None, None] * eye
+    H[:, POSITION, START_VELOCITY] = (gnss.time - delay)[:, None, None] * eye
     H[:, POSITION, START_POSITION] = eye
-    H[:, VELOCITY, LEVER_ARM] = CR @ skew(omega)
+    H[:, VELOCITY, LEVER_ARM] = CR @ skew(interval.omega)
     H[:, POSITION, LEVER_ARM] = CR
-    H[:, VELOCITY, 18] = -acceleration
-    H[:, POSITION, 18] = -(ground_velocity - point.delay * acceleration)
+    H[:, VELOCITY, 18] = -acceleration_then
+    H[:, POSITION, 18] = -(ground_velocity - delay * acceleration)
     L = np.zeros((K, 6, 9))
     L[:, VELOCITY, :3] = -lever_v_skew @ C
     L[:, POSITION, :3] = -lever_p_skew @ C
