@@ -22,6 +22,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
 import dataclasses
+from operator import attrgetter
 import re
 import signal
 import sys
@@ -32,8 +33,8 @@ from geometry_msgs.msg import QuaternionStamped, TwistStamped, TwistWithCovarian
 from ins_align.aligner import Aligner, Attitude, State, Status
 from ins_align.config import (
     Config, config_from_mapping, ConfigError, NODE_NAME, Parameter as ParameterInfo, parameters)
-from ins_align.imu_bytes import read_imu, with_orientation
-from ins_align.messages import fix_from_msg, MessageError, velocity_from_msg
+from ins_align.imu_bytes import ImuSample, read_imu, with_orientation
+from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
 from nav_msgs.msg import Odometry
 import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
@@ -112,45 +113,50 @@ class AlignmentNode(Node):
 
     def _on_imu(self, data: bytes) -> None:
         # The executor takes one message a turn, and a turn costs many times what is done with the
-        # message. What has queued up while the estimator was busy therefore comes along, GNSS
-        # first: nothing shall be late only because it waited here.
-        backlog = queued(self._imu_subscription)
-        if backlog:
-            for fix in queued(self._fix_subscription):
-                self._take_fix(fix)
-            for velocity in queued(self._velocity_subscription):
-                self._take_velocity(velocity)
-        for message in (data, *backlog):
-            self._take_imu(message)
-        if backlog:
-            self._update()
+        # message. What has queued up while the estimator was busy therefore comes along, in the
+        # order of the stamps: nothing shall be late, or early, only because it waited here.
+        queue = queued(self._imu_subscription)
+        gnss: list[Fix | Velocity] = []
+        if queue:
+            gnss += map(fix_from_msg, queued(self._fix_subscription))
+            gnss += filter(None, map(self._velocity, queued(self._velocity_subscription)))
+            gnss.sort(key=attrgetter('stamp_ns'))
+        for message in (data, *queue):
+            sample = read_imu(message)
+            while gnss and gnss[0].stamp_ns <= sample.stamp_ns:
+                self._take_gnss(gnss.pop(0))
+            self._take_imu(sample, message)
+        for measurement in gnss:
+            self._take_gnss(measurement)
 
-    def _take_imu(self, data: bytes) -> None:
-        stamp_ns, gyro, accel, frame_id = read_imu(data)
-        if frame_id != self._imu_frame:
-            self._change_imu_frame(frame_id)
-        self._aligner.add_imu(stamp_ns, gyro, accel)
+    def _take_imu(self, sample: ImuSample, data: bytes) -> None:
+        if sample.frame_id != self._imu_frame:
+            self._change_imu_frame(sample.frame_id)
+        self._aligner.add_imu(sample.stamp_ns, sample.gyro, sample.accel)
         if self._imu_wanted:
-            self._publish_imu(data, stamp_ns)
+            self._publish_imu(data, sample.stamp_ns)
 
     def _on_fix(self, msg: NavSatFix) -> None:
-        self._take_fix(msg)
-        self._update()
-
-    def _take_fix(self, msg: NavSatFix) -> None:
-        self._aligner.add_fix(fix_from_msg(msg))
+        self._take_gnss(fix_from_msg(msg))
 
     def _on_velocity(self, msg: Any) -> None:
-        self._take_velocity(msg)
-        self._update()
+        velocity = self._velocity(msg)
+        if velocity is not None:
+            self._take_gnss(velocity)
 
-    def _take_velocity(self, msg: Any) -> None:
+    def _velocity(self, msg: Any) -> Velocity | None:
         try:
-            velocity = velocity_from_msg(msg, self._config)
+            return velocity_from_msg(msg, self._config)
         except MessageError:
             self._aligner.reject('velocity_body_frame')
+            return None
+
+    def _take_gnss(self, measurement: Fix | Velocity) -> None:
+        if isinstance(measurement, Fix):
+            self._aligner.add_fix(measurement)
         else:
-            self._aligner.add_velocity(velocity)
+            self._aligner.add_velocity(measurement)
+        self._update()
 
     def _change_imu_frame(self, frame_id: str) -> None:
         """Start over: what was learnt is about axes that are no longer the IMU's."""
@@ -362,8 +368,8 @@ def main(args: Sequence[str] | None = None) -> int:
     # at any line, the clean-up included: ros2 launch passes on a Ctrl-C that arrived already.
     signal.signal(signal.SIGINT, lambda number, frame: None)
     args = sys.argv if args is None else [NODE_NAME, *args]
-    _refuse_other_arguments(remove_ros_args(args)[1:])
     try:
+        _refuse_other_arguments(remove_ros_args(args)[1:])
         rclpy.init(args=args)
     except RuntimeError as error:  # all of rcl's
         return _refused(f'the ROS arguments are wrong: {error}')

@@ -23,16 +23,20 @@ import threading
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import QuaternionStamped
+from geometry_msgs.msg import QuaternionStamped, TwistWithCovarianceStamped
 from ins_align.bags import Bag
 from ins_align.config import Config
+from ins_align.rotation import log_so3, matrix_from_quaternion
+import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import Imu
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Imu, NavSatFix
 
 PLAYER = Path(__file__).with_name('node_player.py')
-TOPICS = {'imu': '/imu/data_raw', 'fix': '/fix', 'velocity': '/fix_velocity'}
+IMU, FIX, VELOCITY = '/imu/data_raw', '/fix', '/fix_velocity'
+TOPICS = {'imu': IMU, 'fix': FIX, 'velocity': VELOCITY}
 # Reliable, for comparisons with replay that stand and fall with every single message.
 RELIABLE = [f'qos_overrides.{topic}.subscription.reliability:=reliable'
             for topic in TOPICS.values()]
@@ -51,12 +55,13 @@ class NodeProcess:
         self.output = ''
 
     @property
-    def running(self):
-        return self._process.poll() is None
+    def status(self):
+        """Return the exit status, None while it runs."""
+        return self._process.poll()
 
     def stop(self, number=signal.SIGINT):
         """Send a signal and return the exit status."""
-        if self.running:
+        if self.status is None:
             self._process.send_signal(number)
         return self.wait()
 
@@ -68,7 +73,7 @@ class NodeProcess:
             self._process.kill()
             self.output += self._process.communicate()[0] or ''
             raise
-        return self._process.returncode
+        return self.status
 
 
 @contextmanager
@@ -81,7 +86,7 @@ def running_node(parameters=(), arguments=()):
         node.stop(signal.SIGKILL)
         print(node.output)
         raise
-    alive = node.running
+    alive = node.status is None
     status = node.stop()
     assert alive, node.output
     assert status == 0, node.output
@@ -126,10 +131,8 @@ class Listener:
 
     @property
     def status(self):
-        """The newest status as a dict, empty before the first."""
-        if not self.statuses:
-            return {}
-        return {value.key: value.value for value in self.statuses[-1].status[0].values}
+        """Return the newest status as a dict, empty before the first."""
+        return values_of(self.statuses[-1]) if self.statuses else {}
 
     def count(self, name):
         return int(self.status.get(name, 0))
@@ -154,7 +157,22 @@ class Listener:
         return future.result()
 
 
-def bag_script(path, until_s=None):
+def values_of(msg):
+    """Return the values of a DiagnosticArray of the node."""
+    return {value.key: value.value for value in msg.status[0].values}
+
+
+def stamp_ns(msg):
+    return msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec
+
+
+def attitude_error_deg(quaternion, C_nb):
+    """Return the error of a geometry_msgs/Quaternion, degrees about east, north, up."""
+    q = np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w])
+    return np.degrees(log_so3(matrix_from_quaternion(q) @ np.swapaxes(C_nb, -1, -2)))
+
+
+def bag_script(path, start_s=0.0, duration_s=float('inf')):
     """Return what the drivers published when a bag was recorded."""
     from rosbags.typesys import get_typestore, Stores
     ros1 = get_typestore(Stores.ROS1_NOETIC)
@@ -163,13 +181,48 @@ def bag_script(path, until_s=None):
         topics = bag.choose_topics(Config())
         wanted = {topic: TOPICS[role] for role, topic in topics._asdict().items()
                   if role in TOPICS and topic is not None}
-        for topic, time_ns, data in bag.messages(wanted):
-            if until_s is not None and time_ns - bag.start_ns > until_s * 1e9:
-                break
+        for topic, time_ns, data in bag.messages(list(wanted)):
+            if not 0.0 <= (time_ns - bag.start_ns) * 1e-9 - start_s < duration_s:
+                continue
             if topic.encoding == 'ros1':
                 data = bytes(ros1.ros1_to_cdr(data, topic.msgtype))
             script.append((time_ns, wanted[topic], topic.msgtype, data))
     return script
+
+
+def simulated_messages(simulation):
+    """Return (arrival_ns, topic, ROS message) of a simulation in the order of arrival."""
+    messages = []
+    for stamp, gyro, accel in zip(simulation.imu_stamps_ns.tolist(), simulation.gyro,
+                                  simulation.accel):
+        msg = Imu()
+        set_stamp(msg, stamp)
+        msg.header.frame_id = 'imu_link'
+        for vector, xyz in ((msg.angular_velocity, gyro), (msg.linear_acceleration, accel)):
+            vector.x, vector.y, vector.z = xyz.tolist()
+        messages.append((stamp, IMU, msg))
+    for k, arrival in enumerate(simulation.gnss_arrival_ns.tolist()):
+        fix, velocity = NavSatFix(), TwistWithCovarianceStamped()
+        for msg in (fix, velocity):
+            set_stamp(msg, int(simulation.gnss_stamps_ns[k]))
+            msg.header.frame_id = 'gnss'
+        fix.status.status = 0
+        fix.latitude, fix.longitude, fix.altitude = simulation.lla_deg[k].tolist()
+        linear = velocity.twist.twist.linear
+        linear.x, linear.y, linear.z = simulation.velocity[k].tolist()
+        messages += [(arrival, FIX, fix), (arrival, VELOCITY, velocity)]
+    return sorted(messages, key=lambda message: message[0])
+
+
+def set_stamp(msg, stamp):
+    msg.header.stamp.sec, msg.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
+
+
+def script_of(messages):
+    """Serialise messages for the player."""
+    return [(time_ns, topic, '/'.join([type(msg).__module__.split('.')[0], 'msg',
+                                       type(msg).__name__]), serialize_message(msg))
+            for time_ns, topic, msg in messages]
 
 
 @contextmanager

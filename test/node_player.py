@@ -23,10 +23,15 @@ import pickle
 import sys
 import time
 
+from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-DISCOVERY_TIMEOUT = 30.0  # s
+TIMEOUT = 30.0  # s
+# A busy machine must not cost messages: the player waits when the node is this many IMU messages
+# behind, which is less than its queue holds.
+IMU_TOPIC = '/imu/data_raw'
+LEAD = 1500
 
 
 def message_class(name):
@@ -44,19 +49,36 @@ def main(path, rate, reliability):
     for _, topic, kind, _ in script:
         if topic not in publishers:
             publishers[topic] = node.create_publisher(message_class(kind), topic, qos)
-    deadline = time.monotonic() + DISCOVERY_TIMEOUT
+    seen = [0]  # IMU messages by the node's own count
+
+    def on_status(msg):
+        values = {value.key: value.value for value in msg.status[0].values}
+        seen[0] = int(values.get('imu', 0))
+
+    node.create_subscription(DiagnosticArray, '/ins_align/status', on_status, 10)
+    deadline = time.monotonic() + TIMEOUT
     while not all(publisher.get_subscription_count() for publisher in publishers.values()):
         if time.monotonic() > deadline:
             sys.exit('nobody subscribes')
         time.sleep(0.02)
     time.sleep(0.5)  # the other side has to find us too
-    start, first = time.monotonic(), script[0][0]
+    start, first, sent = time.monotonic(), script[0][0], 0
     for time_ns, topic, _, message in script:
         wait = start + (time_ns - first) * 1e-9 / rate - time.monotonic()
         if wait > 0.0:
             time.sleep(wait)
+        if topic == IMU_TOPIC:
+            sent += 1
+            deadline = time.monotonic() + TIMEOUT
+            while sent > seen[0] + LEAD:
+                rclpy.spin_once(node, timeout_sec=1.0)
+                if time.monotonic() > deadline:
+                    sys.exit(f'{sent} IMU messages sent, the node has got no further '
+                             f'than {seen[0]}')
         publishers[topic].publish(message)
-    time.sleep(0.5)  # what is on its way must arrive before the publisher is gone
+    for publisher in publishers.values():
+        publisher.wait_for_all_acked()
+    time.sleep(0.5)  # best effort is not acknowledged
     node.destroy_node()
     rclpy.shutdown()
 

@@ -1,0 +1,115 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The node by itself: parameters, signals, topics, services, without any sensor."""
+
+import signal
+
+from ins_align.config import parameters
+from node_harness import Listener, NodeProcess, running_node
+import pytest
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
+from std_srvs.srv import Trigger
+
+
+def set_parameter(listener, name, value):
+    request = SetParameters.Request(parameters=[Parameter(name=name, value=value)])
+    return listener.call(SetParameters, '/ins_align/set_parameters', request).results[0]
+
+
+def double(value):
+    return ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+
+
+WRONG = (
+    (['-p', 'lever_arm:=[1, 2]'], 'lever_arm must be three numbers'),
+    (['-p', 'lever_arm:=[1.0, .nan, 0.0]'], 'lever_arm[1] must be finite'),
+    (['-p', 'hold_time:=-1'], 'hold_time must lie between 0 and 3600 s'),
+    (['-p', 'imu_grade:=golden'], 'imu_grade must be one of navigation, tactical, mems, custom'),
+    (['-p', 'imu_grade:=custom'], 'missing: angle_random_walk'),
+    (['-p', 'velocity_frame:=body'], 'velocity_frame must be one of enu, ned'),
+    (['-p', 'qos_overrides./fix.subscription.reliability:=perhaps'], 'reliability'),
+    (['--params-file', 'no_such_file.yaml'], 'no_such_file.yaml'),
+    (['--no-such-option'], '--no-such-option'),
+    (['--', '--params-file', 'p.yaml'], 'unrecognized arguments: --params-file p.yaml'),
+)
+
+
+def test_what_is_wrong_at_start_is_refused_with_a_sentence():
+    nodes = [NodeProcess(arguments=arguments) for arguments, _ in WRONG]
+    for node in nodes:
+        node.wait()
+    for node, (_, says) in zip(nodes, WRONG):
+        assert says in node.output
+        assert 'Traceback' not in node.output
+        assert node.status == 2
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_it_cleanly(number):
+    with Listener() as listener:
+        node = NodeProcess()
+        listener.wait_for(lambda: listener.statuses)
+        assert node.stop(number) == 0
+    assert 'Traceback' not in node.output
+    assert 'rror' not in node.output
+
+
+def test_parameters_and_status_of_an_idle_node():
+    given = ['lever_arm:=[1, 2, 3]', 'use_velocity:=true', 'lever_am:=[1.0, 2.0, 3.0]']
+    with Listener() as listener, running_node(given) as node:
+        names = [parameter.name for parameter in parameters()]
+        described = listener.call(DescribeParameters, '/ins_align/describe_parameters',
+                                  DescribeParameters.Request(names=names)).descriptors
+        values = listener.call(GetParameters, '/ins_align/get_parameters',
+                               GetParameters.Request(names=['lever_arm'])).values
+        # A threshold can change, with a reason if it must not, the rest cannot.
+        assert set_parameter(listener, 'heading_std_threshold', double(0.5)).successful
+        too_small = set_parameter(listener, 'heading_std_threshold', double(-0.5))
+        word = set_parameter(listener, 'hold_time', ParameterValue(
+            type=ParameterType.PARAMETER_STRING, string_value='long'))
+        not_finite = set_parameter(listener, 'hold_time', double(float('nan')))
+        read_only = set_parameter(listener, 'gnss_delay', double(0.1))
+        changed = listener.call(
+            GetParameters, '/ins_align/get_parameters',
+            GetParameters.Request(names=['heading_std_threshold', 'hold_time', 'gnss_delay']))
+        reset = listener.call(Trigger, '/ins_align/reset', Trigger.Request())
+        listener.wait_for(lambda: listener.count('resets') == 1)
+        listener.wait_for(lambda: listener.diagnostics)
+
+    by_name = {descriptor.name: descriptor for descriptor in described}
+    assert list(by_name) == names
+    assert all(descriptor.description for descriptor in described)
+    assert by_name['lever_arm'].description.endswith('[m]')
+    assert by_name['lever_arm'].type == ParameterType.PARAMETER_DOUBLE_ARRAY
+    assert by_name['velocity_frame'].additional_constraints == 'one of: enu, ned'
+    assert by_name['hold_time'].floating_point_range[0].to_value == 3600.0
+    assert {name for name in names if not by_name[name].read_only} == {
+        'heading_std_threshold', 'tilt_std_threshold', 'hold_time'}
+    assert list(values[0].double_array_value) == [1.0, 2.0, 3.0]
+    assert "parameter 'lever_am' is not known" in node.output
+
+    for refused, says in ((too_small, 'range'), (word, 'type'), (not_finite, 'nan'),
+                          (read_only, 'read-only')):
+        assert not refused.successful
+        assert says in refused.reason
+    assert [value.double_value for value in changed.values] == [0.5, 2.0, 0.0]
+    assert reset.success
+
+    status, = listener.statuses[-1].status
+    assert status.level == status.WARN
+    assert status.message.startswith('WAITING_FOR_IMU: ')
+    assert listener.status['state'] == 'WAITING_FOR_IMU'
+    assert listener.diagnostics[-1].status[0].name == 'ins_align: alignment'
+    assert not listener.attitudes

@@ -1,0 +1,120 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A flight through the live node: what it publishes against replay and against the truth."""
+
+import csv
+import subprocess
+import sys
+
+from ins_align.simulation import simulate, write_bag
+from node_harness import (
+    attitude_error_deg, bag_script, Listener, play, RELIABLE, running_node, stamp_ns, values_of)
+import numpy as np
+import pytest
+
+RATE = 8.0  # times real time
+# Faster than real time, the same delay on the way between processes is longer on the data's clock.
+LATENESS = 4.0  # s
+MINUTE_NS = 60_000_000_000
+
+
+@pytest.fixture(scope='module')
+def flight():
+    return simulate('flight', imu_grade='mems', seed=0, duration=85.0)
+
+
+def replayed(bag, *options):
+    """Return the rows of `ins_align replay --csv`."""
+    table = bag.with_suffix('.csv')
+    done = subprocess.run([sys.executable, '-m', 'ins_align.cli', 'replay', bag, '--csv', table,
+                           *options], capture_output=True, text=True)
+    assert table.exists(), done.stderr
+    with open(table, newline='') as file:
+        return list(csv.DictReader(file))
+
+
+def test_flight(flight, tmp_path):
+    bag = tmp_path / 'flight'
+    write_bag(flight, bag)
+    rows = replayed(bag, '--set', 'lever_arm=[1,1,1]', '--set', f'gnss_lateness={LATENESS}')
+    declared = next(row for row in rows if row['state'] == 'ALIGNED')
+
+    with running_node(['lever_arm:=[1, 1, 1]', f'gnss_lateness:={LATENESS}',
+                       *RELIABLE]) as node:
+        with Listener(imu=True) as listener:
+            play(bag_script(bag), tmp_path, RATE)
+            listener.wait_for(lambda: listener.count('imu') == len(flight.imu_stamps_ns))
+            listener.wait_for_next_status()
+        with Listener(name='late') as late:
+            late.wait_for(lambda: late.attitudes)
+
+    # The same attitude for whoever listened and for whoever comes late, and that of replay.
+    attitude, = listener.attitudes
+    assert late.attitudes == [attitude]
+    q = attitude.quaternion
+    assert [q.x, q.y, q.z, q.w] == pytest.approx(
+        [float(declared[name]) for name in ('qx', 'qy', 'qz', 'qw')], abs=1e-9)
+    assert q.w >= 0.0
+    assert attitude.header.frame_id == 'map'
+    assert stamp_ns(attitude) == int(rows[0]['stamp_ns'])
+
+    # Nothing was lost or left out on the way, and the last word is that of replay as well.
+    status = listener.status
+    row = next(row for row in rows if row['stamp_ns'] == status['stamp_ns'])
+    assert int(status['stamp_ns']) > stamp_ns(attitude) + MINUTE_NS
+    assert status['state'] == row['state'] == 'ALIGNED'
+    assert float(status['time_to_align_s']) == pytest.approx(float(declared['t_s']))
+    assert int(status['fix']) == int(status['velocity']) == len(flight.gnss_stamps_ns)
+    for name in ('fix_late', 'fix_ahead', 'imu_gap', 'imu_nan', 'imu_late', 'resets'):
+        assert listener.count(name) == 0
+    assert listener.statuses[-1].status[0].level == b'\0'
+    assert 'ALIGNED' in node.output
+
+    check_imu(listener, flight, float(declared['t_s']))
+
+
+def check_imu(listener, flight, time_to_align_s):
+    """Compare ~/imu with the input and, once there is an orientation, with the truth."""
+    stamps = np.array([stamp_ns(msg) for msg in listener.imus])
+    # It takes the node up to a second to notice that somebody listens.
+    unheard = len(flight.imu_stamps_ns) - len(stamps)
+    assert 0 <= unheard < 1.5 * RATE * 100.0
+    assert np.array_equal(stamps, flight.imu_stamps_ns[unheard:])
+    rates = np.array([(msg.angular_velocity.x, msg.angular_velocity.y, msg.angular_velocity.z)
+                      for msg in listener.imus])
+    assert np.array_equal(rates, flight.gyro[unheard:])
+    assert {msg.header.frame_id for msg in listener.imus} == {'imu'}
+
+    known = np.array([msg.orientation_covariance[0] != -1.0 for msg in listener.imus])
+    start = int(np.argmax(known))
+    seconds = (stamps[start] - flight.imu_stamps_ns[0]) * 1e-9
+    # The node waits for late GNSS messages, and hears of several samples at once.
+    assert time_to_align_s <= seconds < time_to_align_s + LATENESS + 10.0
+    assert known[start:].all()
+    minute = slice(start, np.searchsorted(stamps, stamps[start] + MINUTE_NS))
+    truth = flight.attitude_at(stamps[minute])
+    errors, sigmas = [], []
+    for msg, C_nb in zip(listener.imus[minute], truth):
+        errors.append(attitude_error_deg(msg.orientation, C_nb))
+        covariance = np.reshape(msg.orientation_covariance, (3, 3))
+        assert np.linalg.eigvalsh(covariance)[0] > 0.0
+        sigmas.append(np.degrees(np.sqrt(np.diag(covariance))))
+    errors, sigmas = np.array(errors), np.array(sigmas)
+    assert len(errors) > 5900
+    assert np.abs(errors / sigmas).max() < 3.0
+    # Honest must not mean vague.
+    assert sigmas.max() < 1.0
+    assert sigmas[-1].max() < 0.3
+
+
