@@ -95,5 +95,5 @@ $(VENV)/requirements $(OLDEST)/requirements:
 	@touch $@
 
 %/ready: %/requirements setup.py setup.cfg
-	@$*/bin/python -m pip install -qq --no-deps --no-build-isolation -e .
+	@$*/bin/python -m pip install -qq --no-deps --no-build-isolation --use-pep517 -e .
 	@touch $@
