@@ -146,7 +146,7 @@ class Config:
         0.5, 'declare roll and pitch when their sigmas are below', 'deg',
         minimum=1e-4, maximum=90.0, runtime=True)
     hold_time: float = _parameter(
-        2.0, 'every condition must have held for this long before a declaration', 's',
+        1.0, 'every condition must have held for this long before a declaration', 's',
         minimum=0.0, maximum=3600.0, runtime=True)
     method: str = _parameter(
         'map', 'vif, pif: velocity and position integration formula as published; '

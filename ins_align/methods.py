@@ -35,8 +35,8 @@ import numpy as np
 
 # The signs of the sensors are judged again when the data have grown by this share; they are
 # confirmed when every other choice of signs has so much more chi-square.
-EVIDENCE_GROWTH = 0.1
-EVIDENCE_GAIN = 20.0
+EVIDENCE_GROWTH = 0.05
+EVIDENCE_GAIN = 12.0
 WRONG_SIGNS = {
     (1, -1): 'the accelerations reversed (sign of gravity instead of specific force?)',
     (-1, 1): 'the angular rates reversed',
