@@ -40,8 +40,16 @@ INT64_MAX = (1 << 63) - 1
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 
+def one_line(text: str) -> str:
+    """Make text that may quote a recording fit for a line on a terminal."""
+    return ''.join(letter if letter.isprintable() else '?' for letter in text[:1000])
+
+
 class BagError(ValueError):
     """A recording that cannot be used; the text says why in one sentence."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(one_line(text))
 
 
 class Topic(NamedTuple):

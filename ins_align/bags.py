@@ -26,8 +26,8 @@ from typing import Any, NamedTuple
 
 from ins_align import mcap_file, rosbag1_file, sqlite_file
 from ins_align.bag_files import (
-    BagError, ChunkedFile, decompress, decompressor, INT64_MAX, MAX_MESSAGE_BYTES, PIECE_BYTES,
-    Topic, ZSTD_MAGIC)
+    BagError, ChunkedFile, decompress, decompressor, INT64_MAX, MAX_MESSAGE_BYTES, one_line,
+    PIECE_BYTES, Topic, ZSTD_MAGIC)
 from ins_align.config import Config
 from ins_align.decoding import deserialize
 from ins_align.messages import MessageError, velocity_from_msg
@@ -103,7 +103,8 @@ class Bag:
     @property
     def warnings(self) -> list[str]:
         """Sentences on what could not be read."""
-        return self._warnings + [text for file in self._files for text in file.warnings]
+        return [one_line(text) for text in
+                self._warnings + [text for file in self._files for text in file.warnings]]
 
     @property
     def start_ns(self) -> int | None:

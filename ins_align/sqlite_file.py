@@ -26,6 +26,8 @@ from ins_align.bag_files import BagError, MAX_MESSAGE_BYTES, Records, ros2_type,
 
 MAGIC = b'SQLite format 3\x00'
 BLOCK = 4096  # rows read at a time
+# Python decodes sqlite's messages, which quote what is damaged, as UTF-8.
+_ERRORS = (sqlite3.Error, UnicodeDecodeError)
 
 
 class SqliteFile:
@@ -46,7 +48,7 @@ class SqliteFile:
             self._database = sqlite3.connect(f'file:{quote(str(path.resolve()))}?{options}',
                                              uri=True, check_same_thread=False)
             self._open()
-        except sqlite3.Error as error:
+        except _ERRORS as error:
             raise BagError(f'{path.name} cannot be read: {error}') from None
 
     def _is_truncated(self) -> bool:
@@ -80,7 +82,7 @@ class SqliteFile:
                 self.start_ns = self._one_time('messages ORDER BY timestamp')
                 self.end_ns = self._one_time('messages ORDER BY timestamp DESC')
                 return
-            except sqlite3.Error as error:
+            except _ERRORS as error:
                 self._warn_of_damage(error)
         self.start_ns = self._one_time('messages NOT INDEXED ORDER BY rowid')
 
@@ -105,7 +107,7 @@ class SqliteFile:
                         yield records
                         start_ns = records[-1][0] + 1
                 return
-            except sqlite3.Error as error:
+            except _ERRORS as error:
                 self._warn_of_damage(error)
         records = []
         for row in self._rows_as_stored():
@@ -124,7 +126,7 @@ class SqliteFile:
         The order of time would need the index. A page that is lost in part has rows numbered 0.
         """
         last = 0
-        with contextlib.suppress(sqlite3.Error):
+        with contextlib.suppress(*_ERRORS):
             for row in self._database.execute(
                     self._SELECT + ', rowid FROM messages NOT INDEXED ORDER BY rowid'):
                 if row[3] <= last:
@@ -147,7 +149,7 @@ class SqliteFile:
                 self._warn('has damaged messages, which are left out')
         return records
 
-    def _warn_of_damage(self, error: sqlite3.Error) -> None:
+    def _warn_of_damage(self, error: Exception) -> None:
         self._warn(f'is damaged ({error}): it is read as far as it goes')
 
     def _warn(self, text: str) -> None:

@@ -17,10 +17,12 @@ import shutil
 import sqlite3
 import struct
 
+from hypothesis import given, HealthCheck, settings, strategies as st
 from ins_align import bag_files
 from ins_align.bag_files import decompress, ros2_type
 from ins_align.bags import Bag, BagError
 from ins_align.config import Config
+from ins_align.decoding import decode_imu
 import pytest
 from recordings import (
     FIX, FORMATS, IMU, make_twist, mcap_record, mcap_string, real_recording, START_NS, TWIST,
@@ -54,6 +56,15 @@ def recordings(tmp_path_factory):
     names = {kind: kind.replace(' ', '_') + ('.bag' if kind.startswith('ros1') else '')
              for kind in FORMATS}
     return {kind: write_recording(folder / name, kind, 40.0) for kind, name in names.items()}
+
+
+@pytest.fixture(scope='module')
+def short_recordings(tmp_path_factory):
+    """Name and bytes of a storage file of each format."""
+    folder = tmp_path_factory.mktemp('short')
+    files = {kind: storage_file(write_recording(folder / kind.replace(' ', '_'), kind, 1.0))
+             for kind in FORMATS}
+    return {kind: (file.name, file.read_bytes()) for kind, file in files.items()}
 
 
 @pytest.fixture
@@ -234,6 +245,42 @@ def test_directory_of_several_files(tmp_path, recordings):
     records, warnings = by_bag(path)
     assert len(records) == 3 * (10 + 2)
     assert warnings == ['gone.mcap is missing from split']
+
+
+def test_damaged_schema_is_refused_in_one_line(copy):
+    path = copy('sqlite3')
+    file = storage_file(path)
+    content = file.read_bytes()
+    for spoilt in (b'((\n\x1b[31m', b'((\xb8\xb8'):
+        at = content.index(b'CREATE TABLE messages(')
+        file.write_bytes(content[:at + 22] + spoilt + content[at + 22 + len(spoilt):])
+        with pytest.raises(BagError) as info:
+            Bag(path)
+        assert str(info.value).isprintable()
+
+
+@settings(max_examples=200, deadline=None,
+          suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(FORMATS), st.lists(st.tuples(
+    st.integers(0, 1 << 16), st.integers(0, 100), st.one_of(
+        st.binary(max_size=16), st.sampled_from([b'\xff' * 8, bytes(8), b'\xff\xff\xff\x7f']))),
+    min_size=1, max_size=8))
+def test_any_damage(short_recordings, tmp_path, kind, edits):
+    """Whatever the bytes: messages or one sentence, and nothing else."""
+    name, content = short_recordings[kind]
+    for place, removed, added in edits:
+        at = place % len(content) if content else 0
+        content = content[:at] + added + content[at + removed:]
+    (tmp_path / name).write_bytes(content)
+    try:
+        with Bag(tmp_path / name) as bag:
+            for topic, _, message in bag.messages(bag.topics):
+                assert len(message) <= 1 << 16
+                if topic.msgtype == IMU:
+                    decode_imu([message], topic)
+            bag.choose_topics(Config())
+    except BagError as error:
+        assert str(error).isprintable()
 
 
 @pytest.mark.parametrize('content, message', [
