@@ -91,6 +91,8 @@ class Declaration:
             Of the attitudes that must be good enough, in ENU.
         fit : Fit
             How well the data fit the model.
+        unconfirmed : callable
+            Asked before a heading is declared: a reason against it in words, or ''.
 
         Returns
         -------

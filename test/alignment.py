@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What the tests of the core share: simulated recordings through the aligner, errors against truth."""
+"""What the tests of the core share: simulated recordings through the aligner, their errors."""
 
 from functools import lru_cache
 
@@ -31,10 +31,11 @@ def simulated(scenario, **options):
 
 
 def config_for(simulation, **changes):
-    """Return a configuration that states the truth about a simulation."""
+    """Return a configuration that states the truth about a simulation, lever arm and all."""
     settings = {'imu_grade': simulation.meta['imu_grade'],
                 'lever_arm': tuple(simulation.lever_arm.tolist()),
-                'gnss_delay': float(simulation.meta['gnss_delay'])}
+                'gnss_delay': float(simulation.meta['gnss_delay']),
+                'lever_arm_std': 0.0, 'gnss_delay_std': 0.0}
     return Config(**{**settings, **changes})
 
 

@@ -203,8 +203,10 @@ def test_noise_covariance_is_that_of_many_runs():
     index = np.arange(-3, int(duration * rate) + 4)
     stamps = index / rate
     shape = (runs, stamps.size, 3)
-    gyro = omega_of(stamps) + NOISE.angle_random_walk * np.sqrt(rate) * random.standard_normal(shape)
-    accel = force_of(stamps) + NOISE.velocity_random_walk * np.sqrt(rate) * random.standard_normal(shape)
+    gyro_std = NOISE.angle_random_walk * np.sqrt(rate)
+    accel_std = NOISE.velocity_random_walk * np.sqrt(rate)
+    gyro = omega_of(stamps) + gyro_std * random.standard_normal(shape)
+    accel = force_of(stamps) + accel_std * random.standard_normal(shape)
     epochs = np.array([0.0, duration])
     clean = integrated(epochs, rate=rate)
     errors = np.empty((runs, 9))

@@ -34,8 +34,6 @@ from ins_align.rotation import Array, skew
 from ins_align.simulation import Simulation
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO_BIAS, LEVER_ARM, SIZE,
                                 START_POSITION, START_VELOCITY)
-from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO_BIAS, LEVER_ARM, SIZE,
-                                START_POSITION, START_VELOCITY)
 import numpy as np
 
 # Nothing more than "somewhere on the circle" is known of an angle (rad): keeps the information
@@ -54,6 +52,7 @@ class Bound:
         Seconds since t0, the first epoch.
     covariance : ndarray, shape (K, 3, 3)
         Of the small rotation about the axes of ENU, rad^2.
+
     """
 
     time: Array
@@ -84,6 +83,7 @@ class DenseSolution:
         Attitude at the last epoch.
     current_covariance : ndarray, shape (3, 3)
         Of its error in n0.
+
     """
 
     C: Array
@@ -107,12 +107,14 @@ def bound(simulation: Simulation, *, noise: ImuNoise | None = None, use_velocity
     noise : ImuNoise, optional
         By default that of the simulation.
     use_velocity, use_position : bool
+        Which measurements count.
     lever_arm_std, delay_std : float
         Metres per axis and seconds; above 0 they are unknowns too.
 
     Returns
     -------
     Bound
+
     """
     noise = simulation.imu_noise if noise is None else noise
     epochs = _true_epochs_ns(simulation)
@@ -137,18 +139,22 @@ def dense_solution(simulation: Simulation, *, noise: ImuNoise | None = None,
     Parameters
     ----------
     simulation : Simulation
+        Its measurements are used, its truth to start from.
     noise : ImuNoise, optional
         By default that of the simulation.
     use_velocity, use_position : bool
+        Which measurements are used.
     lever_arm_std, delay_std : float
         Metres per axis and seconds; above 0 they are estimated, from `lever_arm` and 0 on.
     lever_arm : array_like, shape (3,), optional
         By default that of the simulation.
     iterations : int
+        Steps of Gauss-Newton.
 
     Returns
     -------
     DenseSolution
+
     """
     noise = simulation.imu_noise if noise is None else noise
     stamps = simulation.gnss_stamps_ns
@@ -345,7 +351,7 @@ def _lever_terms(path: _Path, lever_b: Array) -> tuple[Array, Array]:
 
 
 def _design(path: _Path, lever_b: Array) -> Array:
-    """Derivatives of the measurements to the 19 unknowns, shape (6 K, 19)."""
+    """Derive the measurements by the 19 unknowns, shape (6 K, 19)."""
     lever_v, lever_p = _lever_terms(path, lever_b)
     time = path.time[:, None, None]
     H = np.zeros((len(path.time), 2, 3, SIZE))
@@ -385,6 +391,7 @@ def _turned_by_noise(path: _Path) -> tuple[Array, Array]:
     -------
     B : ndarray, shape (2 K, 3, 7)
     M : ndarray, shape (2 K, 7, 7)
+
     """
     B = np.zeros((len(path.time), 2, 3, 7))
     B[:, 0, :, 0], B[:, 1, :, 0] = path.U, path.P
@@ -398,10 +405,10 @@ def _noise_covariance(path: _Path, noise: ImuNoise, measurement: Array) -> Array
     """Covariance of all rows: random walks of the IMU and GNSS noise, shape (6 K, 6 K)."""
     B, M = _turned_by_noise(path)
     n = len(B)
-    # O[i, a, j, b]: integral of x_i[a] x_j[b] up to the earlier one, i <= j.
-    O = ((B @ M).reshape(3 * n, 7) @ B.reshape(3 * n, 7).T).reshape(n, 3, n, 3)
-    trace = np.einsum('iaja->ij', O)
-    V = -noise.angle_random_walk ** 2 * O.transpose(0, 3, 2, 1)
+    # X[i, a, j, b]: integral of x_i[a] x_j[b] up to the earlier one, i <= j.
+    X = ((B @ M).reshape(3 * n, 7) @ B.reshape(3 * n, 7).T).reshape(n, 3, n, 3)
+    trace = np.einsum('iaja->ij', X)
+    V = -noise.angle_random_walk ** 2 * X.transpose(0, 3, 2, 1)
     t = np.repeat(path.time, 2)
     is_position = np.tile([0.0, 1.0], len(path.time))
     early, late = t[:, None], t[None]
@@ -433,6 +440,7 @@ def _attitude_error_now(path: _Path, noise: ImuNoise, V: Array, rows: Array, y: 
     rotation : ndarray, shape (3,)
     E : ndarray, shape (3, n + 3)
         What the prediction makes of the columns of H; the covariance of what it leaves.
+
     """
     variance = noise.angle_random_walk ** 2
     B, M = _turned_by_noise(path)
