@@ -81,6 +81,7 @@ class AlignmentNode(Node):
     ------
     ConfigError
         If a parameter is wrong.
+
     """
 
     def __init__(self) -> None:
@@ -91,7 +92,6 @@ class AlignmentNode(Node):
         self._aligner = Aligner(self._config)
         self._declared: Attitude | None = None
         self._imu_frame: str | None = None
-        self._imu_wanted = False
 
         self._attitude_publisher = self._open_attitude_topic()
         self._imu_publisher = self._publish_on(Imu, '~/imu', QoSProfile(depth=100))
@@ -133,7 +133,7 @@ class AlignmentNode(Node):
         if sample.frame_id != self._imu_frame:
             self._change_imu_frame(sample.frame_id)
         self._aligner.add_imu(sample.stamp_ns, sample.gyro, sample.accel)
-        if self._imu_wanted:
+        if self._imu_publisher.get_subscription_count():
             self._publish_imu(data, sample.stamp_ns)
 
     def _on_fix(self, msg: NavSatFix) -> None:
@@ -183,7 +183,6 @@ class AlignmentNode(Node):
     def _update(self) -> None:
         """Process what can be processed and publish what has changed."""
         self._aligner.update()
-        self._imu_wanted = self._imu_publisher.get_subscription_count() > 0
         declared = self._aligner.declared
         if declared is not self._declared:
             self._declared = declared
@@ -363,6 +362,7 @@ def main(args: Sequence[str] | None = None) -> int:
     -------
     int
         Exit status: 0 after an interruption, 2 if an argument or a parameter is wrong.
+
     """
     # rclpy's own handlers end spin() on both signals. Python's would also raise KeyboardInterrupt,
     # at any line, the clean-up included: ros2 launch passes on a Ctrl-C that arrived already.
