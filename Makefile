@@ -27,7 +27,8 @@ else
 	@rm -rf build/demo/flight
 	@$(BIN)/ins_align simulate build/demo/flight --scenario flight --imu mems --seed 1 \
 	    --lever-arm 1 1 1
-	@$(BIN)/ins_align replay build/demo/flight --set 'lever_arm=[1, 1, 1]' $(ARGS) \
+	@$(BIN)/ins_align replay build/demo/flight --set 'lever_arm=[1, 1, 1]' \
+	    --set lever_arm_std=0.02 $(ARGS) \
 	    --json build/demo/flight.json --csv build/demo/flight.csv --plot build/demo/flight.png
 	@echo 'Picture: build/demo/flight.png (the numbers are beside it: .json, .csv)'
 endif
