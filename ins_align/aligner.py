@@ -519,10 +519,10 @@ class Aligner:
         stamp_ns, C = self._now
         first = int(np.searchsorted(self._imu.stamps, stamp_ns, side='right'))
         if first < self._imu.stamps.size:
-            bias = method.biases()[0]
+            bias, _, scale = method.sensor_errors()
             stamps = np.concatenate([[stamp_ns], self._imu.stamps[first:]])
             for dt, omega in zip(np.diff(stamps) * 1e-9, self._imu.samples[first:, :3]):
-                C = C @ exp_so3((omega - bias) * dt)
+                C = C @ exp_so3((omega * (1 - scale) - bias) * dt)
             C = orthonormalized(C)
             stamp_ns = int(stamps[-1])
             self._now = stamp_ns, C

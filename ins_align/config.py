@@ -46,17 +46,20 @@ class ImuNoise(NamedTuple):
     velocity_random_walk: float  # m/s/sqrt(s)
     gyro_bias_std: float  # rad/s
     accel_bias_std: float  # m/s^2
+    gyro_scale_std: float = 0.0  # scale factor error, 0.01 is one percent
 
 
-def _imu_noise(arw: float, vrw: float, gyro_bias: float, accel_bias: float) -> ImuNoise:
+def _imu_noise(arw: float, vrw: float, gyro_bias: float, accel_bias: float,
+               gyro_scale: float) -> ImuNoise:
     """Convert deg/sqrt(h), m/s/sqrt(h), deg/s, m/s^2 to SI."""
-    return ImuNoise(math.radians(arw) / 60.0, vrw / 60.0, math.radians(gyro_bias), accel_bias)
+    return ImuNoise(math.radians(arw) / 60.0, vrw / 60.0, math.radians(gyro_bias), accel_bias,
+                    gyro_scale)
 
 
 PRESETS = {
-    'navigation': _imu_noise(0.002, 0.003, 0.01 / 3600.0, 50e-6 * STANDARD_GRAVITY),
-    'tactical': _imu_noise(0.05, 0.03, 1.0 / 3600.0, 1e-3 * STANDARD_GRAVITY),
-    'mems': _imu_noise(0.3, 0.09, 0.1, 0.05),
+    'navigation': _imu_noise(0.002, 0.003, 0.01 / 3600.0, 50e-6 * STANDARD_GRAVITY, 1e-5),
+    'tactical': _imu_noise(0.05, 0.03, 1.0 / 3600.0, 1e-3 * STANDARD_GRAVITY, 3e-4),
+    'mems': _imu_noise(0.3, 0.09, 0.1, 0.05, 0.01),
 }
 
 
@@ -127,6 +130,9 @@ class Config:
     accel_bias_std: float = _parameter(
         0.0, "accelerometer bias, 1 sigma per axis; 0: the preset's", 'm/s^2',
         minimum=0.0, maximum=10.0)
+    gyro_scale_std: float = _parameter(
+        0.0, "scale factor error of the gyroscopes, 1 sigma per axis, 0.01 is one percent; 0: the "
+        "preset's, for custom none", '1', minimum=0.0, maximum=0.5)
     velocity_std: float = _parameter(
         0.2, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none', 'm/s',
         minimum=1e-4, maximum=100.0)
@@ -167,7 +173,7 @@ class Config:
             raise ConfigError('method vif needs velocities, but use_velocity is false: set it to '
                               'auto or true, or use the method pif or map')
         if self.imu_grade == 'custom':
-            missing = [name for name in ImuNoise._fields if getattr(self, name) == 0.0]
+            missing = [name for name in ImuNoise._fields[:4] if getattr(self, name) == 0.0]
             if missing:
                 raise ConfigError('imu_grade custom needs all four figures of the IMU above 0, '
                                   f'missing: {", ".join(missing)}')
@@ -176,7 +182,7 @@ class Config:
     def imu_noise(self) -> ImuNoise:
         """Noise of the IMU in SI units: the preset's, where a figure is given that one."""
         own = _imu_noise(self.angle_random_walk, self.velocity_random_walk,
-                         self.gyro_bias_std, self.accel_bias_std)
+                         self.gyro_bias_std, self.accel_bias_std, self.gyro_scale_std)
         if self.imu_grade == 'custom':
             return own
         return ImuNoise(*(given or preset for given, preset

@@ -27,9 +27,9 @@ import math
 from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals
 from ins_align.rotation import Array, cross, exp_so3, skew
-from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, BODY_FIXED, DELAY, GYRO_BIAS, inverse_spd,
-                                LEVER_ARM, Prior, prior_of, SIZE, START_POSITION, START_VELOCITY,
-                                UNIFORM_ANGLE_STD, Unknowns)
+from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, BODY_FIXED, DELAY, GYRO, GYRO_BIAS,
+                                GYRO_SCALE, inverse_spd, LEVER_ARM, Prior, prior_of, SIZE,
+                                START_POSITION, START_VELOCITY, UNIFORM_ANGLE_STD, Unknowns)
 from ins_align.whitening import (Chain, HEADING_RESOLVED_STD, Measurements, POSITION,
                                  sensitivities, VELOCITY, Whitener)
 import numpy as np
@@ -82,7 +82,7 @@ class MapEstimator:
     prior : Prior
     use_position : bool
         Whether position rows will come.
-    estimate_lever_arm, estimate_delay : bool
+    estimate_lever_arm, estimate_delay, estimate_gyro_scale : bool
         Otherwise they stay at the prior's mean.
     capacity : int
         Epochs that are stored.
@@ -109,18 +109,20 @@ class MapEstimator:
 
     def __init__(self, prior: Prior, *, use_position: bool = False,
                  estimate_lever_arm: bool = False, estimate_delay: bool = False,
-                 capacity: int = 1000, excess: float = 1.0) -> None:
+                 estimate_gyro_scale: bool = False, capacity: int = 1000, excess: float = 1.0) -> None:
         """Start at t0."""
         wanted = np.ones(SIZE, bool)
         wanted[START_POSITION] = use_position
         wanted[LEVER_ARM] = estimate_lever_arm
         wanted[DELAY] = estimate_delay
+        wanted[GYRO_SCALE] = estimate_gyro_scale
         self._columns = np.flatnonzero(wanted)
         self._size = 9 if use_position else 6
         self._prior = prior
         self._capacity = capacity
         self._intervals = Intervals.empty(capacity)
-        self._biases = np.zeros((capacity, 6))         # with which the intervals were integrated
+        # With which the intervals were integrated: gyro bias, accelerometer bias, gyro scale.
+        self._sensor_errors = np.zeros((capacity, 3, 3))
         self._gnss = Measurements.empty(capacity)
         self.count = 0
         self.solution: Solution | None = None
@@ -132,7 +134,7 @@ class MapEstimator:
 
     # Input
 
-    def add(self, interval: Intervals, gyro_bias: Array, accel_bias: Array,
+    def add(self, interval: Intervals, sensor_errors: tuple[Array, Array, Array],
             gnss: Measurements) -> Array:
         """
         Append an epoch; the first one is t0 and its interval has no length.
@@ -141,8 +143,8 @@ class MapEstimator:
         ----------
         interval : Intervals
             One interval, up to the epoch.
-        gyro_bias, accel_bias : ndarray, shape (3,)
-            With which it was integrated.
+        sensor_errors : tuple of ndarray, shape (3,)
+            Gyro bias, accelerometer bias and gyro scale factor with which it was integrated.
         gnss : Measurements
             One epoch.
 
@@ -161,7 +163,7 @@ class MapEstimator:
             raise RuntimeError('the store is full: hand over to a new estimator')
         k = self.count
         self._intervals.put(k, interval, 0)
-        self._biases[k, :3], self._biases[k, 3:] = gyro_bias, accel_bias
+        self._sensor_errors[k] = sensor_errors
         self._gnss.put(k, gnss)
         self.count += 1
         if self.solution is None:
@@ -192,9 +194,7 @@ class MapEstimator:
     def _extend(self, s: Solution, epochs: slice, gate: 'tuple[Array, Array] | None') -> Array:
         """Take stored epochs into a solution; return the last one's innovations squared."""
         gnss = self._gnss.take(epochs)
-        biases = self._biases[epochs]
-        interval = self._intervals.take(epochs).bias_corrected(
-            s.point.gyro_bias - biases[:, :3], s.point.accel_bias - biases[:, 3:])
+        interval = self._corrected(epochs, s.point)
         chain, F, W = s.chain.extended(interval, self.excess)
         Y, L = sensitivities(s.point, chain, gnss, interval)
         nis = np.full(2, math.nan)
@@ -207,6 +207,13 @@ class MapEstimator:
                                                   self._gate_scale)
         s.chain = chain.at(-1)
         return nis
+
+    def _corrected(self, epochs: slice, point: Unknowns) -> Intervals:
+        """Return stored intervals as they would be with the sensor errors of a point."""
+        used = self._sensor_errors[epochs]
+        return self._intervals.take(epochs).corrected(
+            point.gyro_bias - used[:, 0], point.accel_bias - used[:, 1],
+            point.gyro_scale - used[:, 2])
 
     # Solution
 
@@ -302,9 +309,7 @@ class MapEstimator:
     def _rough_attitude(self, point: Unknowns) -> Array:
         """Centred q-method over the store, with the biases and lever arm of `point`."""
         epochs = slice(0, self.count)
-        biases = self._biases[epochs]
-        interval = self._intervals.take(epochs).bias_corrected(
-            point.gyro_bias - biases[:, :3], point.accel_bias - biases[:, 3:])
+        interval = self._corrected(epochs, point)
         chain = Chain.start().extended(interval)[0]
         gnss = self._gnss.take(epochs)
         moments = np.zeros((3, 3))
@@ -358,10 +363,10 @@ class MapEstimator:
         dict
             Chi-square by (sign of the gyros, sign of the accelerometers), in units of what is
             usual for (1, 1).
+
         """
         epochs = slice(max(0, self.count - self.EVIDENCE_EPOCHS), self.count)
-        raw = self._intervals.take(epochs).bias_corrected(-self._biases[epochs, :3],
-                                                          -self._biases[epochs, 3:])
+        raw = self._corrected(epochs, prior.mean)
         gnss = self._gnss.take(epochs)
         chi2 = {}
         scale = 1.0
@@ -369,6 +374,7 @@ class MapEstimator:
             trial = MapEstimator(prior, use_position=self._size == 9,
                                  estimate_lever_arm=LEVER_ARM.start in self._columns,
                                  estimate_delay=DELAY.start in self._columns,
+                                 estimate_gyro_scale=GYRO_SCALE.start in self._columns,
                                  capacity=gnss.time.size, excess=self.excess)
             trial._intervals, trial._gnss = raw.mirrored(*signs), gnss
             trial.count = gnss.time.size
@@ -393,7 +399,7 @@ class MapEstimator:
 
     @property
     def covariance(self) -> Array:
-        """Covariance of the 19 unknowns; zero where one is not estimated, shape (19, 19)."""
+        """Covariance of the 22 unknowns; zero where one is not estimated, shape (22, 22)."""
         full = np.zeros((SIZE, SIZE))
         if self.solution is not None:
             full[np.ix_(self._columns, self._columns)] = self.solution.P
@@ -442,22 +448,22 @@ class MapEstimator:
         # step of the biases as one of the unknowns, so that step is still to be applied.
         dx = np.zeros(SIZE)
         dx[self._columns] = s.dx
-        bias = dx[GYRO_BIAS], dx[ACCEL_BIAS]
-        error[:3] += s.chain.R_g @ bias[0]
-        error[3:6] += s.chain.v_g @ bias[0] + s.chain.v_a @ bias[1]
-        error[6:] += s.chain.p_g @ bias[0] + s.chain.p_a @ bias[1]
+        gyro, accel = dx[GYRO], dx[ACCEL_BIAS]
+        error[:3] += s.chain.R_g @ gyro
+        error[3:6] += s.chain.v_g @ gyro + s.chain.v_a @ accel
+        error[6:] += s.chain.p_g @ gyro + s.chain.p_a @ accel
         C = x.C @ exp_so3(error[:3]) @ s.chain.R
         Cv, Cp = x.C @ (s.chain.v + error[3:6]), x.C @ (s.chain.p + error[6:])
         # d(state now) / d(unknowns), d(chain errors)
         J = np.zeros((9, SIZE))
         J[:3, ATTITUDE] = np.eye(3)
-        J[:3, GYRO_BIAS] = x.C @ s.chain.R_g
+        J[:3, GYRO] = x.C @ s.chain.R_g
         J[3:6, ATTITUDE] = -skew(Cv)
-        J[3:6, GYRO_BIAS] = x.C @ s.chain.v_g
+        J[3:6, GYRO] = x.C @ s.chain.v_g
         J[3:6, ACCEL_BIAS] = x.C @ s.chain.v_a
         J[3:6, START_VELOCITY] = np.eye(3)
         J[6:, ATTITUDE] = -skew(Cp)
-        J[6:, GYRO_BIAS] = x.C @ s.chain.p_g
+        J[6:, GYRO] = x.C @ s.chain.p_g
         J[6:, ACCEL_BIAS] = x.C @ s.chain.p_a
         J[6:, START_VELOCITY] = time * np.eye(3)
         J[6:, START_POSITION] = np.eye(3)
@@ -505,7 +511,8 @@ class MapEstimator:
             unknowns = np.concatenate([places[:3], places[3:] + START_VELOCITY.start - 3])
         places = np.concatenate([places, 9 + kept])
         unknowns = np.concatenate([unknowns, self._columns[kept]])
-        mean = Unknowns(C_n0n.T @ C, x.gyro_bias, x.accel_bias, C_n0n.T @ (v + shift_v),
+        mean = Unknowns(C_n0n.T @ C, x.gyro_bias, x.gyro_scale, x.accel_bias,
+                        C_n0n.T @ (v + shift_v),
                         C_n0n.T @ (p + shift_p), x.lever_b, x.delay)
         return prior_of(mean, joint[np.ix_(places, places)], unknowns, heading_free)
 

@@ -140,8 +140,8 @@ class Method(Protocol):
     def nuisance(self) -> Nuisance:
         """Return biases, lever arm and delay."""
 
-    def biases(self) -> tuple[Array, Array]:
-        """Return gyro and accelerometer bias."""
+    def sensor_errors(self) -> tuple[Array, Array, Array]:
+        """Return gyro bias, accelerometer bias and gyro scale factor errors."""
 
     def prior_without_attitude(self) -> Prior | None:
         """Return what a fresh start may keep."""
@@ -176,7 +176,7 @@ class MapMethod:
         noise = config.imu_noise
         self._first_prior = first_prior(noise.gyro_bias_std, noise.accel_bias_std,
                                         np.array(config.lever_arm), config.lever_arm_std,
-                                        0.0, config.gnss_delay_std)
+                                        0.0, config.gnss_delay_std, noise.gyro_scale_std)
         if prior is None:
             prior = self._first_prior
         self._doubt = 'the signs of the IMU axes are not judged yet'
@@ -194,7 +194,7 @@ class MapMethod:
             prior, use_position=self._use_position,
             estimate_lever_arm=self._config.lever_arm_std > 0,
             estimate_delay=self._config.gnss_delay_std > 0, capacity=self._capacity,
-            excess=excess)
+            estimate_gyro_scale=self._config.imu_noise.gyro_scale_std > 0, excess=excess)
 
     def advance(self, epoch: Epoch, imu: ImuSteps) -> None:
         """Take the next epoch and the IMU steps before it."""
@@ -216,9 +216,10 @@ class MapMethod:
              @ C_n0n.T)[None],
             np.array([present]), (C_n0n @ gravity_n(epoch.latitude, epoch.altitude))[None],
             -still[None])
-        biases = self.biases()
-        interval = preintegrate(imu.steps, *biases, imu.noise)
-        nis = self._estimator.add(interval, *biases, gnss)
+        errors = self.sensor_errors()
+        gyro_bias, accel_bias, gyro_scale = errors
+        interval = preintegrate(imu.steps, gyro_bias, accel_bias, imu.noise, gyro_scale)
+        nis = self._estimator.add(interval, errors, gnss)
         self._last, self._last_epoch = imu, epoch
         self._offered += any(present)
         self._nis = float(np.nanmean(nis)) / 3 if np.any(np.isfinite(nis)) else math.nan
@@ -291,10 +292,10 @@ class MapMethod:
                         x.lever_b, std[LEVER_ARM], self._config.gnss_delay + x.delay,
                         float(std[DELAY][0]))
 
-    def biases(self) -> tuple[Array, Array]:
-        """Return gyro and accelerometer bias."""
+    def sensor_errors(self) -> tuple[Array, Array, Array]:
+        """Return gyro bias, accelerometer bias and gyro scale factor errors."""
         x = self._estimator.estimate()
-        return x.gyro_bias, x.accel_bias
+        return x.gyro_bias, x.accel_bias, x.gyro_scale
 
     def prior_without_attitude(self) -> Prior | None:
         """Return what a fresh start may keep."""
@@ -429,9 +430,9 @@ class NoteMethod:
         zero = np.zeros(3)
         return Nuisance(zero, zero, zero, zero, self._lever_b, zero, self._config.gnss_delay, 0.0)
 
-    def biases(self) -> tuple[Array, Array]:
-        """Return zero biases."""
-        return self._zero, self._zero
+    def sensor_errors(self) -> tuple[Array, Array, Array]:
+        """Return zeros."""
+        return self._zero, self._zero, self._zero
 
     def prior_without_attitude(self) -> Prior | None:
         """Nothing but the attitude is estimated."""

@@ -43,6 +43,8 @@ class Intervals:
         Derivatives to the gyro bias (g) and accelerometer bias (a): of the rotation as a left
         error (``R <- exp_so3(J_Rg d) R``), of v, of p. That of v to the accelerometer bias is the
         same integral as J_Rg.
+    J_Rs, J_vs, J_ps : ndarray, shape (K, 3, 3)
+        Derivatives to the gyro scale factors.
     Q : ndarray, shape (K, 9, 9)
         Covariance of the errors (rotation at the start, v, p) that the sensors' noise leaves.
     Q_excess : ndarray, shape (K, 9, 9)
@@ -60,6 +62,9 @@ class Intervals:
     J_vg: Array
     J_pg: Array
     J_pa: Array
+    J_Rs: Array
+    J_vs: Array
+    J_ps: Array
     Q: Array
     Q_excess: Array
     omega: Array
@@ -106,23 +111,27 @@ class Intervals:
         return Intervals(**{
             **vars(self), 'R': R, 'v': accel_sign * v, 'p': accel_sign * p,
             'J_vg': accel_sign * self.J_vg, 'J_pg': accel_sign * self.J_pg,
+            'J_Rs': gyro_sign * self.J_Rs, 'J_vs': gyro_sign * accel_sign * self.J_vs,
+            'J_ps': gyro_sign * accel_sign * self.J_ps,
             'omega': gyro_sign * self.omega, 'f': accel_sign * self.f})
 
-    def bias_corrected(self, gyro_bias: Array, accel_bias: Array) -> 'Intervals':
+    def corrected(self, gyro_bias: Array, accel_bias: Array, gyro_scale: Array) -> 'Intervals':
         """
-        First-order correction for a change of the biases, shape (3,) or (K, 3).
+        First-order correction for a change of the sensors' errors, shape (3,) or (K, 3) each.
 
         Noise and derivatives are left as they are: they change in second order only.
         """
-        turn = (self.J_Rg @ gyro_bias[..., None])[..., 0]
+        def product(matrices: Array, vectors: Array) -> Array:
+            return (matrices @ vectors[..., None])[..., 0]
+
         return Intervals(**{
             **vars(self),
-            'R': exp_so3(turn) @ self.R,
-            'v': self.v + (self.J_vg @ gyro_bias[..., None]
-                           + self.J_Rg @ accel_bias[..., None])[..., 0],
-            'p': self.p + (self.J_pg @ gyro_bias[..., None]
-                           + self.J_pa @ accel_bias[..., None])[..., 0],
-            'omega': self.omega - gyro_bias, 'f': self.f - accel_bias})
+            'R': exp_so3(product(self.J_Rg, gyro_bias) + product(self.J_Rs, gyro_scale)) @ self.R,
+            'v': (self.v + product(self.J_vg, gyro_bias) + product(self.J_Rg, accel_bias)
+                  + product(self.J_vs, gyro_scale)),
+            'p': (self.p + product(self.J_pg, gyro_bias) + product(self.J_pa, accel_bias)
+                  + product(self.J_ps, gyro_scale)),
+            'omega': self.omega * (1 - gyro_scale) - gyro_bias, 'f': self.f - accel_bias})
 
 
 @dataclass(frozen=True)
@@ -136,6 +145,7 @@ class Noise:
         rad/sqrt(s) and m/s/sqrt(s), as stated.
     gyro_excess, accel_excess : array_like
         What was measured beyond that, in the same units.
+
     """
 
     angle_random_walk: ArrayLike = 0.0
@@ -244,7 +254,8 @@ def white_noise(stamps: Array, samples: Array) -> Array:
     return np.sqrt(variance * (stamps[-1] - stamps[0]) / (stamps.size - 1))
 
 
-def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise) -> Intervals:
+def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise,
+                 gyro_scale: ArrayLike = 0.0) -> Intervals:
     """
     Integrate the steps of K intervals.
 
@@ -259,6 +270,9 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     gyro_bias, accel_bias : ndarray, shape (3,)
         Subtracted first.
     noise : Noise
+    gyro_scale : array_like, shape () or (3,)
+        Scale factors less one: the true rate is ``omega (1 - gyro_scale) - gyro_bias``.
+        Of the sensors, in each step.
 
     Returns
     -------
@@ -272,7 +286,8 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
 
     """
     dt = steps.dt
-    omega, f = steps.omega - gyro_bias, steps.f - accel_bias
+    omega = steps.omega * (1 - np.asarray(gyro_scale)) - gyro_bias
+    f = steps.f - accel_bias
     omega0, omega1 = omega[:, :-1], omega[:, 1:]
     f0, f1 = f[:, :-1], f[:, 1:]
     h = dt[..., None]
@@ -301,10 +316,17 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     A_step = A @ jacobian * hh
     A_sum = np.cumsum(A_step, axis=1)
     A_mid = A_sum - 0.5 * A_step
-    v_g_step = skew(u) @ A_mid
+    skew_u = skew(u)
+    v_g_step = skew_u @ A_mid
     v_g = np.cumsum(v_g_step, axis=1)
     p_g = np.sum(hh * (v_g - 0.5 * v_g_step), axis=1)
     p_a = np.sum(hh * A_mid, axis=1)
+    # A scale factor is a bias in proportion to the rate of its axis.
+    S_step = A_step * (0.5 * (omega0 + omega1))[..., None, :]
+    S_sum = np.cumsum(S_step, axis=1)
+    v_s_step = skew_u @ (S_sum - 0.5 * S_step)
+    v_s = np.cumsum(v_s_step, axis=1)
+    p_s = np.sum(hh * (v_s - 0.5 * v_s_step), axis=1)
 
     duration = np.sum(dt, axis=1)
     v, p = v_end[:, -1], p_end[:, -1]
@@ -315,8 +337,8 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
         _noise(dt * np.square(gyro), dt * np.square(accel), dt, remaining, v_rest, p_rest)
         for gyro, accel in ((noise.angle_random_walk, noise.velocity_random_walk),
                             (noise.gyro_excess, noise.accel_excess)))
-    return Intervals(duration, turned[:, -1], v, p, -A_sum[:, -1], v_g[:, -1], p_g, -p_a, Q,
-                     Q_excess, omega[:, -1], f[:, -1])
+    return Intervals(duration, turned[:, -1], v, p, -A_sum[:, -1], v_g[:, -1], p_g, -p_a,
+                     -S_sum[:, -1], v_s[:, -1], p_s, Q, Q_excess, omega[:, -1], f[:, -1])
 
 
 def _noise(gyro_variance: Array, accel_variance: Array, dt: Array, remaining: Array,

@@ -14,7 +14,7 @@
 """
 The unknowns of an alignment and what is known of them beforehand.
 
-All 19 of them have their place in one vector; an estimator takes those columns that it estimates.
+All 22 of them have their place in one vector; an estimator takes those columns that it estimates.
 """
 
 from dataclasses import dataclass, replace
@@ -42,6 +42,8 @@ class Unknowns:
         Initial attitude ``C_nb(0)``.
     gyro_bias, accel_bias : ndarray, shape (3,)
         rad/s, m/s^2; measured minus true.
+    gyro_scale : ndarray, shape (3,)
+        Scale factor errors of the gyros.
     start_velocity, start_position : ndarray, shape (3,)
         Of the IMU at t0 in n0, relative to the antenna's track (c_v, c_p of method.md).
     lever_b : ndarray, shape (3,)
@@ -53,6 +55,7 @@ class Unknowns:
 
     C: Array
     gyro_bias: Array
+    gyro_scale: Array
     accel_bias: Array
     start_velocity: Array
     start_position: Array
@@ -60,37 +63,39 @@ class Unknowns:
     delay: float
 
     def vector(self) -> Array:
-        """All but the attitude, which has three zeros, shape (19,)."""
-        return np.concatenate([np.zeros(3), self.gyro_bias, self.accel_bias, self.start_velocity,
+        """All but the attitude, which has three zeros, shape (22,)."""
+        return np.concatenate([np.zeros(3), self.gyro_bias, self.gyro_scale, self.accel_bias, self.start_velocity,
                                self.start_position, self.lever_b, [self.delay]])
 
     def moved(self, dx: Array) -> 'Unknowns':
-        """Return the point moved by `dx`, shape (19,)."""
-        return Unknowns(exp_so3(dx[:3]) @ self.C, self.gyro_bias + dx[3:6],
-                        self.accel_bias + dx[6:9], self.start_velocity + dx[9:12],
-                        self.start_position + dx[12:15], self.lever_b + dx[15:18],
-                        float(self.delay + dx[18]))
+        """Return the point moved by `dx`, shape (22,)."""
+        return Unknowns(exp_so3(dx[ATTITUDE]) @ self.C, self.gyro_bias + dx[GYRO_BIAS],
+                        self.gyro_scale + dx[GYRO_SCALE], self.accel_bias + dx[ACCEL_BIAS],
+                        self.start_velocity + dx[START_VELOCITY],
+                        self.start_position + dx[START_POSITION],
+                        self.lever_b + dx[LEVER_ARM], float(self.delay + dx[DELAY.start]))
 
     def minus(self, other: 'Unknowns') -> Array:
-        """Return the step from `other` to this point, shape (19,)."""
+        """Return the step from `other` to this point, shape (22,)."""
         step = self.vector() - other.vector()
         step[:3] = log_so3(self.C @ other.C.T)
         return step
 
 
 # Places of the blocks in the full vector of unknowns.
-ATTITUDE, GYRO_BIAS, ACCEL_BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
-START_VELOCITY, START_POSITION = slice(9, 12), slice(12, 15)
-LEVER_ARM, DELAY = slice(15, 18), slice(18, 19)
-SIZE = 19
+ATTITUDE, GYRO_BIAS, GYRO_SCALE, ACCEL_BIAS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+START_VELOCITY, START_POSITION = slice(12, 15), slice(15, 18)
+LEVER_ARM, DELAY = slice(18, 21), slice(21, 22)
+SIZE = 22
+GYRO = slice(3, 9)                      # bias and scale factor
 # Unknowns that outlive a new t0 and do not depend on the heading.
-BODY_FIXED = np.r_[GYRO_BIAS, ACCEL_BIAS, LEVER_ARM, DELAY]
+BODY_FIXED = np.r_[GYRO, ACCEL_BIAS, LEVER_ARM, DELAY]
 
 
 @dataclass(frozen=True)
 class Prior:
     """
-    What is known of x before the data: a mean and an information matrix over all 19 unknowns.
+    What is known of x before the data: a mean and an information matrix over all 22 unknowns.
 
     With `heading_free` the heading of the mean is arbitrary and carries no information.
     """
@@ -114,7 +119,8 @@ class Prior:
 
 
 def first_prior(gyro_bias_std: float, accel_bias_std: float, lever_b: Array,
-                lever_std: float, delay: float, delay_std: float) -> Prior:
+                lever_std: float, delay: float, delay_std: float,
+                gyro_scale_std: float = 0.0) -> Prior:
     """
     Return the prior before any data: biases, lever arm and delay; nothing else.
 
@@ -130,11 +136,13 @@ def first_prior(gyro_bias_std: float, accel_bias_std: float, lever_b: Array,
     """
     std = np.full(SIZE, math.inf)
     std[GYRO_BIAS], std[ACCEL_BIAS] = gyro_bias_std, accel_bias_std
+    if gyro_scale_std > 0:
+        std[GYRO_SCALE] = gyro_scale_std
     if lever_std > 0:
         std[LEVER_ARM] = lever_std
     if delay_std > 0:
         std[DELAY] = delay_std
-    mean = Unknowns(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
+    mean = Unknowns(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
                     np.asarray(lever_b, dtype=float), delay)
     return Prior(mean, np.diag(std ** -2.0), False)
 

@@ -23,8 +23,9 @@ import math
 
 from ins_align.preintegration import Intervals
 from ins_align.rotation import Array, cross, cumulative_rotations, skew
-from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, GYRO_BIAS, Index, LEVER_ARM, SIZE,
-                                START_POSITION, START_VELOCITY, Unknowns)
+from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO, GYRO_BIAS, GYRO_SCALE,
+                                Index, LEVER_ARM, SIZE, START_POSITION, START_VELOCITY,
+                                Unknowns)
 import numpy as np
 
 # Below this heading sigma (rad) the problem is as good as linear in the heading.
@@ -85,7 +86,7 @@ class Chain:
     R: Array                # C_b0b
     v: Array                # int C_b0b f
     p: Array                # int int C_b0b f
-    R_g: Array              # left error of R to the gyro bias
+    R_g: Array              # left error of R to gyro bias and scale factor, (3, 6)
     v_g: Array
     v_a: Array
     p_g: Array
@@ -94,8 +95,8 @@ class Chain:
     @staticmethod
     def start() -> 'Chain':
         """Return the chain at t0."""
-        zero = np.zeros((3, 3))
-        return Chain(np.eye(3), np.zeros(3), np.zeros(3), zero, zero, zero, zero, zero)
+        gyro, accel = np.zeros((3, 6)), np.zeros((3, 3))
+        return Chain(np.eye(3), np.zeros(3), np.zeros(3), gyro, gyro, accel, gyro, accel)
 
     def at(self, index: int) -> 'Chain':
         """Return one epoch of a chain over many."""
@@ -109,6 +110,7 @@ class Chain:
         Parameters
         ----------
         interval : Intervals
+            To be appended.
         excess : float
             Share of the noise measured in excess of the stated one that is believed.
 
@@ -135,13 +137,16 @@ class Chain:
             after = start + np.cumsum(steps, axis=0)
             return after - steps, after
 
-        RJ = R @ interval.J_Rg
+        def gyro(bias: Array, scale: Array) -> Array:
+            return R @ np.concatenate([bias, scale], axis=-1)
+
+        RJ = gyro(interval.J_Rg, interval.J_Rs)
         R_g, R_g_end = total(self.R_g, RJ)
-        v_g, v_g_end = total(self.v_g, R @ interval.J_vg - skew_u @ R_g)
-        v_a, v_a_end = total(self.v_a, RJ)
+        v_g, v_g_end = total(self.v_g, gyro(interval.J_vg, interval.J_vs) - skew_u @ R_g)
+        v_a, v_a_end = total(self.v_a, RJ[..., :3])
         v, v_end = total(self.v, u)
         p_end = total(self.p, w + interval.duration[:, None] * v)[1]
-        p_g_end = total(self.p_g, h * v_g + R @ interval.J_pg - skew_w @ R_g)[1]
+        p_g_end = total(self.p_g, h * v_g + gyro(interval.J_pg, interval.J_ps) - skew_w @ R_g)[1]
         p_a_end = total(self.p_a, h * v_a + R @ interval.J_pa)[1]
 
         F = np.zeros((K, 9, 9))
@@ -173,7 +178,7 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
 
     Returns
     -------
-    Y : ndarray, shape (K, 6, 20)
+    Y : ndarray, shape (K, 6, 23)
         The residual ``s - model`` in the first column, then the derivative of the model to each
         unknown.
     L : ndarray, shape (K, 6, 9)
@@ -207,8 +212,11 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     H[:, VELOCITY, ATTITUDE] = -skew(Ca_v)
     H[:, POSITION, ATTITUDE] = -skew(Ca_p)
     C_R_g = C @ chain.R_g
-    H[:, VELOCITY, GYRO_BIAS] = C @ chain.v_g - lever_v_skew @ C_R_g + CR @ skew(lever)
-    H[:, POSITION, GYRO_BIAS] = C @ chain.p_g - lever_p_skew @ C_R_g
+    CR_lever = CR @ skew(lever)
+    H[:, VELOCITY, GYRO] = C @ chain.v_g - lever_v_skew @ C_R_g
+    H[:, VELOCITY, GYRO_BIAS] += CR_lever
+    H[:, VELOCITY, GYRO_SCALE] += CR_lever * interval.omega[:, None, :]
+    H[:, POSITION, GYRO] = C @ chain.p_g - lever_p_skew @ C_R_g
     H[:, VELOCITY, ACCEL_BIAS] = C @ chain.v_a
     H[:, POSITION, ACCEL_BIAS] = C @ chain.p_a
     H[:, VELOCITY, START_VELOCITY] = eye
@@ -216,8 +224,8 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     H[:, POSITION, START_POSITION] = eye
     H[:, VELOCITY, LEVER_ARM] = CR @ skew(interval.omega)
     H[:, POSITION, LEVER_ARM] = CR
-    H[:, VELOCITY, 18] = -acceleration_then
-    H[:, POSITION, 18] = -(ground_velocity - delay * acceleration)
+    H[:, VELOCITY, DELAY.start] = -acceleration_then
+    H[:, POSITION, DELAY.start] = -(ground_velocity - delay * acceleration)
     L = np.zeros((K, 6, 9))
     L[:, VELOCITY, :3] = -lever_v_skew @ C
     L[:, POSITION, :3] = -lever_p_skew @ C
@@ -233,7 +241,7 @@ class Whitener:
     Parameters
     ----------
     columns : ndarray of int
-        Unknowns that are estimated, out of the 19.
+        Unknowns that are estimated, out of the 22.
     size : int
         9 when positions are used, 6 when velocities alone are.
 
@@ -266,7 +274,7 @@ class Whitener:
         ----------
         kind : int
             0 or 1.
-        Y, L : ndarray, shapes (3, 20), (3, 9)
+        Y, L : ndarray, shapes (3, 23), (3, 9)
             From `sensitivities`.
         covariance : ndarray, shape (3, 3)
             Of the measurement.

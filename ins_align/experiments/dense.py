@@ -461,12 +461,13 @@ def _rows(epochs: int, use_velocity: bool, use_position: bool) -> Array:
 def _prior(noise: ImuNoise, use_position: bool, lever_arm_std: float,
            delay_std: float) -> tuple[Array, Array]:
     """Numbers of the unknowns that are estimated, and the prior's information about each."""
-    std = np.full(SIZE, math.inf)
+    std = np.zeros(SIZE)
     std[ATTITUDE] = _ATTITUDE_STD
+    std[START_VELOCITY] = math.inf
+    std[START_POSITION] = math.inf if use_position else 0.0
     std[GYRO_BIAS], std[ACCEL_BIAS] = noise.gyro_bias_std, noise.accel_bias_std
     std[LEVER_ARM], std[DELAY] = lever_arm_std, delay_std
     wanted = std > 0
-    wanted[START_POSITION] = use_position
     return np.flatnonzero(wanted), std[wanted] ** -2.0
 
 
