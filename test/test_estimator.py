@@ -133,19 +133,21 @@ def test_covariance_without_noise_is_the_cramer_rao_bound_at_every_time(scenario
     {}, {'use_position': True}, {'use_velocity': False, 'use_position': True},
     {'lever_arm_std': 0.5, 'gnss_delay_std': 0.05}))
 def test_handover_gives_the_attitude_of_one_that_never_handed_over(changes, monkeypatch):
-    s = simulated('car', imu_grade='mems', duration=40.0, seed=2, position_std=0.5)
-    whole, _ = aligned(s, **changes)
-    monkeypatch.setattr('ins_align.aligner.MapMethod', partial(MapMethod, capacity=75))
-    parts, _ = aligned(s, **changes)
-    assert parts.status().counts['rebases'] >= 2 and whole.status().counts['rebases'] == 0
-    one, other = whole.status().current, parts.status().current
-    sigma = np.radians(one.sigma_deg)
-    difference = error_of(other, s) - error_of(one, s)
-    assert np.all(np.abs(difference) < 0.2 * sigma)
-    assert np.allclose(other.sigma_deg, one.sigma_deg, rtol=0.1)
-    assert np.allclose(parts.status().gyro_bias, whole.status().gyro_bias,
-                       atol=0.2 * np.max(whole.status().gyro_bias_std))
-    assert np.allclose(parts.status().gyro_bias_std, whole.status().gyro_bias_std, rtol=0.1)
+    # Neither what a misfit adds to the prior nor what is left of second order is looked at here.
+    monkeypatch.setattr('ins_align.methods.Fit.factor', 1.0)
+    monkeypatch.setattr(MapEstimator, 'NONLINEARITY', 0.01)
+    s = simulated('flight', imu_grade='tactical', duration=30.0, seed=2, position_std=0.5)
+    one = aligned(s, **changes)[0].status()
+    monkeypatch.setattr('ins_align.aligner.MapMethod', partial(MapMethod, capacity=70))
+    other = aligned(s, **changes)[0].status()
+    assert other.counts['rebases'] >= 2 and one.counts['rebases'] == 0
+    assert np.allclose(other.current.sigma_deg, one.current.sigma_deg, rtol=0.03)
+    difference = error_of(other.current, s) - error_of(one.current, s)
+    assert np.all(np.abs(difference) < 0.15 * np.radians(one.current.sigma_deg))
+    for name in ('gyro_bias', 'accel_bias', 'lever_arm', 'gnss_delay'):
+        sigma = np.asarray(getattr(one, name + '_std'))
+        assert np.allclose(getattr(other, name + '_std'), sigma, rtol=0.03), name
+        assert np.all(np.abs(getattr(other, name) - getattr(one, name)) <= 0.15 * sigma), name
 
 
 def test_handover_while_standing_still_keeps_tilt_and_biases(monkeypatch):

@@ -55,7 +55,7 @@ def residuals(x, intervals, gnss, chain_error=np.zeros(9)):
     chain, _, _ = Chain.start().extended(corrected)
     chain = replace(chain, R=exp_so3(chain_error[:3]) @ chain.R, v=chain.v + chain_error[3:6],
                     p=chain.p + chain_error[6:])
-    return sensitivities(x, chain, gnss, corrected.omega, corrected.f)
+    return sensitivities(x, chain, gnss, corrected)
 
 
 @pytest.mark.parametrize('column', range(SIZE))

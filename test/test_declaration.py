@@ -1,0 +1,152 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""When something is declared, held back and withdrawn, and the words for it."""
+
+from ins_align.config import Config
+from ins_align.declaration import Declaration, State
+from ins_align.methods import Fit
+import numpy as np
+import pytest
+
+
+def fit(**changes):
+    values = {'chi2': 300.0, 'dof': 300, 'nis': 1.0, 'converged': True, 'rejected_velocity': 0,
+              'rejected_position': 0, 'offered': 102}
+    return Fit(**{**values, **changes})
+
+
+def covariance(tilt_deg, heading_deg):
+    return np.diag(np.radians([tilt_deg, tilt_deg, heading_deg]) ** 2)
+
+
+GOOD, LEVEL, OPEN = covariance(0.1, 0.5), covariance(0.1, 14.0), covariance(5.0, 90.0)
+
+
+def judge(declaration, start, seconds, P, the_fit=None, rate=5.0, doubt=''):
+    """Judge a stretch of epochs; return the last verdict."""
+    verdict = None
+    for k in range(int(seconds * rate) + 1):
+        verdict = declaration.update(start + k / rate, (P, P), the_fit or fit(), lambda: doubt)
+    return verdict
+
+
+def test_good_sigmas_are_declared_after_the_hold_time():
+    declaration = Declaration(Config(hold_time=2.0))
+    before = judge(declaration, 0.0, 1.8, GOOD)
+    assert before.state is State.ALIGNING and 'hold' in before.reason and '2' in before.reason
+    assert judge(declaration, 2.0, 0.0, GOOD).state is State.ALIGNED
+
+
+@pytest.mark.parametrize('hold', (0.0, 0.5, 10.0))
+def test_hold_time_is_the_parameter(hold):
+    declaration = Declaration(Config(hold_time=hold))
+    if hold > 0:
+        assert judge(declaration, 0.0, hold - 0.2, GOOD).state is not State.ALIGNED
+    assert judge(declaration, hold, 0.2, GOOD).state is State.ALIGNED
+
+
+def test_level_comes_before_heading_and_the_reason_has_numbers():
+    verdict = judge(Declaration(Config()), 0.0, 3.0, LEVEL)
+    assert verdict.state is State.LEVELLED
+    assert verdict.reason == 'heading sigma 14 deg, needs 1: turn or change speed'
+    verdict = judge(Declaration(Config()), 0.0, 3.0, OPEN)
+    assert verdict.state is State.ALIGNING and 'tilt sigma 5' in verdict.reason
+
+
+def test_a_lapse_starts_the_hold_again():
+    declaration = Declaration(Config(hold_time=2.0))
+    judge(declaration, 0.0, 1.6, GOOD)
+    judge(declaration, 1.8, 0.0, LEVEL)
+    assert judge(declaration, 2.0, 1.8, GOOD).state is not State.ALIGNED
+    assert judge(declaration, 4.0, 0.0, GOOD).state is State.ALIGNED
+
+
+def test_sigma_is_widened_by_the_misfit():
+    misfit = fit(chi2=300.0 * 9 / 4)
+    wide = covariance(0.1, 0.8)                       # times 1.5: 1.2 degrees
+    assert judge(Declaration(Config()), 0.0, 5.0, wide).state is State.ALIGNED
+    assert judge(Declaration(Config()), 0.0, 5.0, wide, misfit).state is State.LEVELLED
+
+
+def test_thresholds_are_the_parameters():
+    assert judge(Declaration(Config(heading_std_threshold=20.0)), 0.0, 3.0,
+                 LEVEL).state is State.ALIGNED
+    assert judge(Declaration(Config(tilt_std_threshold=0.05)), 0.0, 3.0,
+                 GOOD).state is State.ALIGNING
+
+
+def test_the_worse_of_initial_and_current_counts():
+    declaration = Declaration(Config(hold_time=2.0))
+    for k in range(20):
+        verdict = declaration.update(0.2 * k, (GOOD, LEVEL), fit(), str)
+    assert verdict.state is State.LEVELLED
+
+
+@pytest.mark.parametrize('changes, words', [
+    ({'chi2': 3000.0}, 'residuals'), ({'rejected_velocity': 40}, '40 of 102'),
+    ({'rejected_velocity': 20, 'rejected_position': 20}, '40 of 102')])
+def test_contradicting_data_are_not_declared_and_withdraw(changes, words):
+    bad = fit(**changes)
+    verdict = judge(Declaration(Config()), 0.0, 10.0, GOOD, bad)
+    assert verdict.state is State.ALIGNING and words in verdict.reason
+    declaration = Declaration(Config(hold_time=2.0))
+    assert judge(declaration, 0.0, 3.0, GOOD).state is State.ALIGNED
+    assert judge(declaration, 3.2, 0.0, GOOD, bad).state is State.ALIGNING
+    # And comes back only after holding again.
+    assert judge(declaration, 3.4, 1.8, GOOD).state is not State.ALIGNED
+    assert judge(declaration, 5.4, 0.2, GOOD).state is State.ALIGNED
+
+
+def test_innovations_that_go_bad_withdraw_long_before_the_sum_shows_it():
+    declaration = Declaration(Config(hold_time=2.0))
+    judge(declaration, 0.0, 3.0, GOOD)
+    long = {'chi2': 30000.0, 'dof': 30000}
+    assert judge(declaration, 3.0, 2.0, GOOD, fit(**long)).state is State.ALIGNED
+    assert judge(declaration, 5.0, 10.0, GOOD, fit(nis=10.0, **long)).state is State.ALIGNING
+
+
+def test_declared_heading_survives_a_little_more_sigma_and_not_twice_as_much():
+    declaration = Declaration(Config(hold_time=2.0))
+    judge(declaration, 0.0, 3.0, GOOD)
+    assert judge(declaration, 3.2, 1.0, covariance(0.1, 1.5)).state is State.ALIGNED
+    assert judge(declaration, 5.0, 0.0, covariance(0.1, 2.5)).state is State.LEVELLED
+    assert judge(declaration, 6.0, 0.0, covariance(0.1, 1.5)).state is State.LEVELLED
+
+
+def test_not_before_there_is_redundancy():
+    verdict = judge(Declaration(Config()), 0.0, 10.0, GOOD, fit(dof=5, chi2=5.0, offered=4))
+    assert verdict.state is State.ALIGNING and '4' in verdict.reason
+
+
+def test_not_before_the_linearisation_has_settled():
+    assert judge(Declaration(Config()), 0.0, 10.0, GOOD,
+                 fit(converged=False)).state is State.ALIGNING
+
+
+def test_doubt_about_the_signs_holds_the_heading_back_and_not_the_level():
+    declaration = Declaration(Config(hold_time=2.0))
+    verdict = judge(declaration, 0.0, 10.0, GOOD, doubt='signs of the axes: turn')
+    assert verdict.state is State.LEVELLED and verdict.reason == 'signs of the axes: turn'
+    assert judge(declaration, 10.2, 0.0, GOOD).state is State.ALIGNED
+    # What has been confirmed once is not asked again.
+    assert judge(declaration, 10.4, 1.0, GOOD, doubt='signs').state is State.ALIGNED
+
+
+def test_doubt_is_not_asked_about_before_everything_else_holds():
+    def never():
+        raise AssertionError('costly, and not needed yet')
+
+    declaration = Declaration(Config(hold_time=2.0))
+    for k in range(5):
+        declaration.update(0.2 * k, (LEVEL, LEVEL), fit(), never)

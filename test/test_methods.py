@@ -1,0 +1,106 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The alignment methods on noise-free flights, and what they say of themselves."""
+
+from alignment import aligned, error_deg, error_of, normalised_error, simulated
+from ins_align.methods import Fit
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+PLACES = {
+    'north': {'latitude_deg': 48.0}, 'south': {'latitude_deg': -37.0},
+    'arctic': {'latitude_deg': 80.0},
+    'antimeridian': {'latitude_deg': -18.0, 'longitude_deg': 179.9999},
+}
+METHODS = {
+    'vif': {'method': 'vif'}, 'vif to the letter': {'method': 'vif', 'free_start': False},
+    'pif': {'method': 'pif'}, 'pif to the letter': {'method': 'pif', 'free_start': False},
+    'pif of positions': {'method': 'pif', 'velocity': False},
+    'pif of positions to the letter': {'method': 'pif', 'velocity': False, 'free_start': False},
+    'map': {'method': 'map'}, 'map of positions': {'method': 'map', 'velocity': False},
+}
+
+
+@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('place', PLACES)
+def test_noise_free_flight_is_aligned_to_a_thousandth_of_a_degree(place, method):
+    # Positions alone are waited for: 12 s of recording are 10 s of alignment.
+    s = simulated('flight', ideal=True, duration=12.2, **PLACES[place])
+    aligner, epochs = aligned(s, **METHODS[method])
+    at_ten = [epoch for epoch in epochs if epoch.t_s <= 10.01][-1]
+    assert at_ten.t_s > 9.7
+    assert error_deg(at_ten.initial, s) < 1e-3
+    assert error_deg(at_ten.current, s) < 1e-3
+
+
+@pytest.mark.parametrize('options', (
+    {'mount_rpy_deg': (10.0, -70.0, 130.0)}, {'imu_jitter': 0.4}, {'gnss_rate': 1.0},
+    {'gnss_phase': 0.01}, {'gnss_latency': 0.4}, {'imu_rate': 200.0, 'gnss_rate': 10.0}))
+def test_map_does_not_mind_mount_jitter_rates_or_latency(options):
+    s = simulated('flight', ideal=True, duration=12.0, **options)
+    aligner, _ = aligned(s)
+    assert error_deg(aligner.status().initial, s) < 1e-3
+    assert error_deg(aligner.status().current, s) < 1e-3
+
+
+def test_known_delay_is_taken_into_account():
+    s = simulated('flight', ideal=True, duration=12.0, gnss_delay=0.2)
+    aligner, _ = aligned(s, gnss_delay=0.2)
+    assert error_deg(aligner.status().initial, s) < 1e-3
+    wrong, _ = aligned(s, gnss_delay=0.0)
+    assert error_deg(wrong.status().initial, s) > 0.02
+
+
+@pytest.mark.parametrize('method', ('vif', 'pif'))
+def test_sigma_of_the_note_is_honest_where_its_model_holds(method):
+    """Navigation grade for ten seconds: GNSS noise is all that matters."""
+    total = 0.0
+    seeds = range(16)
+    for seed in seeds:
+        s = simulated('flight', imu_grade='navigation', duration=10.0, seed=seed)
+        total += normalised_error(aligned(s, method=method)[0].status().initial, s)
+    if method == 'vif':
+        low, high = chi2.ppf([0.0005, 0.9995], 3 * len(seeds))
+        assert low < total < high
+    else:
+        # Integrated velocity noise is not white, which the note's sum of squares ignores.
+        assert np.isfinite(total)
+
+
+def test_biases_spoil_the_note_and_not_the_map():
+    errors = {'vif': [], 'map': []}
+    for seed in range(4):
+        s = simulated('car', imu_grade='mems', duration=50.0, seed=seed, gnss_rate=2.0)
+        for method, found in errors.items():
+            status = aligned(s, method=method)[0].status()
+            found.append(abs(np.degrees(error_of(status.initial, s)[2])))
+    assert np.median(errors['map']) < 0.5 < 1.0 < np.median(errors['vif'])
+
+
+def test_what_the_note_does_not_estimate_it_says_to_be_as_configured():
+    s = simulated('flight', ideal=True, duration=12.2)
+    status = aligned(s, method='vif')[0].status()
+    assert np.array_equal(status.gyro_bias, np.zeros(3))
+    assert np.array_equal(status.lever_arm, s.lever_arm)
+
+
+def test_a_posteriori_factor_only_widens():
+    good = Fit(chi2=50.0, dof=100, nis=1.0, converged=True, rejected_velocity=0,
+               rejected_position=0, offered=40)
+    bad = Fit(chi2=400.0, dof=100, nis=1.0, converged=True, rejected_velocity=0,
+              rejected_position=0, offered=40)
+    empty = Fit(chi2=0.0, dof=0, nis=1.0, converged=True, rejected_velocity=0,
+                rejected_position=0, offered=2)
+    assert good.factor == 1.0 and bad.factor == 2.0 and empty.factor == np.inf
