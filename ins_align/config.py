@@ -131,7 +131,7 @@ class Config:
         0.0, "accelerometer bias, 1 sigma per axis; 0: the preset's", 'm/s^2',
         minimum=0.0, maximum=10.0)
     gyro_scale_std: float = _parameter(
-        0.0, "scale factor error of the gyroscopes, 1 sigma per axis, 0.01 is one percent; 0: the "
+        0.0, 'scale factor error of the gyroscopes, 1 sigma per axis, 0.01 is one percent; 0: the '
         "preset's, for custom none", '1', minimum=0.0, maximum=0.5)
     velocity_std: float = _parameter(
         0.2, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none', 'm/s',

@@ -109,7 +109,8 @@ class MapEstimator:
 
     def __init__(self, prior: Prior, *, use_position: bool = False,
                  estimate_lever_arm: bool = False, estimate_delay: bool = False,
-                 estimate_gyro_scale: bool = False, capacity: int = 1000, excess: float = 1.0) -> None:
+                 estimate_gyro_scale: bool = False, capacity: int = 1000,
+                 excess: float = 1.0) -> None:
         """Start at t0."""
         wanted = np.ones(SIZE, bool)
         wanted[START_POSITION] = use_position

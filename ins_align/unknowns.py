@@ -64,8 +64,9 @@ class Unknowns:
 
     def vector(self) -> Array:
         """All but the attitude, which has three zeros, shape (22,)."""
-        return np.concatenate([np.zeros(3), self.gyro_bias, self.gyro_scale, self.accel_bias, self.start_velocity,
-                               self.start_position, self.lever_b, [self.delay]])
+        return np.concatenate([np.zeros(3), self.gyro_bias, self.gyro_scale, self.accel_bias,
+                               self.start_velocity, self.start_position, self.lever_b,
+                               [self.delay]])
 
     def moved(self, dx: Array) -> 'Unknowns':
         """Return the point moved by `dx`, shape (22,)."""
@@ -132,6 +133,8 @@ def first_prior(gyro_bias_std: float, accel_bias_std: float, lever_b: Array,
         Lever arm, metres.
     lever_std, delay, delay_std : float
         Metres per axis, seconds.
+    gyro_scale_std : float
+        Per axis, 0.01 is one percent; 0: none.
 
     """
     std = np.full(SIZE, math.inf)

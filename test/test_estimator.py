@@ -172,7 +172,7 @@ def test_store_is_bounded(monkeypatch):
 
 @pytest.fixture(scope='module')
 def many_flights():
-    """Initial and current attitude of MEMS flights of 50 s with their simulations."""
+    """Fly with MEMS IMUs for 50 s: initial and current attitudes with their simulations."""
     runs = []
     for seed in range(24):
         s = simulated('flight', imu_grade='mems', duration=50.0, seed=seed, gnss_rate=2.0)
