@@ -273,7 +273,6 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
         Of the sensors, in each step.
     gyro_scale : array_like, shape () or (3,)
         Scale factors less one: the true rate is ``omega (1 - gyro_scale) - gyro_bias``.
-        Of the sensors, in each step.
 
     Returns
     -------
