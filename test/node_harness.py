@@ -14,6 +14,7 @@
 """What the tests of the node share: the node as a process, messages to play, a listener."""
 
 from contextlib import contextmanager
+import csv
 from pathlib import Path
 import pickle
 import signal
@@ -175,7 +176,7 @@ def attitude_error_deg(quaternion, C_nb):
 def bag_script(path, start_s=0.0, duration_s=float('inf')):
     """Return what the drivers published when a bag was recorded."""
     from rosbags.typesys import get_typestore, Stores
-    ros1 = get_typestore(Stores.ROS1_NOETIC)
+    store = get_typestore(Stores.ROS2_JAZZY)
     script = []
     with Bag(path) as bag:
         topics = bag.choose_topics(Config())
@@ -185,9 +186,24 @@ def bag_script(path, start_s=0.0, duration_s=float('inf')):
             if not 0.0 <= (time_ns - bag.start_ns) * 1e-9 - start_s < duration_s:
                 continue
             if topic.encoding == 'ros1':
-                data = bytes(ros1.ros1_to_cdr(data, topic.msgtype))
+                data = bytes(store.ros1_to_cdr(data, topic.msgtype))
             script.append((time_ns, wanted[topic], topic.msgtype, data))
     return script
+
+
+def overrides(parameters):
+    """Write parameters as they stand behind -p."""
+    return [f'{name}:={value}' for name, value in parameters.items()]
+
+
+def replayed(bag, parameters, table, *options):
+    """Return the rows of `ins_align replay --csv TABLE`."""
+    settings = [f'--set={name}={value}' for name, value in parameters.items()]
+    done = subprocess.run([sys.executable, '-m', 'ins_align.cli', 'replay', bag, '--csv', table,
+                           *settings, *options], capture_output=True, text=True)
+    assert table.exists(), done.stderr
+    with open(table, newline='') as file:
+        return list(csv.DictReader(file))
 
 
 def simulated_messages(simulation):

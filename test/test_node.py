@@ -15,7 +15,7 @@
 
 import signal
 
-from ins_align.config import parameters
+from ins_align.config import Config, parameters
 from node_harness import Listener, NodeProcess, running_node
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -104,7 +104,8 @@ def test_parameters_and_status_of_an_idle_node():
                           (read_only, 'read-only')):
         assert not refused.successful
         assert says in refused.reason
-    assert [value.double_value for value in changed.values] == [0.5, 2.0, 0.0]
+    assert [value.double_value for value in changed.values] == [
+        0.5, Config().hold_time, 0.0]
     assert reset.success
 
     status, = listener.statuses[-1].status
