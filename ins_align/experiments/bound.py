@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 from ins_align.aligner import Aligner
 from ins_align.experiments import dense
 from ins_align.experiments.common import (
-    config_for, epochs_of, error_of, GRADES, parallel, Report, rms)
+    epochs_of, error_of, exact_config_for, GRADES, parallel, Report, rms)
 from ins_align.report import new_figure
 from ins_align.rotation import Array
 from ins_align.simulation import simulate, Simulation
@@ -117,18 +117,18 @@ def bounds_of(case: Case) -> tuple[Array, Array]:
     return np.degrees(np.sqrt(P[:, 0] + P[:, 1])), np.degrees(np.sqrt(P[:, 2]))
 
 
-def crossing_time(task: tuple[str, str, float, float]) -> float | None:
+def crossing_time(task: tuple[str, str, float, float, dict[str, float]]) -> float | None:
     """
     Return when the bound of the heading crosses a threshold, None if it does not.
 
     Parameters
     ----------
     task : tuple
-        Scenario, grade, seconds to look at, degrees.
+        Scenario, grade, seconds to look at, degrees, what of `dense.bound` is unknown.
 
     """
-    scenario, grade, horizon, threshold_deg = task
-    bound = dense.bound(simulate(scenario, imu_grade=grade, duration=horizon))
+    scenario, grade, horizon, threshold_deg, unknown = task
+    bound = dense.bound(simulate(scenario, imu_grade=grade, duration=horizon), **unknown)
     good = np.degrees(np.sqrt(bound.covariance[:, 2, 2])) <= threshold_deg
     return float(bound.time[np.argmax(good)]) if good.any() else None
 
@@ -143,8 +143,8 @@ def run_case(task: tuple[Case, int]) -> Numbers:
     if case.unknown == 'lever arm':
         changes |= {'lever_arm': (0.0, 0.0, 0.0), 'lever_arm_std': LEVER_STD}
     if case.unknown == 'delay':
-        changes |= {'gnss_delay_std': DELAY_STD, 'gnss_lateness': 2 * DELAY}
-    aligner = Aligner(config_for(simulation, **changes))
+        changes['gnss_delay_std'] = DELAY_STD
+    aligner = Aligner(exact_config_for(simulation, **changes))
     attitudes: list[Any] = [None] * len(TIMES)
     for epoch in epochs_of(aligner, simulation, velocity=not case.position_only):
         for k, time in enumerate(TIMES):

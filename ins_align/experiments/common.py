@@ -32,15 +32,15 @@ from ins_align.rotation import Array, log_so3, matrix_from_quaternion
 from ins_align.simulation import Simulation
 import numpy as np
 
-# Of simulated data nothing comes late; a little is left for the split at GNSS stamps.
-LATENESS = 0.05
+# Of simulated data nothing comes late, but an unknown delay wants IMU samples beyond the stamp.
+LATENESS = 0.5
 GRADES = ('navigation', 'tactical', 'mems')
 _THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 _PROGRESS_STEP = 0.02
 
 
 def parallel(function: Callable[[Any], Any], tasks: Sequence[Any],
-             jobs: int | None = None, name: str = '') -> list[Any]:
+             jobs: int | None = None, name: str = '', *, apart: bool = False) -> list[Any]:
     """
     Map a function of a module over tasks in processes of one thread each.
 
@@ -57,7 +57,7 @@ def parallel(function: Callable[[Any], Any], tasks: Sequence[Any],
 
     """
     jobs = min(jobs or os.cpu_count() or 1, max(len(tasks), 1))
-    if jobs == 1:
+    if jobs == 1 and not apart:
         return list(_counted(map(function, tasks), len(tasks), name))
     before = {variable: os.environ.get(variable) for variable in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, '1'))
@@ -100,14 +100,24 @@ def epochs_of(aligner: Aligner, simulation: Simulation, *, fix: bool = True,
 
 
 def config_for(simulation: Simulation, **changes: Any) -> Config:
-    """Return the configuration that knows a simulation's IMU grade and lever arm."""
+    """Return the defaults with a simulation's IMU grade and lever arm."""
     values: dict[str, Any] = {
         'lever_arm': tuple(simulation.lever_arm.tolist()), 'gnss_lateness': LATENESS,
-        'imu_grade': simulation.meta['imu_grade'],
-        'gyro_bias_std': math.degrees(simulation.imu_noise.gyro_bias_std),
-        'accel_bias_std': simulation.imu_noise.accel_bias_std}
+        'imu_grade': simulation.meta['imu_grade']}
     values.update(changes)
     return Config(**values)
+
+
+def exact_config_for(simulation: Simulation, **changes: Any) -> Config:
+    """Return the very model of a simulation: lever arm, delay and scale factors are known."""
+    noise = simulation.imu_noise
+    values: dict[str, Any] = {
+        'imu_grade': 'custom', 'angle_random_walk': 60 * math.degrees(noise.angle_random_walk),
+        'velocity_random_walk': 60 * noise.velocity_random_walk,
+        'gyro_bias_std': math.degrees(noise.gyro_bias_std),
+        'accel_bias_std': noise.accel_bias_std, 'lever_arm_std': 0.0, 'gnss_delay_std': 0.0}
+    values.update(changes)
+    return config_for(simulation, **values)
 
 
 class Error(NamedTuple):

@@ -1,0 +1,253 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Experiment ``note``: the note's simulation with and without its lever-arm term, and its remarks.
+
+The note says of its set-up: lever arm [1 1 1] m, 100 runs, the simulation of its predecessor,
+which it does not describe. Here: scenario `flight`, navigation grade, velocity 0.1 m/s at 5 Hz.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ins_align.aligner import Aligner
+from ins_align.earth import EARTH_RATE, earth_rate_n, LocalLevel
+from ins_align.experiments import dense
+from ins_align.experiments.common import epochs_of, exact_config_for, parallel, Report, rms
+from ins_align.formula import exact_lever_remainder
+from ins_align.report import new_figure
+from ins_align.rotation import Array, cross, matrix_from_quaternion, roll_pitch_yaw
+from ins_align.simulation import simulate
+import numpy as np
+
+DURATION = 100.0
+TABLE_TIMES = (10.0, 20.0, 50.0, 100.0)
+PEAK_FROM, PEAK_TO = 2.0, 20.0      # s, where the note's Fig. 1 has its lumps
+SHOWN_FROM = 3.0                    # s, larger errors before may lie outside of the figure
+LEVER = (1.0, 1.0, 1.0)
+REMARK_DURATION = 1000.0
+ANGLES = ('roll', 'pitch', 'heading')
+NO_LEVER = (0.0, 0.0, 0.0)
+# Name, lever arm of the vehicle, what the aligner is told beside the grade.
+VARIANTS: dict[str, tuple[tuple[float, ...], dict[str, Any]]] = {
+    'not compensated': (LEVER, {'method': 'vif', 'free_start': False, 'lever_arm': NO_LEVER}),
+    'compensated': (LEVER, {'method': 'vif', 'free_start': False}),
+    'zero lever arm': (NO_LEVER, {'method': 'vif', 'free_start': False}),
+    'not compensated, free start': (LEVER, {'method': 'vif', 'lever_arm': NO_LEVER}),
+    'compensated, free start': (LEVER, {'method': 'vif'}),
+    'map': (LEVER, {'method': 'map'}),
+}
+ADDED = ('compensated', 'compensated, free start', 'map')
+COLOURS = {'not compensated': '#D55E00', 'compensated': '#0072B2', 'zero lever arm': '#009E73',
+           'compensated, free start': '#E69F00', 'map': '#CC79A7'}
+
+
+def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
+    """Run all variants, navigation grade; the note, its free start and map with MEMS too."""
+    runs = runs or 100
+    report = Report('note', "The note's experiment", out)
+    report.text(
+        'Scenario `flight` (100 m/s, S-turns with 40 s period, oscillation of 2 to 3 deg about '
+        f'all axes), IMU 100 Hz, GNSS velocity 5 Hz, 0.1 m/s; lever arm {list(LEVER)} m; {runs} '
+        'runs. The note does not give its own set-up. Errors of the attitude at t0.')
+    tasks = [(grade, name, seed) for grade, names in (('navigation', tuple(VARIANTS)),
+                                                      ('mems', ADDED))
+             for name in names for seed in range(runs)]
+    results = parallel(run_one, tasks, jobs, 'runs')
+    errors: dict[str, dict[str, Array]] = {'navigation': {}, 'mems': {}}
+    for number in range(0, len(tasks), runs):
+        grade, name, _ = tasks[number]
+        errors[grade][name] = np.array(results[number:number + runs])
+    time = np.arange(errors['navigation']['map'].shape[1]) / 5.0
+    bounds = {grade: bound_of(grade) for grade in errors}
+    numbers = {'rms_heading_deg': rms_table(report, errors, bounds, time),
+               'peak_deg': peak_table(report, errors['navigation'], time)}
+    report.figure(note_figure(errors['navigation'], time), '', f'Mean errors of {runs} runs, '
+                  'method `vif` without free start, as in Fig. 1 of the note')
+    report.figure(added_figure(errors, bounds, time), '_added', 'Root mean square errors: the '
+                  'note, its free start, map, and the Cramer-Rao bound')
+    remarks = remarks_of(REMARK_DURATION)
+    report.figure(remark_figure(*remarks), '_remarks', 'Remark 2.1: what the short form of (9) '
+                  'leaves out. Remark 2.2: the lever-arm term against the integral of the '
+                  'specific force')
+    seconds, remainder, limit, term, integral = remarks
+    numbers['remark_2_1'] = {'largest_m_s': remainder.max(), 'limit_at_end_m_s': limit[-1],
+                             'largest_share_of_limit': np.max(remainder[1:] / limit[1:])}
+    report.text(
+        f'Remark 2.1: over {REMARK_DURATION:g} s the short form of (9) misses at most '
+        f'{remainder.max():.2g} m/s; the limit 2 W^2 t |l| is {limit[-1]:.2g} m/s at the end; the '
+        f'remainder is at most {np.max(remainder[1:] / limit[1:]):.2f} of it. Remark 2.2: after '
+        + ', '.join(f'{t:g} s the lever-arm term is {term[k]:.2g} m/s, the integral '
+                    f'{integral[k]:.3g} m/s' for t, k in (
+                        (t, np.searchsorted(seconds, t)) for t in (1.0, 10.0, 100.0))) + '.')
+    report.write({'runs': runs, **numbers})
+
+
+def run_one(task: tuple[str, str, int]) -> Array:
+    """Return errors of roll, pitch, yaw, degrees, at every epoch, shape (K, 3)."""
+    grade, name, seed = task
+    lever, told = VARIANTS[name]
+    simulation = simulate('flight', imu_grade=grade, seed=seed, duration=DURATION,
+                          lever_arm=lever)
+    aligner = Aligner(exact_config_for(simulation, **told))
+    errors = np.full((len(simulation.gnss_stamps_ns), 3), np.nan)
+    for epoch in epochs_of(aligner, simulation):
+        if epoch.initial is not None:
+            C_true = simulation.attitude_at(epoch.initial.stamp_ns)
+            rpy = roll_pitch_yaw(matrix_from_quaternion(epoch.initial.quaternion_xyzw))
+            difference = np.remainder(rpy - roll_pitch_yaw(C_true) + np.pi, 2 * np.pi) - np.pi
+            errors[np.searchsorted(simulation.gnss_stamps_ns, epoch.stamp_ns)] = np.degrees(
+                difference)
+    return errors
+
+
+def bound_of(grade: str) -> Array:
+    """Bound of tilt per axis (root mean square of both) and heading at every epoch, degrees."""
+    P = dense.bound(simulate('flight', imu_grade=grade, duration=DURATION)).covariance
+    return np.degrees(np.sqrt(np.stack([(P[:, 0, 0] + P[:, 1, 1]) / 2, P[:, 2, 2]], axis=-1)))
+
+
+def rms_table(report: Report, errors: dict[str, dict[str, Array]], bounds: dict[str, Array],
+              time: Array) -> dict[str, list[float]]:
+    """Print the heading's rms over time."""
+    places = [int(np.argmin(np.abs(time - t))) for t in TABLE_TIMES]
+    rows, numbers = [], {}
+    for grade, variants in errors.items():
+        columns = {name: rms(error[:, places, 2], axis=0) for name, error in variants.items()}
+        columns['Cramer-Rao bound'] = bounds[grade][places, 1]
+        for name, values in columns.items():
+            rows.append([f'{grade}: {name}', *(f'{value:.2g}' for value in values)])
+            numbers[f'{grade}: {name}'] = list(values)
+    report.table('Heading error, rms in deg. Without "free start" and map: free_start false, '
+                 'the note to the letter', ['variant', *(f'{t:g} s' for t in TABLE_TIMES)], rows)
+    return numbers
+
+
+def peak_table(report: Report, errors: dict[str, Array], time: Array) -> dict[str, list[float]]:
+    """Print the largest mean errors early on."""
+    early = (time >= PEAK_FROM) & (time <= PEAK_TO)
+    rows, numbers = [], {}
+    for name in ('not compensated', 'compensated', 'zero lever arm'):
+        mean = np.mean(errors[name], axis=0)
+        values = [*np.max(np.abs(mean[early]), axis=0), *np.abs(mean[-1])]
+        rows.append([name, *(f'{value:.3f}' for value in values)])
+        numbers[name] = values
+    report.table(
+        f'Mean error, deg: largest from {PEAK_FROM:g} to {PEAK_TO:g} s, and at {DURATION:g} s',
+        ['variant', *ANGLES, *(f'{angle}, end' for angle in ANGLES)], rows)
+    return numbers
+
+
+def note_figure(errors: dict[str, Array], time: Array) -> Any:
+    """Draw mean errors over time."""
+    picture = new_figure(8.0, 8.0)
+    axes = picture.subplots(3, 1, sharex=True)
+    for column, (ax, angle) in enumerate(zip(axes, ANGLES)):
+        for name in ('not compensated', 'compensated', 'zero lever arm'):
+            mean = np.mean(errors[name][..., column], axis=0)
+            ax.plot(time, mean, color=COLOURS[name], label=name,
+                    linestyle='--' if name == 'zero lever arm' else '-')
+        shown = time >= SHOWN_FROM
+        limit = 1.1 * max(np.nanmax(np.abs(np.mean(errors[name][:, shown, column], axis=0)))
+                          for name in ('not compensated', 'compensated', 'zero lever arm'))
+        ax.set_ylim(-limit, limit)
+        ax.set_xlim(0.0, DURATION)
+        ax.set_ylabel(f'{angle} (deg)')
+        ax.grid(alpha=0.3)
+    axes[0].set_title(f'mean alignment error (scaled to what is seen after {SHOWN_FROM:g} s)')
+    axes[0].legend(fontsize=9)
+    axes[-1].set_xlabel('time since t0 (s)')
+    return picture
+
+
+def added_figure(errors: dict[str, dict[str, Array]], bounds: dict[str, Array],
+                 time: Array) -> Any:
+    """Draw rms errors and bounds over time."""
+    picture = new_figure(11.0, 7.5)
+    axes = picture.subplots(2, 2, sharex=True, sharey='row')
+    shown = time >= 1.0
+    for column, (grade, variants) in enumerate(errors.items()):
+        for line, angle in enumerate(('tilt, per axis', 'heading')):
+            ax = axes[line, column]
+            for name in ADDED:
+                chosen = slice(0, 2) if line == 0 else slice(2, 3)
+                ax.semilogy(time[shown], rms(variants[name][:, shown, chosen], axis=(0, 2)),
+                            color=COLOURS[name],
+                            label='the note' if name == 'compensated' else name)
+            ax.semilogy(time[shown], bounds[grade][shown, line], 'k--', label='Cramer-Rao bound')
+            ax.set_title(f'{grade} IMU: {angle}')
+            ax.grid(which='both', alpha=0.25)
+        axes[1, column].set_xlabel('time since t0 (s)')
+    for ax in axes[:, 0]:
+        ax.set_ylabel('rms error (deg)')
+    axes[0, 0].legend(fontsize=8)
+    return picture
+
+
+def remarks_of(duration: float) -> tuple[Array, Array, Array, Array, Array]:
+    """
+    Terms of (9) on the true motion.
+
+    Returns
+    -------
+    time, remainder, limit, term, integral : ndarray, shape (N,)
+        Seconds; m/s: what the short form leaves out, its limit, the lever-arm term, the integral
+        of the specific force.
+    """
+    truth = simulate('flight', ideal=True, duration=duration, gnss_rate=1.0)
+    time = (truth.truth_stamps_ns - truth.truth_stamps_ns[0]) * 1e-9
+    lever_b = np.array(LEVER)
+    latitude, longitude = np.radians(truth.truth_lla[:, :2]).T
+    C_nb = truth.truth_C_nb
+    C_n0n = LocalLevel(latitude[0], longitude[0]).matrix(time, latitude, longitude)
+    C_b0b = C_nb[0].T @ C_n0n @ C_nb
+    omega_ie_n = earth_rate_n(latitude)
+    omega_eb_b = truth.truth_gyro - np.einsum('nji,nj->ni', C_nb, omega_ie_n)
+    remainder = exact_lever_remainder(time, C_b0b, omega_eb_b, C_nb[0].T @ omega_ie_n[0],
+                                      lever_b)
+    turned = np.einsum('nij,nj->ni', C_b0b, cross(truth.truth_gyro, lever_b))
+    force = np.einsum('nij,nj->ni', C_b0b, truth.truth_accel)
+    h = np.diff(time)[:, None]
+    integral = np.concatenate([np.zeros((1, 3)),
+                               np.cumsum(h / 2 * (force[1:] + force[:-1]), axis=0)])
+
+    def size(vectors: Array) -> Array:
+        return np.linalg.norm(vectors, axis=1)
+
+    return (time, size(remainder), 2 * EARTH_RATE ** 2 * time * np.linalg.norm(lever_b),
+            size(turned - turned[0]), size(integral))
+
+
+def remark_figure(time: Array, remainder: Array, limit: Array, term: Array,
+                  integral: Array) -> Any:
+    """Draw Remarks 2.1 and 2.2."""
+    picture = new_figure(11.0, 4.2)
+    left, right = picture.subplots(1, 2)
+    every = slice(10, None, 10)
+    left.plot(time[every], remainder[every], color='#0072B2', label='remainder of the short form')
+    left.plot(time[every], limit[every], 'k--', label='$2\\,W^2\\,t\\,|l|$')
+    left.set_title('Remark 2.1')
+    right.loglog(time[every], integral[every], color='#E69F00',
+                 label='$|\\int C_{b0b}\\,f_b\\,dt|$')
+    right.loglog(time[every], term[every], color='#0072B2', linewidth=0.8,
+                 label='lever-arm term')
+    right.set_title('Remark 2.2')
+    for ax in (left, right):
+        ax.set_xlabel('time since t0 (s)')
+        ax.set_ylabel('m/s')
+        ax.grid(alpha=0.3)
+        ax.legend()
+    return picture
