@@ -37,13 +37,13 @@ def force_of(t):
     return np.stack([2.0 * np.sin(1.3 * t), 1.5 * np.cos(2.1 * t), 9.8 + np.sin(2.9 * t)], axis=-1)
 
 
-def exact(start, end, gyro_bias=ZERO, accel_bias=ZERO):
+def exact(start, end):
     """Attitude, velocity, position by a high-order integrator from `start` to `end`."""
     def derivative(t, y):
         R = y[:9].reshape(3, 3)
-        w = omega_of(t) - gyro_bias
+        w = omega_of(t)
         wx = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
-        return np.concatenate([(R @ wx).ravel(), R @ (force_of(t) - accel_bias), y[9:12]])
+        return np.concatenate([(R @ wx).ravel(), R @ force_of(t), y[9:12]])
 
     y0 = np.concatenate([np.eye(3).ravel(), np.zeros(6)])
     y = solve_ivp(derivative, (start, end), y0, method='DOP853', rtol=1e-12, atol=1e-13).y[:, -1]
@@ -58,10 +58,10 @@ def samples(duration, rate=RATE, jitter=0.0, seed=0):
     return stamps, omega_of(stamps), force_of(stamps)
 
 
-def integrated(epochs, rate=RATE, jitter=0.0, gyro_bias=ZERO, accel_bias=ZERO, noise=NOISE):
+def integrated(epochs, rate=RATE, jitter=0.0, gyro_bias=ZERO, accel_bias=ZERO, gyro_scale=ZERO):
     stamps, gyro, accel = samples(epochs[-1], rate, jitter)
     steps = split_at_epochs(stamps, gyro, accel, np.asarray(epochs, float))
-    return preintegrate(steps, gyro_bias, accel_bias, noise)
+    return preintegrate(steps, gyro_bias, accel_bias, NOISE, gyro_scale)
 
 
 def chained(interval):
@@ -160,7 +160,7 @@ def test_jacobians_are_the_derivatives_of_the_integration(axis):
     step = 1e-5
     epochs = [0.0, 1.5]
     at = integrated(epochs)
-    for name, size in (('gyro_bias', step), ('accel_bias', step)):
+    for name, size in (('gyro_bias', step), ('accel_bias', step), ('gyro_scale', step)):
         bias = size * np.eye(3)[axis]
         plus, minus = (integrated(epochs, **{name: sign * bias}) for sign in (1, -1))
         turn = Rotation.from_matrix(plus.R[0] @ minus.R[0].T).as_rotvec() / (2 * size)
@@ -168,6 +168,8 @@ def test_jacobians_are_the_derivatives_of_the_integration(axis):
         J_p = (plus.p[0] - minus.p[0]) / (2 * size)
         if name == 'gyro_bias':
             expected = at.J_Rg, at.J_vg, at.J_pg
+        elif name == 'gyro_scale':
+            expected = at.J_Rs, at.J_vs, at.J_ps
         else:
             expected = np.zeros((1, 3, 3)), at.J_Rg, at.J_pa
         assert np.allclose(turn, expected[0][0][:, axis], atol=1e-4)
@@ -175,10 +177,11 @@ def test_jacobians_are_the_derivatives_of_the_integration(axis):
         assert np.allclose(J_p, expected[2][0][:, axis], atol=2e-3)
 
 
-def test_bias_correction_is_re_integration_to_first_order():
+def test_correction_is_re_integration_to_first_order():
     gyro_bias, accel_bias = np.array([2e-3, -1e-3, 1.5e-3]), np.array([0.05, -0.02, 0.03])
-    corrected = integrated([0.0, 0.2]).bias_corrected(gyro_bias, accel_bias)
-    again = integrated([0.0, 0.2], gyro_bias=gyro_bias, accel_bias=accel_bias)
+    scale = np.array([1e-3, -2e-3, 2e-3])
+    corrected = integrated([0.0, 0.2]).corrected(gyro_bias, accel_bias, scale)
+    again = integrated([0.0, 0.2], gyro_bias=gyro_bias, accel_bias=accel_bias, gyro_scale=scale)
     # Second order: 1/2 (2.7e-3 * 0.2)^2 for angles.
     assert angle(corrected.R[0], again.R[0]) < 3e-7
     assert np.allclose(corrected.v[0], again.v[0], atol=3e-6)
@@ -187,12 +190,13 @@ def test_bias_correction_is_re_integration_to_first_order():
     assert np.allclose(corrected.f[0], again.f[0], atol=1e-15)
 
 
-def test_bias_correction_takes_a_bias_for_each_interval():
+def test_correction_takes_errors_for_each_interval():
     interval = integrated([0.0, 0.2, 0.4])
     gyro, accel = np.array([[1e-3, 0, 0], [0, 2e-3, 0]]), np.array([[0, 0.1, 0], [0.1, 0, 0]])
-    both = interval.bias_corrected(gyro, accel)
+    scale = np.array([[0, 0.01, 0], [0, 0, 0.02]])
+    both = interval.corrected(gyro, accel, scale)
     for k in range(2):
-        one = interval.take(slice(k, k + 1)).bias_corrected(gyro[k], accel[k])
+        one = interval.take(slice(k, k + 1)).corrected(gyro[k], accel[k], scale[k])
         assert np.allclose(one.v[0], both.v[k]) and np.allclose(one.R[0], both.R[k])
 
 
@@ -287,6 +291,20 @@ def test_noise_in_excess_is_kept_apart():
     assert np.allclose(interval.Q, preintegrate(steps, ZERO, ZERO, NOISE).Q)
     assert np.allclose(interval.Q_excess, preintegrate(steps, ZERO, ZERO, Noise(2e-3, 3e-2)).Q)
     assert not np.any(preintegrate(steps, ZERO, ZERO, NOISE).Q_excess)
+
+
+def test_mirrored_intervals_are_those_of_mirrored_sensors():
+    """To first order in the rotation over an interval, which is what is promised."""
+    epochs = np.array([0.0, 0.2, 0.4])
+    stamps, gyro, accel = samples(0.4)
+    plain = preintegrate(split_at_epochs(stamps, gyro, accel, epochs), ZERO, ZERO, NOISE)
+    for gyro_sign, accel_sign in ((1, -1), (-1, 1), (-1, -1)):
+        steps = split_at_epochs(stamps, gyro_sign * gyro, accel_sign * accel, epochs)
+        expected = preintegrate(steps, ZERO, ZERO, NOISE)
+        mirrored = plain.mirrored(gyro_sign, accel_sign)
+        for name in ('R', 'v', 'p', 'omega', 'f'):
+            assert np.allclose(getattr(mirrored, name), getattr(expected, name),
+                               rtol=0.02, atol=0.02), name
 
 
 def test_storage_gives_back_what_was_put():

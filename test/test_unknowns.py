@@ -17,7 +17,9 @@ from dataclasses import replace
 
 from alignment import LEVER
 from ins_align.rotation import exp_so3
-from ins_align.unknowns import first_prior, inverse_spd, Prior, SIZE, Unknowns
+from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, GYRO_SCALE,
+                                inverse_spd, LEVER_ARM, Prior, SIZE, START_POSITION,
+                                START_VELOCITY, Unknowns)
 import numpy as np
 import pytest
 
@@ -25,7 +27,7 @@ import pytest
 def some_unknowns(seed=0):
     r = np.random.default_rng(seed)
     return Unknowns(exp_so3(r.standard_normal(3)), 1e-3 * r.standard_normal(3),
-                    1e-2 * r.standard_normal(3), r.standard_normal(3), r.standard_normal(3),
+                    0.01 * r.standard_normal(3), 1e-2 * r.standard_normal(3), r.standard_normal(3), r.standard_normal(3),
                     r.standard_normal(3), 0.03)
 
 
@@ -36,14 +38,20 @@ def test_moving_and_comparing_points_are_inverse():
 
 
 def test_first_prior_knows_what_it_was_told():
-    prior = first_prior(1e-3, 0.05, LEVER, 0.5, 0.02, 0.1)
-    information, step = prior.at(some_unknowns())
-    assert np.allclose(np.diag(information)[3:9], [1e6] * 3 + [400.0] * 3)
-    assert np.allclose(np.diag(information)[15:], [4.0] * 3 + [100.0])
-    assert np.all(information[:3] == 0) and np.all(information[9:15] == 0)
-    assert np.allclose(step[15:18], np.array(LEVER) - some_unknowns().lever_b)
-    fixed = first_prior(1e-3, 0.05, LEVER, 0.0, 0.0, 0.0)
-    assert np.all(fixed.information[15:] == 0)
+    prior = first_prior(1e-3, 0.05, LEVER, 0.5, 0.02, 0.1, 0.01)
+    x = some_unknowns()
+    information, step = prior.at(x)
+    known = np.diag(information)
+    assert np.allclose(known[GYRO_BIAS], 1e6) and np.allclose(known[ACCEL_BIAS], 400.0)
+    assert np.allclose(known[GYRO_SCALE], 1e4)
+    assert np.allclose(known[LEVER_ARM], 4.0) and np.allclose(known[DELAY], 100.0)
+    for nothing in (ATTITUDE, START_VELOCITY, START_POSITION):
+        assert np.all(known[nothing] == 0)
+    assert np.allclose(step[LEVER_ARM], np.array(LEVER) - x.lever_b)
+    assert np.allclose(step[DELAY], 0.02 - x.delay)
+    fixed = np.diag(first_prior(1e-3, 0.05, LEVER, 0.0, 0.0, 0.0).information)
+    assert np.all(fixed[LEVER_ARM] == 0) and np.all(fixed[DELAY] == 0)
+    assert np.all(fixed[GYRO_SCALE] == 0)
 
 
 @pytest.mark.parametrize('turn', (0.0, 0.5, 3.0))

@@ -32,8 +32,8 @@ from ins_align.config import ImuNoise
 from ins_align.messages import ENU_FROM_NED
 from ins_align.rotation import Array, skew
 from ins_align.simulation import Simulation
-from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO_BIAS, LEVER_ARM, SIZE,
-                                START_POSITION, START_VELOCITY)
+from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO, GYRO_BIAS, GYRO_SCALE,
+                                LEVER_ARM, SIZE, START_POSITION, START_VELOCITY)
 import numpy as np
 
 # Nothing more than "somewhere on the circle" is known of an angle (rad): keeps the information
@@ -72,10 +72,10 @@ class DenseSolution:
     ----------
     C : ndarray, shape (3, 3)
         ``C_nb(t0)``.
-    unknowns : ndarray, shape (19,)
-        Biases, start, lever arm, delay in their places, the first three zero. The start is that
+    unknowns : ndarray, shape (22,)
+        Sensor errors, start, lever arm, delay in their places, the first three zero. The start is that
         of the IMU with respect to inertial space.
-    covariance : ndarray, shape (19, 19)
+    covariance : ndarray, shape (22, 22)
         Zero where something is not estimated.
     chi2 : float
         Sum of squares of the whitened residuals and the prior's.
@@ -188,12 +188,12 @@ def dense_solution(simulation: Simulation, *, noise: ImuNoise | None = None,
         chi2 = float(left @ left + np.sum(information * (to_mean - dx[columns]) ** 2))
         rotation, E = _attitude_error_now(path, noise, V[np.ix_(rows, rows)], rows, y, H,
                                           dx[columns])
-        current = _rotation(dx[:3] - path.Theta[-1] @ dx[GYRO_BIAS] + rotation) @ path.C[-1]
+        current = _rotation(dx[:3] - path.Theta[-1] @ dx[GYRO] + rotation) @ path.C[-1]
         C = _rotation(dx[:3]) @ C
         x = x + dx
         x[:3] = 0.0
     J = np.zeros((3, SIZE))
-    J[:, ATTITUDE], J[:, GYRO_BIAS] = np.eye(3), -path.Theta[-1]
+    J[:, ATTITUDE], J[:, GYRO] = np.eye(3), -path.Theta[-1]
     J = J[:, columns] - E[:, :len(columns)]
     covariance = np.zeros((SIZE, SIZE))
     covariance[np.ix_(columns, columns)] = P
@@ -205,16 +205,18 @@ class _Path:
     """
     Integrals over the motion at K epochs, in n0 axes.
 
-    U and P are the first and second integral of the specific force, Theta that of C, Gamma that of
-    ``[U' x] Theta``; M holds the integrals of z z^T, z = (1, U, t U - P).
+    U and P are the first and second integral of the specific force, S that of C; Theta, shape
+    (K, 3, 6), of C and of ``C diag(omega)``: what bias and scale factor of a gyro turn; Gamma that
+    of ``[U' x] Theta``; M holds the integrals of z z^T, z = (1, U, t U - P).
     """
 
     time: Array
     C: Array              # C_n0b
     U: Array
     P: Array
+    S: Array
+    int_S: Array
     Theta: Array
-    int_Theta: Array
     Gamma: Array
     int_Gamma: Array
     M: Array
@@ -237,13 +239,14 @@ def _path(time: Array, C: Array, omega: Array, f: Array, at: Array, C_n0n: Array
     force = np.einsum('nij,nj->ni', C, f)
     U = _cumulative(time, force)
     P = _cumulative(time, U)
-    Theta = _cumulative(time, C)
+    S = _cumulative(time, C)
+    Theta = np.concatenate([S, _cumulative(time, C * omega[:, None, :])], axis=-1)
     Gamma = _cumulative(time, skew(force) @ Theta)
     z = np.hstack([np.ones((len(time), 1)), U, time[:, None] * U - P])
     M = _cumulative(time, z[:, :, None] * z[:, None, :])
     gravity = np.einsum('nij,nj->ni', C_n0n, g_n)
-    return _Path(time[at], C[at], U[at], P[at], Theta[at], _cumulative(time, Theta)[at], Gamma[at],
-                 _cumulative(time, Gamma)[at], M[at], omega[at], force[at] + gravity,
+    return _Path(time[at], C[at], U[at], P[at], S[at], _cumulative(time, S)[at], Theta[at],
+                 Gamma[at], _cumulative(time, Gamma)[at], M[at], omega[at], force[at] + gravity,
                  np.einsum('nij,nj->ni', C_n0n, v_n), C_n0n)
 
 
@@ -288,7 +291,8 @@ def _measured_path(simulation: Simulation, C: Array, x: Array) -> _Path:
     epochs_ns = simulation.gnss_stamps_ns - round(x[DELAY][0] * 1e9)
     grid, at = _grid(simulation.imu_stamps_ns, epochs_ns)
     time = (grid - grid[0]) * 1e-9
-    omega = _interpolated(simulation.imu_stamps_ns, simulation.gyro, grid) - x[GYRO_BIAS]
+    omega = _interpolated(simulation.imu_stamps_ns, simulation.gyro, grid)
+    omega = omega * (1 - x[GYRO_SCALE]) - x[GYRO_BIAS]
     f = _interpolated(simulation.imu_stamps_ns, simulation.accel, grid) - x[ACCEL_BIAS]
     # Angle of each step with the coning term of a rate that is linear in time.
     h = np.diff(time)[:, None]
@@ -351,18 +355,20 @@ def _lever_terms(path: _Path, lever_b: Array) -> tuple[Array, Array]:
 
 
 def _design(path: _Path, lever_b: Array) -> Array:
-    """Derive the measurements by the 19 unknowns, shape (6 K, 19)."""
+    """Derive the measurements by the 19 unknowns, shape (6 K, 22)."""
     lever_v, lever_p = _lever_terms(path, lever_b)
     time = path.time[:, None, None]
     H = np.zeros((len(path.time), 2, 3, SIZE))
     velocity, position = H[:, 0], H[:, 1]
     velocity[..., ATTITUDE] = -skew(path.U + lever_v)
     position[..., ATTITUDE] = -skew(path.P + lever_p)
-    velocity[..., GYRO_BIAS] = (path.Gamma + skew(lever_v) @ path.Theta
-                                + path.C @ skew(lever_b))
-    position[..., GYRO_BIAS] = path.int_Gamma + skew(lever_p) @ path.Theta
-    velocity[..., ACCEL_BIAS] = -path.Theta
-    position[..., ACCEL_BIAS] = -path.int_Theta
+    C_lever = path.C @ skew(lever_b)
+    velocity[..., GYRO] = path.Gamma + skew(lever_v) @ path.Theta
+    velocity[..., GYRO_BIAS] += C_lever
+    velocity[..., GYRO_SCALE] += C_lever * path.omega[:, None, :]
+    position[..., GYRO] = path.int_Gamma + skew(lever_p) @ path.Theta
+    velocity[..., ACCEL_BIAS] = -path.S
+    position[..., ACCEL_BIAS] = -path.int_S
     velocity[..., START_VELOCITY] = np.eye(3)
     position[..., START_VELOCITY] = time * np.eye(3)
     position[..., START_POSITION] = np.eye(3)
@@ -465,7 +471,8 @@ def _prior(noise: ImuNoise, use_position: bool, lever_arm_std: float,
     std[ATTITUDE] = _ATTITUDE_STD
     std[START_VELOCITY] = math.inf
     std[START_POSITION] = math.inf if use_position else 0.0
-    std[GYRO_BIAS], std[ACCEL_BIAS] = noise.gyro_bias_std, noise.accel_bias_std
+    std[GYRO_BIAS], std[GYRO_SCALE] = noise.gyro_bias_std, noise.gyro_scale_std
+    std[ACCEL_BIAS] = noise.accel_bias_std
     std[LEVER_ARM], std[DELAY] = lever_arm_std, delay_std
     wanted = std > 0
     return np.flatnonzero(wanted), std[wanted] ** -2.0
