@@ -24,6 +24,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 import math
 
+from ins_align.earth import EARTH_RATE
 from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals
 from ins_align.rotation import Array, cross, exp_so3, skew
@@ -34,6 +35,11 @@ from ins_align.whitening import (Chain, HEADING_RESOLVED_STD, Measurements, POSI
                                  sensitivities, VELOCITY, Whitener)
 import numpy as np
 
+# What is always known: an angle lies on the circle, a velocity and a position are on the Earth.
+WEAK_INFORMATION = np.zeros(SIZE)
+WEAK_INFORMATION[ATTITUDE] = UNIFORM_ANGLE_STD ** -2
+WEAK_INFORMATION[START_VELOCITY] = 1e4 ** -2
+WEAK_INFORMATION[START_POSITION] = 1e7 ** -2
 # Median of chi-square with three degrees of freedom.
 MEDIAN_CHI2_3 = 2.366
 
@@ -93,16 +99,16 @@ class MapEstimator:
     FIRST_FIT = 4
     # A linearisation moves again when its second-order error exceeds this share of the sigma.
     NONLINEARITY = 0.1
-    # It may move once the store has grown by this share, which bounds the mean cost per epoch.
+    # It may move once the store has grown by this share, which bounds the mean cost per epoch; far
+    # from the point, which does not last, sooner.
     GROWTH = 0.125
-    MAX_ITERATIONS = 4
+    FAR, GROWTH_FAR = 1.0, 0.015
+    MAX_ITERATIONS = 8
     # The share of the excess noise is judged when the store has grown by this share, tried at
     # steps of this factor, and moved when the log likelihood gains this much.
     TUNE_FROM, TUNE_GROWTH, TUNE_STEP, TUNE_GAIN = 12, 0.5, 3.0, 1.0
     MIN_EXCESS, MAX_EXCESS = 0.01, 9.0
     MAX_REJECTED = 0.3
-    # Epochs from which the signs of the sensors are judged.
-    EVIDENCE_EPOCHS = 150
     # Innovations whose median scales the gate, so that noise beyond what is stated does not
     # turn the good epochs into outliers.
     GATE_WINDOW = 25
@@ -118,6 +124,7 @@ class MapEstimator:
         wanted[DELAY] = estimate_delay
         wanted[GYRO_SCALE] = estimate_gyro_scale
         self._columns = np.flatnonzero(wanted)
+        self._weak = WEAK_INFORMATION[self._columns]
         self._size = 9 if use_position else 6
         self._prior = prior
         self._capacity = capacity
@@ -129,6 +136,7 @@ class MapEstimator:
         self.solution: Solution | None = None
         self._last_fit = self._last_tuned = 0
         self.fits = 0
+        self._nonlinearity = 0.0
         self.excess = excess
         self._recent: deque[float] = deque(maxlen=self.GATE_WINDOW)
         self._gate_scale = 1.0
@@ -175,15 +183,19 @@ class MapEstimator:
                 self._fit()
             return nis
         s = self.solution
-        nis = self._extend(s, slice(k, k + 1), (s.dx, s.P))
+        # Far from the linearisation point an innovation says nothing about its measurement.
+        nis = self._extend(s, slice(k, k + 1),
+                           (s.dx, s.P) if self._nonlinearity <= self.FAR else None)
         self._recent.extend(nis[np.isfinite(nis)])
         if len(self._recent) == self.GATE_WINDOW:
             self._gate_scale = max(1.0, float(np.median(self._recent)) / MEDIAN_CHI2_3)
         self._solve(s)
         if self.count >= max(self.TUNE_FROM, self._last_tuned * (1 + self.TUNE_GROWTH)):
             self._tune()
-        if (self.nonlinearity() > self.NONLINEARITY
-                and self.count >= self._last_fit * (1 + self.GROWTH)):
+        self._nonlinearity = self.nonlinearity()
+        growth = self.GROWTH_FAR if self._nonlinearity > self.FAR else self.GROWTH
+        if (self._nonlinearity > self.NONLINEARITY
+                and self.count >= self._last_fit * (1 + growth)):
             self._fit()
         return nis
 
@@ -222,7 +234,7 @@ class MapEstimator:
         """Solve the normal equations and judge the fit."""
         information = s.information + s.whitener.normal[1:, 1:]
         right = s.whitener.normal[1:, 0] + s.information @ s.mean_step
-        information[ATTITUDE, ATTITUDE] += np.eye(3) / UNIFORM_ANGLE_STD ** 2
+        information[range(self._columns.size), range(self._columns.size)] += self._weak
         s.P = inverse_spd(information)
         s.dx = s.P @ right
         column = s.P[:, 2]
@@ -275,6 +287,7 @@ class MapEstimator:
             starts.append(replace(starts[0] if starts else self._prior.mean, C=rough))
         solutions = [self._converge(start, gate) for start in starts]
         self.solution = min(solutions, key=lambda s: s.chi2)
+        self._nonlinearity = self.nonlinearity()
 
     def _tune(self) -> None:
         """
@@ -349,7 +362,7 @@ class MapEstimator:
 
     def sign_evidence(self, prior: Prior) -> dict[tuple[int, int], float]:
         """
-        Fit the latest epochs afresh with the signs of gyros and accelerometers as they are or not.
+        Fit the stored epochs afresh with the signs of gyros and accelerometers as they are or not.
 
         A wrong sign, or one wrong axis (which is all three wrong in a body frame turned half
         around), fits as well as the right ones until the vehicle has turned.
@@ -366,7 +379,7 @@ class MapEstimator:
             usual for (1, 1).
 
         """
-        epochs = slice(max(0, self.count - self.EVIDENCE_EPOCHS), self.count)
+        epochs = slice(0, self.count)
         raw = self._corrected(epochs, prior.mean)
         gnss = self._gnss.take(epochs)
         chi2 = {}
@@ -503,6 +516,11 @@ class MapEstimator:
             T[3 * block:3 * block + 3, 3 * block:3 * block + 3] = C_n0n.T
         joint = scale * T @ joint @ T.T
         heading_free = not math.sqrt(joint[2, 2]) < HEADING_RESOLVED_STD
+        if heading_free:
+            # The gyros cannot tell their biases from the Earth's rate seen under a heading that
+            # may be anything; the linear picture knows the tangent of that circle only.
+            gyro_bias = slice(9 + GYRO_BIAS.start, 9 + GYRO_BIAS.stop)
+            joint[gyro_bias, gyro_bias] += EARTH_RATE ** 2 * np.eye(3)
         # Places of what is kept in the joint covariance, and in the vector of unknowns.
         kept = np.flatnonzero(np.isin(self._columns, BODY_FIXED))
         if heading_free:

@@ -33,9 +33,13 @@ from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_B
 from ins_align.whitening import Measurements
 import numpy as np
 
-# The signs of the sensors are judged again when the data have grown by this share; they are
-# confirmed when every other choice of signs has so much more chi-square.
-EVIDENCE_GROWTH = 0.05
+# After t0 has moved, the fit so far counts like this many rows.
+PAST_DOF = 300
+# The signs of the sensors are judged again when the data have grown by the first share, and by
+# the second beyond so many epochs; they are confirmed when every other choice of signs has so much
+# more chi-square.
+EVIDENCE_GROWTH = 0.05, 0.5
+EVIDENCE_SOON = 200
 EVIDENCE_GAIN = 12.0
 WRONG_SIGNS = {
     (1, -1): 'the accelerations reversed (sign of gravity instead of specific force?)',
@@ -183,6 +187,7 @@ class MapMethod:
         self._next_evidence = 0.0
         self._offered = 0
         self._rejected = [0, 0]
+        self._past = 0.0, 0
         self._start(epoch, prior)
         self._nis = math.nan
         self._add(epoch, imu)
@@ -231,6 +236,7 @@ class MapMethod:
         prior = self._estimator.handover(track.C_n0n, -track.s_v(np.zeros(3)), -track.s_p,
                                          fit.factor ** 2)
         self._rejected = [fit.rejected_velocity, fit.rejected_position]
+        self._past = PAST_DOF * fit.chi2 / max(fit.dof, 1), PAST_DOF
         self.moved += 1
         start = replace(self._last_epoch, v_n=None, position_measured=False)
         self._start(start, prior, self._estimator.excess)
@@ -259,7 +265,8 @@ class MapMethod:
         if solution is None:
             return Fit(math.nan, 0, math.nan, False, 0, 0, self._offered)
         rejected = solution.whitener.rejected
-        return Fit(solution.chi2, solution.dof, self._nis,
+        past_chi2, past_dof = self._past
+        return Fit(past_chi2 + solution.chi2, past_dof + solution.dof, self._nis,
                    self._estimator.nonlinearity() <= self._estimator.NONLINEARITY,
                    self._rejected[0] + rejected[0], self._rejected[1] + rejected[1],
                    self._offered)
@@ -271,7 +278,8 @@ class MapMethod:
     def unconfirmed(self) -> str:
         """Return why the data do not show yet that the sensors' signs are right, or nothing."""
         if self._offered >= self._next_evidence and self._doubt:
-            self._next_evidence = self._offered * (1 + EVIDENCE_GROWTH)
+            growth = EVIDENCE_GROWTH[self._offered > EVIDENCE_SOON]
+            self._next_evidence = self._offered * (1 + growth)
             chi2 = self._estimator.sign_evidence(self._first_prior)
             right = chi2.pop((1, 1))
             rival = min(chi2, key=chi2.__getitem__)
