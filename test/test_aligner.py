@@ -1,0 +1,422 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The aligner as a whole: states, faults of messages, outputs, wrong set-ups."""
+
+from alignment import aligned, config_for, error_deg, error_of, normalised_error, simulated
+from ins_align.aligner import Aligner
+from ins_align.config import Config, ConfigError
+from ins_align.declaration import State
+from ins_align.rotation import matrix_from_quaternion, roll_pitch_yaw
+from ins_align.simulation import feed
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope='module')
+def flight():
+    """A MEMS flight of 30 s."""
+    return simulated('flight', imu_grade='mems', duration=30.0, seed=1)
+
+
+@pytest.fixture(scope='module')
+def result(flight):
+    return aligned(flight)
+
+
+def feed_part(aligner, s, start=0.0, end=1e9):
+    """Feed what arrives between two times, in seconds of the recording."""
+    origin = int(s.imu_stamps_ns[0])
+    epochs = []
+    for kind, payload in s.messages():
+        stamp = int(payload[0][-1]) if kind == 'imu' else payload.stamp_ns
+        if not start <= (stamp - origin) * 1e-9 < end:
+            continue
+        if kind == 'imu':
+            aligner.add_imu(*payload)
+            epochs += aligner.update()
+        elif kind == 'fix':
+            aligner.add_fix(payload)
+        else:
+            aligner.add_velocity(payload)
+    return epochs
+
+
+def give_all(aligner, s, used=slice(None), force_scale=1.0):
+    """Feed a whole recording at once, GNSS first so that nothing of it is late."""
+    for k in range(len(s.gnss_stamps_ns)):
+        aligner.add_fix(s.fix(k))
+        aligner.add_velocity(s.velocity_measurement(k))
+    aligner.add_imu(s.imu_stamps_ns[used], s.gyro[used], force_scale * s.accel[used])
+    return aligner.flush()
+
+
+# The way through the states
+
+def test_states_in_their_order(flight):
+    aligner = Aligner(config_for(flight))
+    status = aligner.status()
+    assert status.state is State.WAITING_FOR_IMU and 'IMU' in status.reason
+    assert status.initial is None and status.t0_ns is None
+    for stamp, gyro, accel in zip(flight.imu_stamps_ns[:20].tolist(), flight.gyro, flight.accel):
+        aligner.add_imu(stamp, gyro, accel)
+    aligner.update()
+    aligner.flush()
+    assert aligner.status().state is State.WAITING_FOR_GNSS
+    aligner = Aligner(config_for(flight))
+    states = [epoch.state for epoch in feed(aligner, flight)]
+    order = [state for k, state in enumerate(states) if k == 0 or state is not states[k - 1]]
+    assert order[0] is State.ALIGNING and order[-1] is State.ALIGNED
+    words = aligner.take_events()
+    assert any(word.startswith('ALIGNED: aligned: heading sigma') for word in words)
+    assert aligner.take_events() == []
+
+
+def test_only_positions_wait_for_velocities_and_then_go_on(flight):
+    aligner, epochs = aligned(flight, velocity=False)
+    assert epochs[0].stamp_ns - flight.gnss_stamps_ns[0] >= 2 * SECOND
+    assert normalised_error(aligner.status().initial, flight) < chi2.ppf(0.9999, 3)
+
+
+def test_only_velocities_wait_for_a_position(flight):
+    aligner, epochs = aligned(flight, fix=False)
+    assert epochs == [] and aligner.status().state is State.WAITING_FOR_GNSS
+    assert 'position' in aligner.status().reason
+
+
+def test_wanted_velocities_are_waited_for(flight):
+    aligner, epochs = aligned(flight, velocity=False, use_velocity=True)
+    assert epochs == [] and 'velocity' in aligner.status().reason
+
+
+def test_epochs_tell_time_and_both_attitudes(flight, result):
+    aligner, epochs = result
+    assert [e.stamp_ns for e in epochs] == flight.gnss_stamps_ns.tolist()
+    assert np.allclose([e.t_s for e in epochs],
+                       (flight.gnss_stamps_ns - flight.gnss_stamps_ns[0]) * 1e-9)
+    last = epochs[-1]
+    assert last.initial.stamp_ns == flight.gnss_stamps_ns[0]
+    assert last.current.stamp_ns == last.stamp_ns
+    for attitude in (last.initial, last.current):
+        assert normalised_error(attitude, flight) < chi2.ppf(0.9999, 3)
+        assert attitude.quaternion_xyzw[3] >= 0
+        rpy = np.degrees(roll_pitch_yaw(matrix_from_quaternion(attitude.quaternion_xyzw)))
+        assert np.allclose([attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg], rpy)
+        assert np.allclose(attitude.sigma_deg,
+                           np.degrees(np.sqrt(np.diag(attitude.covariance))))
+
+
+def test_declared_attitude_is_the_initial_one_of_that_moment(flight, result):
+    aligner, epochs = result
+    first = next(e for e in epochs if e.state is State.ALIGNED)
+    assert aligner.declared.stamp_ns == flight.gnss_stamps_ns[0]
+    assert np.array_equal(aligner.declared.quaternion_xyzw, first.initial.quaternion_xyzw)
+    assert aligner.status().time_to_align_s == pytest.approx(first.t_s)
+    assert first.t_s > Config().hold_time
+
+
+def test_counts_add_up(flight, result):
+    counts = result[0].status().counts
+    assert counts['imu'] == len(flight.imu_stamps_ns)
+    assert counts['fix'] == counts['velocity'] == len(flight.gnss_stamps_ns)
+    assert counts['epochs_used'] + counts['epochs_rejected_velocity'] \
+        + counts['epochs_rejected_position'] == len(flight.gnss_stamps_ns)
+
+
+def test_attitude_now_is_carried_to_the_newest_sample(flight):
+    aligner = Aligner(config_for(flight))
+    assert aligner.attitude_now() is None
+    feed_part(aligner, flight)
+    now = aligner.attitude_now()
+    assert now.stamp_ns == flight.imu_stamps_ns[-1] > aligner.status().stamp_ns + SECOND // 2
+    assert error_deg(now, flight) < 3 * np.linalg.norm(now.sigma_deg) + 0.1
+    assert np.all(now.sigma_deg >= aligner.status().current.sigma_deg)
+    again = aligner.attitude_now()
+    assert np.array_equal(now.quaternion_xyzw, again.quaternion_xyzw)
+
+
+def test_reset_starts_over(flight):
+    aligner = Aligner(config_for(flight))
+    feed_part(aligner, flight, 0.0, 15.0)
+    assert aligner.status().initial is not None
+    aligner.reset('test')
+    status = aligner.status()
+    assert status.state is State.WAITING_FOR_IMU and status.initial is None
+    assert aligner.declared is None and status.counts['resets'] == 1
+    assert any('test' in word for word in aligner.take_events())
+    feed_part(aligner, flight, 15.0)
+    assert aligner.status().t0_ns > flight.imu_stamps_ns[0] + 14 * SECOND
+
+
+def test_thresholds_may_change_while_running_and_nothing_else(flight):
+    aligner = Aligner(config_for(flight, heading_std_threshold=1e-3))
+    feed_part(aligner, flight, 0.0, 25.0)
+    assert aligner.status().state is not State.ALIGNED
+    aligner.reconfigure(config_for(flight, heading_std_threshold=2.0))
+    feed_part(aligner, flight, 25.0)
+    assert aligner.status().state is State.ALIGNED
+    with pytest.raises(ConfigError, match='lever_arm'):
+        aligner.reconfigure(config_for(flight, lever_arm=(0.0, 0.0, 0.0)))
+
+
+def test_rejected_messages_of_an_adapter_are_counted():
+    aligner = Aligner()
+    aligner.reject('velocity_body_frame')
+    assert aligner.status().counts['velocity_body_frame'] == 1
+
+
+# Faults of messages
+
+def test_clock_set_back_starts_over(flight):
+    aligner = Aligner(config_for(flight))
+    feed_part(aligner, flight, 0.0, 20.0)
+    assert aligner.status().initial is not None
+    feed_part(aligner, flight, 0.0, 20.0)
+    status = aligner.status()
+    assert status.counts['clock_jumps'] == 1
+    assert any('clock' in word for word in aligner.take_events())
+    assert status.initial is not None and normalised_error(
+        status.initial, flight) < chi2.ppf(0.9999, 3)
+
+
+def test_silent_imu_starts_over_and_keeps_the_biases(flight):
+    aligner = Aligner(config_for(flight))
+    feed_part(aligner, flight, 0.0, 15.0)
+    before = aligner.status()
+    feed_part(aligner, flight, 18.5)
+    status = aligner.status()
+    assert status.counts['restarts'] == 1 and status.counts['imu_gap'] >= 1
+    assert status.t0_ns > before.t0_ns + 18 * SECOND
+    assert normalised_error(status.current, flight) < chi2.ppf(0.9999, 3)
+    assert np.all(status.gyro_bias_std <= 1.2 * before.gyro_bias_std)
+
+
+def test_short_gaps_of_the_imu_are_survived_and_doubted(flight):
+    keep = np.ones(len(flight.imu_stamps_ns), bool)
+    for start in range(300, 2900, 500):
+        keep[start:start + 20] = False             # 0.2 s without samples
+    whole, gappy = (Aligner(config_for(flight)) for _ in range(2))
+    for aligner, used in ((whole, np.ones_like(keep)), (gappy, keep)):
+        give_all(aligner, flight, used)
+    status = gappy.status()
+    assert status.counts['imu_gap'] >= 5 and status.counts.get('restarts', 0) == 0
+    assert normalised_error(status.current, flight) < chi2.ppf(0.9999, 3)
+    assert np.all(status.current.sigma_deg > whole.status().current.sigma_deg)
+
+
+def test_broken_messages_on_the_way_change_nothing_but_counts(flight, result):
+    aligner = Aligner(config_for(flight))
+    for k, (kind, payload) in enumerate(flight.messages()):
+        if kind == 'imu':
+            aligner.add_imu(*payload)
+            stamp = int(payload[0][-1])
+            aligner.add_imu(stamp + 1, np.full(3, np.nan), np.zeros(3))
+            aligner.add_imu(stamp, np.zeros(3), np.zeros(3))               # twice
+            aligner.update()
+        elif kind == 'fix':
+            aligner.add_fix(payload._replace(stamp_ns=payload.stamp_ns + 7, latitude_deg=np.nan))
+            aligner.add_fix(payload._replace(stamp_ns=payload.stamp_ns + 7, status=-1))
+            aligner.add_fix(payload)
+            aligner.add_fix(payload)
+        else:
+            aligner.add_velocity(payload._replace(velocity=np.full(3, np.inf)))
+            aligner.add_velocity(payload)
+            aligner.add_velocity(payload._replace(stamp_ns=payload.stamp_ns - 60 * SECOND))
+    aligner.flush()
+    clean, spoilt = result[0].status(), aligner.status()
+    assert np.array_equal(spoilt.initial.quaternion_xyzw, clean.initial.quaternion_xyzw)
+    assert np.array_equal(spoilt.initial.covariance, clean.initial.covariance)
+    for reason in ('imu_nan', 'imu_duplicate', 'fix_nan', 'fix_no_fix', 'fix_duplicate',
+                   'velocity_nan', 'velocity_late'):
+        assert spoilt.counts[reason] > 100, reason
+
+
+def test_covariances_of_any_size_break_nothing(flight):
+    sizes = (1e-12, 1e-4, 1.0, 1e12)
+    aligner = Aligner(config_for(flight, use_position=True))
+    for k, (kind, payload) in enumerate(flight.messages()):
+        if kind == 'imu':
+            aligner.add_imu(*payload)
+            aligner.update()
+        elif kind == 'fix':
+            aligner.add_fix(payload._replace(covariance=sizes[k % 4] * np.eye(3)))
+        else:
+            aligner.add_velocity(payload._replace(covariance=sizes[-k % 4] * np.eye(3)))
+    aligner.flush()
+    initial = aligner.status().initial
+    assert np.all(np.isfinite(initial.quaternion_xyzw))
+    assert np.all(np.linalg.eigvalsh(initial.covariance) > 0)
+
+
+def test_position_that_jumps_for_good_starts_over(flight):
+    aligner = Aligner(config_for(flight))
+    feed_part(aligner, flight, 0.0, 10.0)
+    for kind, payload in flight.messages():
+        stamp = int(payload[0][0]) if kind == 'imu' else payload.stamp_ns
+        if stamp < flight.imu_stamps_ns[0] + 10 * SECOND:
+            continue
+        if kind == 'imu':
+            aligner.add_imu(*payload)
+            aligner.update()
+        elif kind == 'fix':
+            aligner.add_fix(payload._replace(latitude_deg=payload.latitude_deg + 1.0))
+        else:
+            aligner.add_velocity(payload)
+    assert aligner.status().counts['restarts'] == 1
+    assert aligner.status().counts['fix_jump'] >= 5
+
+
+def test_single_wild_fix_is_not_believed(flight):
+    aligner = Aligner(config_for(flight))
+    for k, (kind, payload) in enumerate(flight.messages()):
+        if kind == 'imu':
+            aligner.add_imu(*payload)
+            aligner.update()
+        elif kind == 'fix':
+            wild = k % 50 == 1 and k > 3
+            aligner.add_fix(payload._replace(longitude_deg=-60.0) if wild else payload)
+        else:
+            aligner.add_velocity(payload)
+    aligner.flush()
+    status = aligner.status()
+    assert status.counts['fix_jump'] >= 2 and status.counts.get('restarts', 0) == 0
+    assert normalised_error(status.initial, flight) < chi2.ppf(0.9999, 3)
+
+
+def test_vertical_velocity_that_is_absent_is_not_believed():
+    s = simulated('car', imu_grade='mems', duration=40.0, seed=3)
+    aligner = Aligner(config_for(s, velocity_vertical='absent'))
+    for kind, payload in s.messages():
+        if kind == 'imu':
+            aligner.add_imu(*payload)
+            aligner.update()
+        elif kind == 'fix':
+            aligner.add_fix(payload)
+        else:
+            flat = payload.velocity * [1.0, 1.0, 0.0]
+            aligner.add_velocity(payload._replace(velocity=flat))
+    aligner.flush()
+    assert normalised_error(aligner.status().initial, s) < chi2.ppf(0.9999, 3)
+
+
+def test_memory_is_bounded_without_gnss(flight):
+    aligner = Aligner(config_for(flight))
+    chunk = 1000
+    for k in range(60):
+        stamps = np.arange(k * chunk, (k + 1) * chunk, dtype=np.int64) * 5_000_000
+        aligner.add_imu(stamps, np.zeros((chunk, 3)), np.tile([0.0, 0.0, 9.8], (chunk, 1)))
+        aligner.update()
+    assert aligner._imu.stamps.size < 3 * chunk
+    assert aligner.status().state is State.WAITING_FOR_GNSS
+
+
+def test_memory_is_bounded_when_gnss_stays_away(flight):
+    aligner = Aligner(config_for(flight))
+    feed_part(aligner, flight, 0.0, 10.0)
+    last = int(flight.imu_stamps_ns[-1])
+    chunk = 1000
+    for k in range(60):
+        stamps = last + np.arange(k * chunk + 1, (k + 1) * chunk + 1, dtype=np.int64) * 10_000_000
+        aligner.add_imu(stamps, np.zeros((chunk, 3)), np.tile([0.0, 0.0, 9.8], (chunk, 1)))
+        aligner.update()
+    assert aligner._imu.stamps.size < 3 * chunk
+    current = aligner.status().current
+    assert current is None or np.all(np.isfinite(current.covariance))
+
+
+# Wrong set-ups
+
+def turning_car(seed, **options):
+    return simulated('car', imu_grade='mems', duration=40.0, seed=seed, **options)
+
+
+def test_accelerations_in_g_are_a_fault():
+    s = turning_car(1)
+    aligner = Aligner(config_for(s))
+    states = [epoch.state for epoch in give_all(aligner, s, force_scale=1 / 9.80665)]
+    assert states[-1] is State.FAULT and State.ALIGNED not in states
+    assert 'm/s^2' in aligner.status().reason
+    assert aligner.declared is None
+
+
+def test_velocity_in_the_other_frame_is_a_fault_with_the_cure():
+    s = turning_car(2, velocity_frame='ned')
+    aligner, epochs = aligned(s)
+    assert State.ALIGNED not in [e.state for e in epochs]
+    assert aligner.status().state is State.FAULT
+    assert 'velocity_frame' in aligner.status().reason
+
+
+WRONG = {
+    'y axis reversed': ({'flip_axis': 'y'}, {}),
+    'x axis reversed': ({'flip_axis': 'x'}, {}),
+    'z axis reversed': ({'flip_axis': 'z'}, {}),
+    'gravity for force': ({'accel_sign': -1}, {}),
+    'NED for ENU': ({'velocity_frame': 'ned'}, {}),
+    'lever arm left out': ({'lever_arm': (1.5, -1.0, 1.0)}, {'lever_arm': (0.0, 0.0, 0.0)}),
+    'delay left out': ({'gnss_delay': 0.2}, {'gnss_delay': 0.0}),
+}
+
+
+@pytest.mark.parametrize('scenario', ('flight', 'car'))
+@pytest.mark.parametrize('wrong', WRONG)
+def test_wrong_set_up_is_never_declared_wrong(wrong, scenario):
+    """The default configuration: what is declared is right, or nothing is."""
+    options, changes = WRONG[wrong]
+    for seed in range(2):
+        s = simulated(scenario, imu_grade='mems', duration=30.0, seed=seed, gnss_rate=4.0,
+                      **options)
+        defaults = {'lever_arm_std': Config().lever_arm_std,
+                    'gnss_delay_std': Config().gnss_delay_std}
+        _, epochs = aligned(s, **{**defaults, **changes})
+        for epoch in epochs:
+            if epoch.state is State.ALIGNED:
+                error = np.degrees(error_of(epoch.initial, s))
+                assert np.all(np.abs(error) < 5 * epoch.initial.sigma_deg), (seed, epoch.t_s)
+
+
+@pytest.mark.parametrize('scenario', ('static', 'straight'))
+def test_mems_that_holds_its_course_never_declares_a_heading(scenario):
+    s = simulated(scenario, imu_grade='mems', duration=120.0, seed=2, gnss_rate=2.0, imu_rate=50.0)
+    aligner, epochs = aligned(s)
+    states = {e.state for e in epochs}
+    assert State.ALIGNED not in states and State.LEVELLED in states
+    assert 'turn or change speed' in aligner.status().reason
+
+
+@pytest.mark.parametrize('grade', ('navigation', 'tactical', 'mems'))
+@pytest.mark.parametrize('scenario', ('flight', 'car', 'hover', 'launch', 'reverse'))
+def test_whatever_is_declared_is_right(scenario, grade):
+    s = simulated(scenario, imu_grade=grade, duration=30.0, seed=11, outlier_rate=0.02,
+                  gnss_latency=0.2)
+    aligner, epochs = aligned(s)
+    for epoch in epochs:
+        if epoch.state is State.ALIGNED:
+            error = np.degrees(error_of(epoch.initial, s))
+            assert np.all(np.abs(error) < 5 * epoch.initial.sigma_deg)
+    if scenario in ('flight', 'launch'):
+        assert epochs[-1].state is State.ALIGNED
+
+
+def test_standing_first_neither_spoils_nor_delays():
+    late = simulated('car', imu_grade='mems', duration=75.0, seed=4, stand_still=40.0)
+    once = simulated('car', imu_grade='mems', duration=40.0, seed=4)
+
+    def time_to_align(s):
+        _, epochs = aligned(s)
+        return next(e.t_s for e in epochs if e.state is State.ALIGNED)
+
+    assert time_to_align(late) - 40.0 < 1.2 * time_to_align(once)

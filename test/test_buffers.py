@@ -1,0 +1,225 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What arrives late, twice, out of order or broken is put in order or counted."""
+
+from collections import Counter
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from ins_align.buffers import GnssBuffer, ImuBuffer
+from ins_align.messages import Fix, Velocity
+import numpy as np
+import pytest
+
+MS = 1_000_000
+LATENESS = 1000 * MS
+
+
+def imu_buffer():
+    counts = Counter()
+    return ImuBuffer(LATENESS, counts), counts
+
+
+def gnss_buffer():
+    counts = Counter()
+    return GnssBuffer(LATENESS, counts), counts
+
+
+def sample_of(stamp):
+    """Values that tell their stamp."""
+    return np.full(3, stamp * 1e-12), np.full(3, -stamp * 1e-12)
+
+
+def fill(buffer, stamps):
+    for stamp in stamps:
+        buffer.add(stamp, *sample_of(stamp))
+    buffer.consolidate()
+
+
+def held(buffer):
+    """Stamps that are held, each with its own values."""
+    assert np.allclose(buffer.samples[:, 0], buffer.stamps * 1e-12)
+    assert np.allclose(buffer.samples[:, 3], -buffer.stamps * 1e-12)
+    return buffer.stamps.tolist()
+
+
+def test_samples_in_order_stay_as_they_are():
+    buffer, counts = imu_buffer()
+    fill(buffer, range(0, 100 * MS, 10 * MS))
+    assert held(buffer) == list(range(0, 100 * MS, 10 * MS))
+    assert counts['imu'] == 10 and buffer.newest_ns == 90 * MS
+
+
+def test_samples_out_of_order_are_sorted_and_duplicates_dropped():
+    buffer, counts = imu_buffer()
+    fill(buffer, [0, 20 * MS, 10 * MS, 10 * MS, 30 * MS, 20 * MS])
+    assert held(buffer) == [0, 10 * MS, 20 * MS, 30 * MS]
+    assert counts['imu_duplicate'] == 2
+    assert counts['imu_out_of_order'] >= 2
+    fill(buffer, [25 * MS, 40 * MS, 30 * MS])
+    assert held(buffer) == [0, 10 * MS, 20 * MS, 25 * MS, 30 * MS, 40 * MS]
+
+
+@pytest.mark.parametrize('value', (np.nan, np.inf, -np.inf, 1e30))
+@pytest.mark.parametrize('column', range(6))
+def test_broken_values_are_dropped_and_counted(value, column):
+    buffer, counts = imu_buffer()
+    sample = np.zeros(6)
+    sample[column] = value
+    buffer.add(0, np.zeros(3), np.zeros(3))
+    buffer.add(10 * MS, sample[:3], sample[3:])
+    buffer.add(20 * MS, np.zeros(3), np.zeros(3))
+    buffer.consolidate()
+    assert buffer.stamps.tolist() == [0, 20 * MS]
+    assert counts['imu_nan'] == 1 and counts['imu'] == 3
+
+
+def test_sample_later_than_allowed_is_counted_and_dropped():
+    buffer, counts = imu_buffer()
+    fill(buffer, [0, 2000 * MS, 10 * MS, 2010 * MS])
+    assert held(buffer) == [0, 2000 * MS, 2010 * MS]
+    assert counts['imu_late'] == 1 and buffer.jumped_to_ns is None
+
+
+def test_sample_before_what_is_used_up_is_late():
+    buffer, counts = imu_buffer()
+    fill(buffer, [0, 100 * MS, 200 * MS])
+    buffer.used_ns = 150 * MS
+    fill(buffer, [120 * MS, 300 * MS])
+    assert held(buffer) == [0, 100 * MS, 200 * MS, 300 * MS]
+    assert counts['imu_late'] == 1
+
+
+def test_clock_set_back_is_told_from_a_single_late_sample():
+    buffer, counts = imu_buffer()
+    fill(buffer, [5000 * MS, 10 * MS])
+    assert buffer.jumped_to_ns is None
+    buffer.add(20 * MS, *sample_of(20 * MS))
+    assert buffer.jumped_to_ns == 20 * MS
+
+
+def test_two_strays_far_apart_are_not_a_clock():
+    buffer, _ = imu_buffer()
+    fill(buffer, [5000 * MS, 10 * MS, 2000 * MS])
+    assert buffer.jumped_to_ns is None
+
+
+def test_forgetting_keeps_what_interpolation_needs():
+    buffer, _ = imu_buffer()
+    fill(buffer, range(0, 1000 * MS, 10 * MS))
+    buffer.forget_before(505 * MS)
+    kept = held(buffer)
+    assert kept[-1] == 990 * MS and kept[0] in (480 * MS, 490 * MS) and 500 * MS in kept
+    buffer.forget_before(0)
+    assert held(buffer) == kept
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.integers(0, 60), min_size=1, max_size=40), st.data())
+def test_arrays_are_the_same_as_one_by_one(numbers, data):
+    stamps = np.array(numbers, np.int64) * 50 * MS          # up to 3 s: late ones among them
+    one, counts_one = imu_buffer()
+    many, counts_many = imu_buffer()
+    for stamp in stamps.tolist():
+        if one.jumped_to_ns is None:
+            one.add(stamp, *sample_of(stamp))
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(numbers)), max_size=4)))
+    for part in np.split(stamps, cuts):
+        if many.jumped_to_ns is None:
+            values = np.repeat(part[:, None] * 1e-12, 3, axis=1)
+            many.add_many(part, values, -values)
+        many.consolidate()
+    one.consolidate()
+    assert one.jumped_to_ns == many.jumped_to_ns
+    assert held(one) == held(many)
+    assert one.newest_ns == many.newest_ns
+    assert +counts_one == +counts_many
+
+
+# GNSS
+
+def fix(stamp=0, **changes):
+    return Fix(stamp, 48.0, 11.0, 300.0, None, 0)._replace(**changes)
+
+
+def velocity(stamp=0, v=(1.0, 2.0, 3.0)):
+    return Velocity(stamp, np.array(v), None)
+
+
+def test_fix_and_velocity_of_one_stamp_are_one_epoch():
+    buffer, counts = gnss_buffer()
+    buffer.add_velocity(velocity(20), None)
+    buffer.add_fix(fix(20), None)
+    buffer.add_fix(fix(10), None)
+    first, second = buffer.release(20)
+    assert (first.stamp_ns, first.velocity) == (10, None) and first.fix is not None
+    assert second.fix is not None and second.velocity is not None
+    assert buffer.release(100) == [] and counts['fix'] == 2 and counts['velocity'] == 1
+
+
+def test_epochs_are_released_in_order_up_to_a_stamp():
+    buffer, _ = gnss_buffer()
+    for stamp in (50, 10, 40, 20, 30):
+        buffer.add_fix(fix(stamp), None)
+    assert [e.stamp_ns for e in buffer.release(30)] == [10, 20, 30]
+    assert [e.stamp_ns for e in buffer.release(99)] == [40, 50]
+
+
+@pytest.mark.parametrize('changes, reason', [
+    ({'latitude_deg': np.nan}, 'fix_nan'), ({'longitude_deg': np.inf}, 'fix_nan'),
+    ({'altitude_m': np.nan}, 'fix_nan'), ({'latitude_deg': 91.0}, 'fix_nan'),
+    ({'longitude_deg': 1e6}, 'fix_nan'), ({'altitude_m': -1e9}, 'fix_nan'),
+    ({'status': -1}, 'fix_no_fix'), ({'latitude_deg': 0.0, 'longitude_deg': 0.0}, 'fix_no_fix')])
+def test_fixes_that_are_none_are_counted_by_reason(changes, reason):
+    buffer, counts = gnss_buffer()
+    buffer.add_fix(fix(5, **changes), None)
+    assert buffer.release(10) == [] and counts[reason] == 1
+
+
+def test_broken_velocities_are_counted():
+    buffer, counts = gnss_buffer()
+    for v in ((np.nan, 0, 0), (0, np.inf, 0), (0, 0, 1e9)):
+        buffer.add_velocity(velocity(5, v), None)
+    assert buffer.release(10) == [] and counts['velocity_nan'] == 3
+
+
+def test_duplicates_are_counted_and_the_first_is_kept():
+    buffer, counts = gnss_buffer()
+    buffer.add_fix(fix(5, altitude_m=1.0), None)
+    buffer.add_fix(fix(5, altitude_m=2.0), None)
+    buffer.add_velocity(velocity(5, (1.0, 0, 0)), None)
+    buffer.add_velocity(velocity(5, (2.0, 0, 0)), None)
+    epoch, = buffer.release(10)
+    assert epoch.fix.altitude_m == 1.0 and epoch.velocity.velocity[0] == 1.0
+    assert counts['fix_duplicate'] == 1 and counts['velocity_duplicate'] == 1
+
+
+def test_messages_too_late_or_of_another_clock_are_counted():
+    buffer, counts = gnss_buffer()
+    newest = 100_000 * MS
+    buffer.add_fix(fix(newest - LATENESS - 1), newest)
+    buffer.add_velocity(velocity(newest - LATENESS - 1), newest)
+    buffer.add_fix(fix(newest + 3_600_000 * MS), newest)
+    assert counts['fix_late'] == 1 and counts['velocity_late'] == 1 and counts['fix_ahead'] == 1
+    buffer.add_fix(fix(newest - LATENESS), newest)
+    assert len(buffer.release(newest)) == 1
+
+
+def test_gnss_without_imu_is_bounded():
+    buffer, counts = gnss_buffer()
+    for k in range(12_000):
+        buffer.add_velocity(velocity(k), None)
+    assert counts['gnss_overflow'] == 2_000
+    released = buffer.release(12_000)
+    assert len(released) == 10_000 and released[-1].stamp_ns == 11_999
