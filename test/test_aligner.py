@@ -28,7 +28,7 @@ SECOND = 1_000_000_000
 
 @pytest.fixture(scope='module')
 def flight():
-    """A MEMS flight of 30 s."""
+    """Simulate a MEMS flight of 30 s."""
     return simulated('flight', imu_grade='mems', duration=30.0, seed=1)
 
 

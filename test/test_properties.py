@@ -28,7 +28,7 @@ SHORT = {'imu_grade': 'mems', 'duration': 8.0, 'seed': 3, 'gnss_rate': 4.0}
 
 @pytest.fixture(scope='module')
 def reference():
-    """A short flight and the epochs of one aligner that got it in order."""
+    """Align a short flight in order."""
     s = simulated('flight', **SHORT)
     aligner = Aligner(config_for(s))
     return s, numbers(feed(aligner, s)), aligner.status()

@@ -27,9 +27,11 @@ ZERO = np.zeros(3)
 
 def some_unknowns(seed=0):
     r = np.random.default_rng(seed)
-    return Unknowns(exp_so3(r.standard_normal(3)), 1e-3 * r.standard_normal(3),
-                    0.01 * r.standard_normal(3), 1e-2 * r.standard_normal(3), r.standard_normal(3), r.standard_normal(3),
-                    r.standard_normal(3), 0.03)
+    return Unknowns(C=exp_so3(r.standard_normal(3)), gyro_bias=1e-3 * r.standard_normal(3),
+                    gyro_scale=0.01 * r.standard_normal(3),
+                    accel_bias=0.01 * r.standard_normal(3),
+                    start_velocity=r.standard_normal(3), start_position=r.standard_normal(3),
+                    lever_b=r.standard_normal(3), delay=0.03)
 
 
 def some_intervals(count=5, seed=0):

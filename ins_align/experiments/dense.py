@@ -32,7 +32,7 @@ from ins_align.config import ImuNoise
 from ins_align.messages import ENU_FROM_NED
 from ins_align.rotation import Array, skew
 from ins_align.simulation import Simulation
-from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO, GYRO_BIAS, GYRO_SCALE,
+from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO, GYRO_BIAS, GYRO_SCALE, Index,
                                 LEVER_ARM, SIZE, START_POSITION, START_VELOCITY)
 import numpy as np
 
@@ -73,8 +73,8 @@ class DenseSolution:
     C : ndarray, shape (3, 3)
         ``C_nb(t0)``.
     unknowns : ndarray, shape (22,)
-        Sensor errors, start, lever arm, delay in their places, the first three zero. The start is that
-        of the IMU with respect to inertial space.
+        Sensor errors, start, lever arm, delay in their places, the first three zero. The start is
+        that of the IMU with respect to inertial space.
     covariance : ndarray, shape (22, 22)
         Zero where something is not estimated.
     chi2 : float
@@ -436,7 +436,7 @@ def _noise_covariance(path: _Path, noise: ImuNoise, measurement: Array) -> Array
     return V
 
 
-def _attitude_error_now(path: _Path, noise: ImuNoise, V: Array, rows: Array, y: Array, H: Array,
+def _attitude_error_now(path: _Path, noise: ImuNoise, V: Array, rows: Index, y: Array, H: Array,
                         dx: Array) -> tuple[Array, Array]:
     """
     Predict the random-walk error of the attitude at the last epoch.
@@ -459,13 +459,13 @@ def _attitude_error_now(path: _Path, noise: ImuNoise, V: Array, rows: Array, y: 
     return cross @ solved[:, 0] - E[:, :n] @ dx, E
 
 
-def _rows(epochs: int, use_velocity: bool, use_position: bool) -> Array:
+def _rows(epochs: int, use_velocity: bool, use_position: bool) -> Index:
     """Numbers of the rows that are used, in the order of time."""
     return np.flatnonzero(np.tile(np.repeat([use_velocity, use_position], 3), epochs))
 
 
 def _prior(noise: ImuNoise, use_position: bool, lever_arm_std: float,
-           delay_std: float) -> tuple[Array, Array]:
+           delay_std: float) -> tuple[Index, Array]:
     """Numbers of the unknowns that are estimated, and the prior's information about each."""
     std = np.zeros(SIZE)
     std[ATTITUDE] = _ATTITUDE_STD
