@@ -103,5 +103,3 @@ def check_imu(listener, flight, time_to_align_s):
     # Honest must not mean vague.
     assert sigmas.max() < 1.0
     assert sigmas[-1].max() < 0.3
-
-

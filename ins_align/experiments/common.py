@@ -54,6 +54,8 @@ def parallel(function: Callable[[Any], Any], tasks: Sequence[Any],
         By default one a processor; 1 stays in this process.
     name : str, optional
         Shown with the progress on a terminal.
+    apart : bool
+        A process of its own even for one job.
 
     """
     jobs = min(jobs or os.cpu_count() or 1, max(len(tasks), 1))

@@ -206,6 +206,7 @@ def remarks_of(duration: float) -> tuple[Array, Array, Array, Array, Array]:
     time, remainder, limit, term, integral : ndarray, shape (N,)
         Seconds; m/s: what the short form leaves out, its limit, the lever-arm term, the integral
         of the specific force.
+
     """
     truth = simulate('flight', ideal=True, duration=duration, gnss_rate=1.0)
     time = (truth.truth_stamps_ns - truth.truth_stamps_ns[0]) * 1e-9

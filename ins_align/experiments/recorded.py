@@ -144,10 +144,12 @@ def run_window(path: Path, start_s: float, duration: float, **told: Any) -> Wind
     Parameters
     ----------
     path : Path
+        The recording.
     start_s, duration : float
         Seconds from the first IMU sample.
     **told
         Parameters of `Config`.
+
     """
     recording = load(path)
     if recording.name in KNOWN_LEVER_ARMS:
