@@ -48,14 +48,14 @@ JsonDict = dict[str, Any]
 
 
 def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
-    """Run all three parts; `runs` is that of the first, the others have a tenth of it."""
+    """Run all three parts; `runs` is that of the first, the others have a part of it."""
     runs = runs or 1000
-    few = max(runs // 10, 1)
+    few, fewer = max(runs // 10, 1), max(runs // 50, 1)
     report = Report('declare', 'Declared means right', out)
     trials = parallel(run_trial, [trial(index) for index in range(runs)], jobs, 'faults')
     offenders = confusion(report, trials)
     silent = parallel(run_silent, [(scenario, SILENT_SEED + seed) for scenario, seed in
-                                   itertools.product(('straight', 'static'), range(few))],
+                                   itertools.product(('straight', 'static'), range(fewer))],
                       jobs, 'silence')
     silent_table(report, silent)
     waits = time_to_heading(few, jobs)
