@@ -274,7 +274,7 @@ class Aligner:
         upto_ns = min(upto_ns, int(self._imu.stamps[-2]))
         done = []
         for message in self._gnss.release(upto_ns):
-            done.extend(self._dry_epochs(message.stamp_ns))
+            self._dry_epochs(message.stamp_ns)
             epoch = self._take(message)
             if epoch is not None:
                 done.append(epoch)
@@ -285,15 +285,11 @@ class Aligner:
                 self._set_verdict(Verdict(State.WAITING_FOR_GNSS, 'no GNSS position yet'))
         return done
 
-    def _dry_epochs(self, upto_ns: int) -> list[Epoch]:
+    def _dry_epochs(self, upto_ns: int) -> None:
         """Go on without GNSS up to a stamp in steps of bounded length."""
-        done = []
         while (self._method is not None and self._last_ns is not None
                and upto_ns - self._last_ns > DRY_INTERVAL_NS):
-            epoch = self._take(GnssEpoch(self._last_ns + DRY_INTERVAL_NS))
-            if epoch is not None:
-                done.append(epoch)
-        return done
+            self._take(GnssEpoch(self._last_ns + DRY_INTERVAL_NS))
 
     def _take(self, message: GnssEpoch) -> Epoch | None:
         """Process one epoch."""
@@ -469,6 +465,9 @@ class Aligner:
         assert method is not None and self._first_t0_ns is not None
         time_s = (stamp_ns - self._first_t0_ns) * 1e-9
         fit = method.fit()
+        if not fit.converged:
+            method.settle()
+            fit = method.fit()
         initial, current = method.initial(), method.current()
         self._now = None
         if initial is None or current is None:

@@ -95,8 +95,7 @@ class Config:
     use_velocity: str | bool = _parameter(
         'auto', 'align with GNSS velocities; auto: when they arrive', choices=AUTO_OR_BOOL)
     use_position: str | bool = _parameter(
-        'auto', 'align with GNSS positions; auto: when no velocity arrives or when their '
-        'covariance is of centimetre grade', choices=AUTO_OR_BOOL)
+        'auto', 'align with GNSS positions; auto: when no velocity arrives', choices=AUTO_OR_BOOL)
     velocity_type: str = _parameter(
         'TwistWithCovarianceStamped', 'message type of the velocity topic',
         choices=('TwistWithCovarianceStamped', 'TwistStamped', 'Odometry'))

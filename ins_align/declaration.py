@@ -143,6 +143,9 @@ class Declaration:
         if heading > config.heading_std_threshold:
             return Verdict(state, f'heading sigma {heading:.2g} deg, needs '
                                   f'{config.heading_std_threshold:g}: turn or change speed')
+        if not fit.converged:
+            return Verdict(state, f'heading sigma {heading:.2g} deg is good enough: the estimate '
+                                  'is still settling')
         return Verdict(state, f'heading sigma {heading:.2g} deg is good enough: it has to hold '
                               f'for {config.hold_time:g} s')
 

@@ -109,6 +109,8 @@ class MapEstimator:
     TUNE_FROM, TUNE_GROWTH, TUNE_STEP, TUNE_GAIN = 12, 0.5, 3.0, 1.0
     MIN_EXCESS, MAX_EXCESS = 0.01, 9.0
     MAX_REJECTED = 0.3
+    # Idle: for this long (s) no heading to within this (rad), though the velocity is known (m/s).
+    IDLE_TIME, IDLE_HEADING_STD, IDLE_VELOCITY_STD = 5.0, 1.2, 0.2
     # Innovations whose median scales the gate, so that noise beyond what is stated does not
     # turn the good epochs into outliers.
     GATE_WINDOW = 25
@@ -203,6 +205,20 @@ class MapEstimator:
     def full(self) -> bool:
         """Whether the store is full."""
         return self.count >= self._capacity
+
+    @property
+    def idle(self) -> bool:
+        """
+        Whether the vehicle has shown nothing of its heading for a while: better a later t0.
+
+        The heading at t0 gets lost with the vertical gyro's bias, the longer the vehicle stands
+        or flies straight; velocity must be known well enough to say that it did.
+        """
+        s = self.solution
+        return (s is not None and self._gnss.time[self.count - 1] >= self.IDLE_TIME
+                and s.P[2, 2] > self.IDLE_HEADING_STD ** 2
+                and self.covariance[START_VELOCITY, START_VELOCITY][:2, :2].trace()
+                < 2 * self.IDLE_VELOCITY_STD ** 2)
 
     def _extend(self, s: Solution, epochs: slice, gate: 'tuple[Array, Array] | None') -> Array:
         """Take stored epochs into a solution; return the last one's innovations squared."""
@@ -317,7 +333,7 @@ class MapEstimator:
     @staticmethod
     def _likelihood(s: Solution) -> float:
         """Log likelihood at the best overall scale of all covariances, but for a constant."""
-        scale = max(s.chi2 / s.dof, 1.0)
+        scale = max(s.chi2 / max(s.dof, 1), 1.0)
         return -0.5 * (s.whitener.log_det + s.dof * math.log(scale) + s.chi2 / scale)
 
     def _rough_attitude(self, point: Unknowns) -> Array:
@@ -356,21 +372,17 @@ class MapEstimator:
                    0.5 * turn * turn / float(sigma[2]))
 
     def settle(self) -> None:
-        """Move the linearisation point now if it is worth it at all, growth or not."""
-        if self.solution is not None and self.nonlinearity() > self.NONLINEARITY:
+        """Move the linearisation point now if that is worth it at all, growth or hardly."""
+        if (self._nonlinearity > self.NONLINEARITY
+                and self.count > self._last_fit * (1 + self.GROWTH_FAR)):
             self._fit()
 
-    def sign_evidence(self, prior: Prior) -> dict[tuple[int, int], float]:
+    def sign_evidence(self) -> dict[tuple[int, int], float]:
         """
         Fit the stored epochs afresh with the signs of gyros and accelerometers as they are or not.
 
         A wrong sign, or one wrong axis (which is all three wrong in a body frame turned half
         around), fits as well as the right ones until the vehicle has turned.
-
-        Parameters
-        ----------
-        prior : Prior
-            Of the biases alone, with zero mean.
 
         Returns
         -------
@@ -380,12 +392,14 @@ class MapEstimator:
 
         """
         epochs = slice(0, self.count)
-        raw = self._corrected(epochs, prior.mean)
+        nothing = replace(self._prior.mean, gyro_bias=np.zeros(3), accel_bias=np.zeros(3),
+                          gyro_scale=np.zeros(3))
+        raw = self._corrected(epochs, nothing)
         gnss = self._gnss.take(epochs)
         chi2 = {}
         scale = 1.0
         for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-            trial = MapEstimator(prior, use_position=self._size == 9,
+            trial = MapEstimator(self._prior.mirrored(*signs), use_position=self._size == 9,
                                  estimate_lever_arm=LEVER_ARM.start in self._columns,
                                  estimate_delay=DELAY.start in self._columns,
                                  estimate_gyro_scale=GYRO_SCALE.start in self._columns,
@@ -520,7 +534,8 @@ class MapEstimator:
             # The gyros cannot tell their biases from the Earth's rate seen under a heading that
             # may be anything; the linear picture knows the tangent of that circle only.
             gyro_bias = slice(9 + GYRO_BIAS.start, 9 + GYRO_BIAS.stop)
-            joint[gyro_bias, gyro_bias] += EARTH_RATE ** 2 * np.eye(3)
+            least = np.linalg.eigvalsh(joint[gyro_bias, gyro_bias])[0]
+            joint[gyro_bias, gyro_bias] += max(EARTH_RATE ** 2 - least, 0.0) * np.eye(3)
         # Places of what is kept in the joint covariance, and in the vector of unknowns.
         kept = np.flatnonzero(np.isin(self._columns, BODY_FIXED))
         if heading_free:

@@ -38,7 +38,7 @@ PAST_DOF = 300
 # The signs of the sensors are judged again when the data have grown by the first share, and by
 # the second beyond so many epochs; they are confirmed when every other choice of signs has so much
 # more chi-square.
-EVIDENCE_GROWTH = 0.05, 0.5
+EVIDENCE_GROWTH = 0.05, 0.3
 EVIDENCE_SOON = 200
 EVIDENCE_GAIN = 12.0
 WRONG_SIGNS = {
@@ -101,6 +101,13 @@ class Fit:
     def factor(self) -> float:
         """A-posteriori factor on sigmas, at least 1."""
         return math.sqrt(max(1.0, self.chi2 / self.dof)) if self.dof > 0 else math.inf
+
+    @property
+    def significant_scale(self) -> float:
+        """Factor on covariances that are handed on: 1 unless the misfit cannot be chance."""
+        if self.dof <= 0 or self.chi2 / self.dof < 1 + 3 * math.sqrt(2 / self.dof):
+            return 1.0
+        return self.chi2 / self.dof
 
 
 @dataclass(frozen=True)
@@ -178,11 +185,10 @@ class MapMethod:
         self._capacity = capacity
         self.moved = 0
         noise = config.imu_noise
-        self._first_prior = first_prior(noise.gyro_bias_std, noise.accel_bias_std,
-                                        np.array(config.lever_arm), config.lever_arm_std,
-                                        0.0, config.gnss_delay_std, noise.gyro_scale_std)
         if prior is None:
-            prior = self._first_prior
+            prior = first_prior(noise.gyro_bias_std, noise.accel_bias_std,
+                                np.array(config.lever_arm), config.lever_arm_std,
+                                0.0, config.gnss_delay_std, noise.gyro_scale_std)
         self._doubt = 'the signs of the IMU axes are not judged yet'
         self._next_evidence = 0.0
         self._offered = 0
@@ -203,7 +209,7 @@ class MapMethod:
 
     def advance(self, epoch: Epoch, imu: ImuSteps) -> None:
         """Take the next epoch and the IMU steps before it."""
-        if self._estimator.full:
+        if self._estimator.full or self._estimator.idle:
             self._move_start()
         time = (epoch.stamp_ns - self.t0_ns) * 1e-9
         self._track.advance(time, epoch.latitude, epoch.longitude, epoch.altitude)
@@ -234,9 +240,10 @@ class MapMethod:
         track, steps = self._track, self._last.steps
         fit = self.fit()
         prior = self._estimator.handover(track.C_n0n, -track.s_v(np.zeros(3)), -track.s_p,
-                                         fit.factor ** 2)
+                                         fit.significant_scale)
         self._rejected = [fit.rejected_velocity, fit.rejected_position]
         self._past = PAST_DOF * fit.chi2 / max(fit.dof, 1), PAST_DOF
+        self._next_evidence = 0.0
         self.moved += 1
         start = replace(self._last_epoch, v_n=None, position_measured=False)
         self._start(start, prior, self._estimator.excess)
@@ -277,10 +284,10 @@ class MapMethod:
 
     def unconfirmed(self) -> str:
         """Return why the data do not show yet that the sensors' signs are right, or nothing."""
-        if self._offered >= self._next_evidence and self._doubt:
-            growth = EVIDENCE_GROWTH[self._offered > EVIDENCE_SOON]
-            self._next_evidence = self._offered * (1 + growth)
-            chi2 = self._estimator.sign_evidence(self._first_prior)
+        if self._doubt and self._estimator.count >= self._next_evidence:
+            growth = EVIDENCE_GROWTH[self._estimator.count > EVIDENCE_SOON]
+            self._next_evidence = self._estimator.count * (1 + growth)
+            chi2 = self._estimator.sign_evidence()
             right = chi2.pop((1, 1))
             rival = min(chi2, key=chi2.__getitem__)
             if chi2[rival] > right + EVIDENCE_GAIN:

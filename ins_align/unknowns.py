@@ -105,6 +105,21 @@ class Prior:
     information: Array
     heading_free: bool
 
+    def mirrored(self, gyro_sign: float, accel_sign: float) -> 'Prior':
+        """Return what is known but for the attitude, were the signs of the sensors changed."""
+        known = np.flatnonzero(np.diag(self.information))
+        kept = np.isin(known, BODY_FIXED)
+        unknowns = known[kept]
+        covariance = inverse_spd(self.information[np.ix_(known, known)])[np.ix_(kept, kept)]
+        sign = np.ones(SIZE)
+        sign[GYRO_BIAS], sign[ACCEL_BIAS] = gyro_sign, accel_sign
+        sign = sign[unknowns]
+        zero = np.zeros(3)
+        mean = replace(self.mean, C=np.eye(3), gyro_bias=gyro_sign * self.mean.gyro_bias,
+                       accel_bias=accel_sign * self.mean.accel_bias, start_velocity=zero,
+                       start_position=zero)
+        return prior_of(mean, covariance * np.outer(sign, sign), unknowns, False)
+
     def at(self, point: Unknowns) -> tuple[Array, Array]:
         """Return the information about the step from `point`, and the mean of that step."""
         mean, information = self.mean, self.information
