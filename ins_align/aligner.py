@@ -20,7 +20,8 @@ their place and the results depend on the messages alone.
 """
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 import math
 
 from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer
@@ -65,37 +66,40 @@ class Attitude:
     Attributes
     ----------
     stamp_ns : int
-    quaternion_xyzw : ndarray, shape (4,)
-        Body to ENU, w >= 0.
+    C_nb : ndarray, shape (3, 3)
+        Body to ENU.
     covariance : ndarray, shape (3, 3)
         Of the small rotation about the axes of ENU, rad^2.
 
     """
 
     stamp_ns: int
-    quaternion_xyzw: Array
+    C_nb: Array
     covariance: Array
-    _rpy: Array = field(repr=False)
 
-    @staticmethod
-    def of(stamp_ns: int, C_nb: Array, covariance: Array) -> 'Attitude':
-        """Make one of a matrix."""
-        return Attitude(stamp_ns, quaternion_from_matrix(C_nb), covariance, roll_pitch_yaw(C_nb))
+    @cached_property
+    def quaternion_xyzw(self) -> Array:
+        """Body to ENU, w >= 0, shape (4,)."""
+        return quaternion_from_matrix(self.C_nb)
+
+    @cached_property
+    def _rpy_deg(self) -> list[float]:
+        return list(np.degrees(roll_pitch_yaw(self.C_nb)).tolist())
 
     @property
     def roll_deg(self) -> float:
         """Roll, degrees."""
-        return math.degrees(self._rpy[0])
+        return self._rpy_deg[0]
 
     @property
     def pitch_deg(self) -> float:
         """Pitch, degrees; nose down is positive (REP-103)."""
-        return math.degrees(self._rpy[1])
+        return self._rpy_deg[1]
 
     @property
     def yaw_deg(self) -> float:
         """Heading as yaw: degrees counter-clockwise from east."""
-        return math.degrees(self._rpy[2])
+        return self._rpy_deg[2]
 
     @property
     def sigma_deg(self) -> Array:
@@ -478,8 +482,8 @@ class Aligner:
             verdict = self._declaration.update(time_s, (initial[1], current[1]), fit,
                                                method.unconfirmed)
             scale = fit.factor ** 2 if math.isfinite(fit.factor) else 1.0
-            self._initial = Attitude.of(method.t0_ns, initial[0], initial[1] * scale)
-            self._current = Attitude.of(stamp_ns, current[0], current[1] * scale)
+            self._initial = Attitude(method.t0_ns, initial[0], initial[1] * scale)
+            self._current = Attitude(stamp_ns, current[0], current[1] * scale)
         fault = self._force_check.fault or self._velocity_check.fault
         if fault:
             self._declaration.levelled = self._declaration.aligned = False
@@ -528,7 +532,7 @@ class Aligner:
         age = (stamp_ns - self._last_ns) * 1e-9
         drift = (self.config.imu_noise.angle_random_walk ** 2 * age
                  + (np.max(method.nuisance().gyro_bias_std) ** 2 + EARTH_RATE ** 2) * age ** 2)
-        return Attitude.of(stamp_ns, C, current.covariance + drift * np.eye(3))
+        return Attitude(stamp_ns, C, current.covariance + drift * np.eye(3))
 
     def status(self) -> Status:
         """Return the state, the reason for it, the estimates and the counts."""

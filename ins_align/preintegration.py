@@ -21,7 +21,8 @@ interpolation. All samples of an interval, and all intervals of a batch, are han
 
 from dataclasses import dataclass, fields
 
-from ins_align.rotation import (Array, cross, cumulative_rotations, exp_so3, left_jacobian, skew)
+from ins_align.rotation import (Array, cross, cumulative_rotations, exp_and_left_jacobian, exp_so3,
+                                skew)
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -296,11 +297,11 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     force = h / 2 * (f0 + f1) - h2_12 * np.diff(steps.f_dot, axis=1)
     coning = h2_12 * cross(omega0, omega1)
     sculling = h2_12 * (cross(omega0, f1) + cross(f0, omega1))
-    jacobian = left_jacobian(theta)
+    turn, jacobian = exp_and_left_jacobian(theta + coning)
     step_v = (jacobian @ force[..., None])[..., 0] + sculling
     step_p = h * h / 6 * (2 * f0 + f1) + h ** 3 / 6 * cross(omega0, 0.5 * (f0 + f1))
 
-    turned = cumulative_rotations(exp_so3(theta + coning))
+    turned = cumulative_rotations(turn)
     A = np.empty_like(turned)                     # from the start of each step to the interval's
     A[:, 0] = np.eye(3)
     A[:, 1:] = turned[:, :-1]

@@ -80,12 +80,15 @@ def _trigonometric_factors(angle2: Array) -> tuple[Array, Array, Array]:
     return a, b, c
 
 
-def _rodrigues(vector: ArrayLike, first: int) -> Array:
+def exp_and_left_jacobian(vector: ArrayLike) -> tuple[Array, Array]:
+    """Return `exp_so3` and `left_jacobian` of rotation vectors, shape (..., 3), at one go."""
     v = np.asarray(vector, dtype=float)
-    factors = _trigonometric_factors(np.sum(v * v, axis=-1))
+    a, b, c = _trigonometric_factors(np.sum(v * v, axis=-1))
     s = skew(v)
-    return (np.eye(3) + factors[first][..., None, None] * s
-            + factors[first + 1][..., None, None] * (s @ s))
+    ss = s @ s
+    eye = np.eye(3)
+    return (eye + a[..., None, None] * s + b[..., None, None] * ss,
+            eye + b[..., None, None] * s + c[..., None, None] * ss)
 
 
 def exp_so3(vector: ArrayLike) -> Array:
@@ -102,7 +105,7 @@ def exp_so3(vector: ArrayLike) -> Array:
     ndarray, shape (..., 3, 3)
 
     """
-    return _rodrigues(vector, 0)
+    return exp_and_left_jacobian(vector)[0]
 
 
 def left_jacobian(vector: ArrayLike) -> Array:
@@ -121,7 +124,7 @@ def left_jacobian(vector: ArrayLike) -> Array:
     ndarray, shape (..., 3, 3)
 
     """
-    return _rodrigues(vector, 1)
+    return exp_and_left_jacobian(vector)[1]
 
 
 def log_so3(matrix: ArrayLike) -> Array:
