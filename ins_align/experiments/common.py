@@ -28,7 +28,7 @@ from ins_align.aligner import Aligner, Attitude, Epoch
 from ins_align.config import Config
 from ins_align.declaration import State
 from ins_align.report import format_table
-from ins_align.rotation import Array, log_so3, matrix_from_quaternion
+from ins_align.rotation import Array, log_so3
 from ins_align.simulation import Simulation
 import numpy as np
 
@@ -171,7 +171,7 @@ def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Array | None = No
         Of the truth itself, about east, north, up; added in quadrature.
 
     """
-    phi = log_so3(C_true @ matrix_from_quaternion(attitude.quaternion_xyzw).T)
+    phi = log_so3(C_true @ attitude.C_nb.T)
     covariance = attitude.covariance
     if extra_std_deg is not None:
         covariance = covariance + np.diag(np.radians(extra_std_deg) ** 2)

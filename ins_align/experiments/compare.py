@@ -143,7 +143,7 @@ def figure(medians: dict[str, Array]) -> Any:
             ax.semilogy(TIMES, values, color=COLOURS[method], label=method)
         ax.set_title(name)
         ax.grid(alpha=0.25)
-        ax.set_ylim(0.01, 200.0)
+        ax.set_ylim(0.003, 200.0)
     for ax in axes[:, 0]:
         ax.set_ylabel('heading error (deg)')
     for ax in axes[-1]:

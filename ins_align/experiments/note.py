@@ -29,7 +29,7 @@ from ins_align.experiments import dense
 from ins_align.experiments.common import epochs_of, exact_config_for, parallel, Report, rms
 from ins_align.formula import exact_lever_remainder
 from ins_align.report import new_figure
-from ins_align.rotation import Array, cross, matrix_from_quaternion, roll_pitch_yaw
+from ins_align.rotation import Array, cross, roll_pitch_yaw
 from ins_align.simulation import simulate
 import numpy as np
 
@@ -107,7 +107,7 @@ def run_one(task: tuple[str, str, int]) -> Array:
     for epoch in epochs_of(aligner, simulation):
         if epoch.initial is not None:
             C_true = simulation.attitude_at(epoch.initial.stamp_ns)
-            rpy = roll_pitch_yaw(matrix_from_quaternion(epoch.initial.quaternion_xyzw))
+            rpy = roll_pitch_yaw(epoch.initial.C_nb)
             difference = np.remainder(rpy - roll_pitch_yaw(C_true) + np.pi, 2 * np.pi) - np.pi
             errors[np.searchsorted(simulation.gnss_stamps_ns, epoch.stamp_ns)] = np.degrees(
                 difference)

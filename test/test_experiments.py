@@ -1,0 +1,188 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The experiments: small runs whose numbers are known, and the errors a user can make."""
+
+import json
+import math
+
+from ins_align import experiments
+from ins_align.aligner import Attitude
+from ins_align.config import PRESETS
+from ins_align.declaration import State
+from ins_align.experiments import bound, common, compare, cost, declare, note, recorded
+from ins_align.rotation import exp_so3, matrix_from_rpy
+from ins_align.simulation import simulate, write_bag
+import numpy as np
+import pytest
+
+pytest.importorskip('pyins')
+
+
+def square(number):
+    """Be a function that another process can import."""
+    return number * number
+
+
+def test_parallel_keeps_the_order_in_any_number_of_processes():
+    tasks = list(range(7))
+    assert common.parallel(square, tasks, 1) == [n * n for n in tasks]
+    assert common.parallel(square, tasks, 2) == [n * n for n in tasks]
+
+
+def test_error_is_counted_in_stated_sigmas():
+    C = matrix_from_rpy([0.1, -0.2, 2.0])
+    phi = np.radians([0.2, -0.6, 3.0])
+    sigma = np.radians([0.1, 0.2, 1.0])
+    attitude = Attitude(1, exp_so3(-phi) @ C, np.diag(sigma ** 2))
+    error = common.error_of(attitude, C)
+    assert error.angles_deg == pytest.approx(np.degrees(phi))
+    assert error.tilt_sigmas == pytest.approx(3.0)
+    assert error.heading_sigmas == pytest.approx(3.0)
+    assert error.nees == pytest.approx(4 + 9 + 9)
+    wider = common.error_of(attitude, C, np.array([0.0, 0.0, math.sqrt(8.0)]))
+    assert wider.heading_sigmas == pytest.approx(1.0)
+
+
+def test_exact_model_is_that_of_the_simulation():
+    simulation = simulate('flight', imu_grade='tactical', duration=5.0)
+    assert common.exact_config_for(simulation).imu_noise == pytest.approx(
+        PRESETS['tactical']._replace(gyro_scale_std=0.0))
+
+
+def test_bound_is_reached_on_a_navigation_grade_flight(monkeypatch):
+    monkeypatch.setattr(bound, 'TIMES', bound.TIMES[:6])
+    case = next(case for case in bound.cases() if case.grade == 'navigation')
+    limits = bound.bounds_of(case)
+    runs = [bound.run_case((case, seed)) for seed in range(4)]
+    result = bound.summary(case, limits, runs)
+    assert result['heading_bound_deg'][bound.TIMES.index(10.0)] == pytest.approx(0.245, abs=0.01)
+    # Four runs, three angles: the mean of twelve squares is within 0.2 and 2.5.
+    late = bound.TIMES.index(10.0)
+    assert np.all(result['nees'][late:] < 2.5)
+    assert np.all(result['nees'][late:] > 0.2)
+    assert np.all(result['heading_ratio'][late:] < 2.0)
+
+
+def test_time_at_which_the_bound_crosses():
+    flight = bound.crossing_time(('flight', 'navigation', 10.0, 1.0, {}))
+    assert flight == pytest.approx(5.4, abs=0.3)
+    assert bound.crossing_time(('straight', 'mems', 10.0, 1.0, {})) is None
+    unknown = {'lever_arm_std': 5.0, 'delay_std': 0.5}
+    assert bound.crossing_time(('flight', 'navigation', 10.0, 1.0, unknown)) > flight
+
+
+def test_trials_are_repeatable_and_cover_everything():
+    combinations = len(declare.FAULTS) * len(declare.SCENARIOS) * len(declare.GRADES)
+    trials = [declare.trial(index) for index in range(combinations)]
+    assert trials[5] == declare.trial(5)
+    seen = {(t['fault'], t['scenario'], t['simulate']['imu_grade']) for t in trials}
+    assert len(seen) == combinations
+
+
+def test_a_declared_trial_is_judged_against_the_truth(monkeypatch):
+    monkeypatch.setattr(declare, 'DURATION', 20.0)
+    task = next(t for t in map(declare.trial, range(500)) if t['fault'] == 'none'
+                and t['scenario'] == 'flight' and t['simulate']['imu_grade'] == 'navigation')
+    result = declare.run_trial(task)
+    assert result['state'] == State.ALIGNED.value
+    for moment in ('levelled', 'aligned', 'final'):
+        for name in ('initial', 'current'):
+            assert result[moment][name]['heading_sigmas'] < 5
+    assert declare.row('x', [result], 'aligned', 'heading_sigmas')[1:6] in (
+        [1, 1, 0, 0, 0], [1, 0, 1, 0, 0])
+    missing = {**result, 'aligned': None}
+    assert declare.row('x', [missing], 'aligned', 'heading_sigmas')[1:6] == [1, 0, 0, 0, 1]
+
+
+def test_note_with_and_without_lever_arm(monkeypatch):
+    monkeypatch.setattr(note, 'DURATION', 12.0)
+    errors = {name: np.array([note.run_one(('navigation', name, seed)) for seed in range(3)])
+              for name in ('not compensated', 'compensated', 'zero lever arm')}
+    end = {name: error[:, -1] for name, error in errors.items()}
+    assert common.rms(end['compensated'][:, 2]) < 1.0
+    # With its term the lever arm is as if it were not there, without it is not.
+    same = common.rms(end['compensated'] - end['zero lever arm'])
+    assert same < 0.1 * common.rms(end['not compensated'] - end['zero lever arm'])
+
+
+def test_short_form_stays_below_its_limit():
+    time, remainder, limit, term, integral = note.remarks_of(100.0)
+    assert np.all(remainder[1:] <= limit[1:])
+    assert limit[-1] == pytest.approx(2 * 7.292115e-5 ** 2 * time[-1] * math.sqrt(3))
+    assert integral[-1] > 100 * term[-1]
+
+
+def test_cost_counts_every_minute():
+    result = cost.run_case('car, defaults', 61.0)
+    assert len(result['us_per_epoch']) == len(result['resident_mb']) == 1
+    assert min(result['us_per_epoch']) > 0
+    assert result['largest_ms'] * 1e3 >= max(result['us_per_epoch'])
+
+
+def test_course_is_not_the_heading_when_backing_out(monkeypatch):
+    monkeypatch.setattr(compare, 'TIMES', compare.TIMES[:30])
+    errors = compare.run_one(('reverse', 0))
+    assert np.nanmin(errors[0, :10]) > 150.0
+    assert np.nanmedian(errors[3, 20:]) < 3.0
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    """Two recordings, one of them without velocities to speak of."""
+    place = tmp_path_factory.mktemp('data')
+    for name, scenario in (('driven', 'car'), ('hovering', 'hover')):
+        write_bag(simulate(scenario, duration=32.0, lever_arm=(0.0, 0.0, 0.0), seed=1),
+                  place / name)
+    return place
+
+
+def test_window_of_a_recording_against_its_reference(folder):
+    path = folder / 'driven'
+    assert recorded.recordings_in(folder) == [path, folder / 'hovering']
+    recording = recorded.load(path)
+    assert recording.duration == pytest.approx(32.0, abs=0.1)
+    window = recorded.run_window(path, 2.0, 25.0, method='map')
+    assert window.moves and not window.covers_minute
+    assert window.declared_s is not None and window.declared.heading_sigmas < 5
+    assert window.time[-1] == pytest.approx(25.0, abs=0.5)
+    assert np.abs(window.error_deg[-1, 2]) < 3.0
+    assert np.nanmedian(np.abs(window.course_deg)) < 3.0
+    assert not recorded.run_window(folder / 'hovering', 0.0, 25.0, method='map').moves
+
+
+def test_recordings_and_their_files(folder, tmp_path, capsys):
+    experiments.run('recordings', tmp_path, data_dir=folder, jobs=1)
+    text = (tmp_path / 'recordings.md').read_text('utf-8')
+    assert 'ins_align experiment recordings --out DIR --data DIR' in text
+    assert 'driven, map' in text
+    numbers = json.loads((tmp_path / 'recordings.json').read_text('utf-8'))
+    assert [window['start_s'] for window in numbers['driven']['map']] == [0.0, 10.0, 20.0]
+    assert (tmp_path / 'recordings.png').stat().st_size > 10_000
+    assert 'driven, note' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('arguments, reason', [
+    ({'name': 'nonsense'}, 'there are note, bound'),
+    ({'name': 'recordings'}, '--data DIR'),
+    ({'name': 'bound', 'runs': 0}, 'at least 1'),
+    ({'name': 'bound', 'data_dir': '/no/such/place'}, 'no directory'),
+])
+def test_what_cannot_be_run_is_said(tmp_path, arguments, reason):
+    with pytest.raises(experiments.ExperimentError, match=reason):
+        experiments.run(out_dir=tmp_path, **arguments)
+
+
+def test_a_folder_without_recordings_is_said(tmp_path):
+    with pytest.raises(experiments.ExperimentError, match='no recording'):
+        experiments.run('recordings', tmp_path, data_dir=tmp_path)
