@@ -109,8 +109,10 @@ class MapEstimator:
     TUNE_FROM, TUNE_GROWTH, TUNE_STEP, TUNE_GAIN = 12, 0.5, 3.0, 1.0
     MIN_EXCESS, MAX_EXCESS = 0.01, 9.0
     MAX_REJECTED = 0.3
-    # Idle: for this long (s) no heading to within this (rad), though the velocity is known (m/s).
+    # Ages (s) at which t0 moves on: when no heading is known to within this (rad), though the
+    # velocity is (m/s); when neither is; when both are.
     IDLE_TIME, IDLE_HEADING_STD, IDLE_VELOCITY_STD = 5.0, 1.2, 0.2
+    MAX_IDLE_TIME, MAX_AGE = 60.0, 120.0
     # Innovations whose median scales the gate, so that noise beyond what is stated does not
     # turn the good epochs into outliers.
     GATE_WINDOW = 25
@@ -207,18 +209,23 @@ class MapEstimator:
         return self.count >= self._capacity
 
     @property
-    def idle(self) -> bool:
+    def stale(self) -> bool:
         """
-        Whether the vehicle has shown nothing of its heading for a while: better a later t0.
+        Whether a later t0 would serve better, though the store is not full.
 
-        The heading at t0 gets lost with the vertical gyro's bias, the longer the vehicle stands
-        or flies straight; velocity must be known well enough to say that it did.
+        The heading at t0 gets lost with the vertical gyro's bias the longer the vehicle stands or
+        flies straight after it. That it does shows when the velocity is known and the heading is
+        not. A long chain of a poor IMU says little of its beginning in any case.
         """
         s = self.solution
-        return (s is not None and self._gnss.time[self.count - 1] >= self.IDLE_TIME
-                and s.P[2, 2] > self.IDLE_HEADING_STD ** 2
-                and self.covariance[START_VELOCITY, START_VELOCITY][:2, :2].trace()
-                < 2 * self.IDLE_VELOCITY_STD ** 2)
+        if s is None:
+            return False
+        age = self._gnss.time[self.count - 1]
+        if s.P[2, 2] <= self.IDLE_HEADING_STD ** 2:
+            return bool(age >= self.MAX_AGE)
+        start = self.covariance[START_VELOCITY, START_VELOCITY]
+        still = start[0, 0] + start[1, 1] < 2 * self.IDLE_VELOCITY_STD ** 2
+        return bool(age >= (self.IDLE_TIME if still else self.MAX_IDLE_TIME))
 
     def _extend(self, s: Solution, epochs: slice, gate: 'tuple[Array, Array] | None') -> Array:
         """Take stored epochs into a solution; return the last one's innovations squared."""
@@ -504,7 +511,8 @@ class MapEstimator:
         return (C, x.start_velocity + Cv, x.start_position + time * x.start_velocity + Cp,
                 covariance)
 
-    def handover(self, C_n0n: Array, shift_v: Array, shift_p: Array, scale: float) -> Prior:
+    def handover(self, C_n0n: Array, shift_v: Array, shift_p: Array, scale: float,
+                 wander: Array) -> Prior:
         """
         Return what is known now as the prior of an estimator whose t0 is the last epoch.
 
@@ -521,6 +529,8 @@ class MapEstimator:
             in n0 axes.
         scale : float
             Factor on the covariance, for data that fit worse than stated.
+        wander : ndarray, shape (22,)
+            Variance by which the unknowns may have changed since t0.
 
         """
         C, v, p, joint = self._now()
@@ -529,6 +539,7 @@ class MapEstimator:
         for block in range(3):
             T[3 * block:3 * block + 3, 3 * block:3 * block + 3] = C_n0n.T
         joint = scale * T @ joint @ T.T
+        joint[9:, 9:] += np.diag(wander[self._columns])
         heading_free = not math.sqrt(joint[2, 2]) < HEADING_RESOLVED_STD
         if heading_free:
             # The gyros cannot tell their biases from the Earth's rate seen under a heading that

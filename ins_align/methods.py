@@ -29,10 +29,12 @@ from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, Nav
 from ins_align.preintegration import Noise, preintegrate, Steps
 from ins_align.rotation import Array, orthonormalized
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
-                                Prior, UNIFORM_ANGLE_STD)
+                                Prior, SIZE, UNIFORM_ANGLE_STD)
 from ins_align.whitening import Measurements
 import numpy as np
 
+# Biases wander by this share of their prior sigma in this time (s).
+WANDER, WANDER_TIME = 0.1, 100.0
 # After t0 has moved, the fit so far counts like this many rows.
 PAST_DOF = 300
 # The signs of the sensors are judged again when the data have grown by the first share, and by
@@ -185,6 +187,9 @@ class MapMethod:
         self._capacity = capacity
         self.moved = 0
         noise = config.imu_noise
+        self._wander = np.zeros(SIZE)
+        self._wander[GYRO_BIAS] = (WANDER * noise.gyro_bias_std) ** 2 / WANDER_TIME
+        self._wander[ACCEL_BIAS] = (WANDER * noise.accel_bias_std) ** 2 / WANDER_TIME
         if prior is None:
             prior = first_prior(noise.gyro_bias_std, noise.accel_bias_std,
                                 np.array(config.lever_arm), config.lever_arm_std,
@@ -209,7 +214,7 @@ class MapMethod:
 
     def advance(self, epoch: Epoch, imu: ImuSteps) -> None:
         """Take the next epoch and the IMU steps before it."""
-        if self._estimator.full or self._estimator.idle:
+        if self._estimator.full or self._estimator.stale:
             self._move_start()
         time = (epoch.stamp_ns - self.t0_ns) * 1e-9
         self._track.advance(time, epoch.latitude, epoch.longitude, epoch.altitude)
@@ -240,7 +245,7 @@ class MapMethod:
         track, steps = self._track, self._last.steps
         fit = self.fit()
         prior = self._estimator.handover(track.C_n0n, -track.s_v(np.zeros(3)), -track.s_p,
-                                         fit.significant_scale)
+                                         fit.significant_scale, self._wander * track.time)
         self._rejected = [fit.rejected_velocity, fit.rejected_position]
         self._past = PAST_DOF * fit.chi2 / max(fit.dof, 1), PAST_DOF
         self._next_evidence = 0.0
