@@ -43,7 +43,7 @@ test-oldest:
 	@for python in $(PYTHON312) python3.12 \
 	        $$(pyenv root 2>/dev/null)/versions/3.12*/bin/python3.12; do \
 	    if "$$python" -c '' 2>/dev/null; then \
-	        $(MAKE) --no-print-directory $(OLDEST)/ready PYTHON="$$python" || exit 1; \
+	        $(MAKE) -s --no-print-directory $(OLDEST)/ready PYTHON="$$python" || exit 1; \
 	        $(OLDEST)/bin/python -m pytest -q -m 'not linter' $(ARGS) \
 	            && echo 'make test-oldest: passed' && exit 0; \
 	        echo 'make test-oldest: FAILED'; exit 1; \
