@@ -50,16 +50,16 @@ class ImuNoise(NamedTuple):
 
 
 def _imu_noise(arw: float, vrw: float, gyro_bias: float, accel_bias: float,
-               gyro_scale: float) -> ImuNoise:
+               gyro_scale: float = 0.0) -> ImuNoise:
     """Convert deg/sqrt(h), m/s/sqrt(h), deg/s, m/s^2 to SI."""
     return ImuNoise(math.radians(arw) / 60.0, vrw / 60.0, math.radians(gyro_bias), accel_bias,
                     gyro_scale)
 
 
 PRESETS = {
-    'navigation': _imu_noise(0.002, 0.003, 0.01 / 3600.0, 50e-6 * STANDARD_GRAVITY, 1e-5),
-    'tactical': _imu_noise(0.05, 0.03, 1.0 / 3600.0, 1e-3 * STANDARD_GRAVITY, 3e-4),
-    'mems': _imu_noise(0.3, 0.09, 0.1, 0.05, 0.01),
+    'navigation': _imu_noise(0.002, 0.003, 0.01 / 3600.0, 50e-6 * STANDARD_GRAVITY),
+    'tactical': _imu_noise(0.05, 0.03, 1.0 / 3600.0, 1e-3 * STANDARD_GRAVITY),
+    'mems': _imu_noise(0.3, 0.09, 0.1, 0.05),
 }
 
 
@@ -130,8 +130,8 @@ class Config:
         0.0, "accelerometer bias, 1 sigma per axis; 0: the preset's", 'm/s^2',
         minimum=0.0, maximum=10.0)
     gyro_scale_std: float = _parameter(
-        0.0, 'scale factor error of the gyroscopes, 1 sigma per axis, 0.01 is one percent; 0: the '
-        "preset's, for custom none", '1', minimum=0.0, maximum=0.5)
+        0.0, 'scale factor error of the gyroscopes, 1 sigma per axis, 0.01 is one percent; above '
+        '0 it is estimated too', '1', minimum=0.0, maximum=0.5)
     velocity_std: float = _parameter(
         0.2, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none', 'm/s',
         minimum=1e-4, maximum=100.0)

@@ -40,6 +40,9 @@ WEAK_INFORMATION = np.zeros(SIZE)
 WEAK_INFORMATION[ATTITUDE] = UNIFORM_ANGLE_STD ** -2
 WEAK_INFORMATION[START_VELOCITY] = 1e4 ** -2
 WEAK_INFORMATION[START_POSITION] = 1e7 ** -2
+# The motion that the fit attributes to the vehicle has the noise of what was fitted to it, one unit
+# of information for each: horizontal slope (tilt) and curvature (gyro bias) of the velocity.
+FITTED_DIRECTIONS = 4
 # Median of chi-square with three degrees of freedom.
 MEDIAN_CHI2_3 = 2.366
 
@@ -110,9 +113,11 @@ class MapEstimator:
     MIN_EXCESS, MAX_EXCESS = 0.01, 9.0
     MAX_REJECTED = 0.3
     # Ages (s) at which t0 moves on: when no heading is known to within this (rad), though the
-    # velocity is (m/s); when neither is; when both are.
+    # velocity is (m/s); when neither is; when both are. The first two only once the gyros' biases
+    # may have turned the heading by so much (rad): a good IMU finds north at rest.
     IDLE_TIME, IDLE_HEADING_STD, IDLE_VELOCITY_STD = 5.0, 1.2, 0.2
     MAX_IDLE_TIME, MAX_AGE = 60.0, 120.0
+    IDLE_HEADING_LOSS = math.radians(0.4)
     # Innovations whose median scales the gate, so that noise beyond what is stated does not
     # turn the good epochs into outliers.
     GATE_WINDOW = 25
@@ -223,8 +228,12 @@ class MapEstimator:
         age = self._gnss.time[self.count - 1]
         if s.P[2, 2] <= self.IDLE_HEADING_STD ** 2:
             return bool(age >= self.MAX_AGE)
-        start = self.covariance[START_VELOCITY, START_VELOCITY]
-        still = start[0, 0] + start[1, 1] < 2 * self.IDLE_VELOCITY_STD ** 2
+        covariance = self.covariance
+        bias_std = math.sqrt(np.max(np.diag(covariance)[GYRO_BIAS]))
+        if age * bias_std < self.IDLE_HEADING_LOSS:
+            return False
+        start = np.diag(covariance)[START_VELOCITY]
+        still = start[0] + start[1] < 2 * self.IDLE_VELOCITY_STD ** 2
         return bool(age >= (self.IDLE_TIME if still else self.MAX_IDLE_TIME))
 
     def _extend(self, s: Solution, epochs: slice, gate: 'tuple[Array, Array] | None') -> Array:
@@ -261,7 +270,7 @@ class MapEstimator:
         s.P = inverse_spd(information)
         s.dx = s.P @ right
         column = s.P[:, 2]
-        feigned = min(s.whitener.spurious, 1 / column[2] - 1 / UNIFORM_ANGLE_STD ** 2)
+        feigned = min(s.whitener.spurious + FITTED_DIRECTIONS, 1 / column[2] - 1 / UNIFORM_ANGLE_STD ** 2)
         s.P = s.P + np.outer(column, column) * feigned / (1 - feigned * column[2])
         s.chi2 = float(s.whitener.normal[0, 0] + s.mean_step @ s.information @ s.mean_step
                        - right @ s.dx)

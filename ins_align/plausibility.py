@@ -27,7 +27,7 @@ MIN_DISTANCE = 10.0
 DISTANCE_SIGMAS = 8.0
 # Mismatch, as a share of the distance, that no noise explains, and how many in a row convict.
 MAX_MISMATCH = 0.5
-CONVICTING = 3
+CONVICTING = 4
 
 
 class ForceCheck:
@@ -60,6 +60,7 @@ class VelocityCheck:
         self._anchor: Array | None = None
         self._C_ne = np.eye(3)
         self._travelled = np.zeros(3)
+        self._far = False
         self._last: tuple[float, Array] | None = None
         self.bad_in_a_row = 0
         self._as_ned_in_a_row = 0
@@ -79,7 +80,9 @@ class VelocityCheck:
         moved = (self._C_ne @ (r_e - self._anchor))[:2]
         travelled = self._travelled[:2]
         distance = max(math.hypot(*moved), math.hypot(*travelled))
-        if distance < max(MIN_DISTANCE, DISTANCE_SIGMAS * position_std):
+        far, before = distance >= max(MIN_DISTANCE, DISTANCE_SIGMAS * position_std), self._far
+        self._far = far
+        if not (far and before):              # a single bad fix is no journey
             return
         bad = math.hypot(*(moved - travelled)) > MAX_MISMATCH * distance
         as_ned = math.hypot(*(moved - travelled[::-1])) < MAX_MISMATCH * distance
@@ -88,7 +91,7 @@ class VelocityCheck:
         self._restart(r_e, latitude, longitude)
 
     def _restart(self, r_e: Array, latitude: float, longitude: float) -> None:
-        self._anchor, self._travelled = r_e, np.zeros(3)
+        self._anchor, self._travelled, self._far = r_e, np.zeros(3), False
         self._C_ne = matrix_en(latitude, longitude).T
 
     @property

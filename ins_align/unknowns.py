@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import math
 from typing import Any
 
+from ins_align.earth import EARTH_RATE
 from ins_align.rotation import Array, exp_so3, log_so3
 import numpy as np
 from numpy.typing import NDArray
@@ -111,6 +112,9 @@ class Prior:
         kept = np.isin(known, BODY_FIXED)
         unknowns = known[kept]
         covariance = inverse_spd(self.information[np.ix_(known, known)])[np.ix_(kept, kept)]
+        # Biases that were learnt under the wrong signs hold the Earth's rate, seen upside down.
+        gyro = np.isin(unknowns, np.r_[GYRO_BIAS])
+        covariance[gyro, gyro] += (2 * EARTH_RATE) ** 2
         sign = np.ones(SIZE)
         sign[GYRO_BIAS], sign[ACCEL_BIAS] = gyro_sign, accel_sign
         sign = sign[unknowns]
