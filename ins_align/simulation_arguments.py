@@ -45,7 +45,7 @@ def checked_arguments(arguments: dict[str, Any]) -> ImuNoise:
 
     check('scenario', f'one of {", ".join(SCENARIOS)}', lambda value: value in tuple(SCENARIOS))
     check('imu_grade', f'one of {", ".join(PRESETS)} or an ImuNoise with figures above 0',
-          lambda value: all(number(figure) and figure > 0 for figure in value)
+          lambda value: all(number(figure) and figure > 0 for figure in value[:4])
           if isinstance(value, ImuNoise) else value in tuple(PRESETS))
     check('seed', 'an integer, 0 or above',
           lambda value: number(value) and value == int(value) and value >= 0)

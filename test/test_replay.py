@@ -212,8 +212,8 @@ def test_reference_has_gaps_and_unknown_attitudes():
 def test_errors_are_estimate_less_reference_and_wrap():
     reference = Reference(orientations([[0.1, 0.0, 3.1]] * 2, [0, 1]))
     C_nb = matrix_from_rpy([0.1, 0.02, -3.1])
-    rotation, rpy = reference.errors_deg(Attitude.of(0, C_nb, np.eye(3)))
+    rotation, rpy = reference.errors_deg(Attitude(0, C_nb, np.eye(3)))
     np.testing.assert_allclose(rpy, np.degrees([0.0, 0.02, 2.0 * np.pi - 6.2]), atol=1e-9)
     np.testing.assert_allclose(exp_so3(np.radians(rotation)) @ C_nb,
                                matrix_from_rpy([0.1, 0.0, 3.1]), atol=1e-12)
-    assert reference.errors_deg(Attitude.of(2, C_nb, np.eye(3))) is None
+    assert reference.errors_deg(Attitude(2, C_nb, np.eye(3))) is None
