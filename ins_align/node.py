@@ -80,11 +80,11 @@ def main(args: Sequence[str] | None = None) -> int:
     except ExternalShutdownException:
         pass
     except (ConfigError, ParameterException, InvalidQosOverridesError, RuntimeError) as error:
-        if node is not None:
-            raise
+        # Without a context it was interrupted, and rcl complains of that wherever it was just then.
         if rclpy.ok():
+            if node is not None:
+                raise
             return _refused(str(error))
-        # Otherwise it was interrupted while it started.
     finally:
         if node is not None:
             node.destroy_node()
