@@ -80,7 +80,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except ExternalShutdownException:
         pass
     except (ConfigError, ParameterException, InvalidQosOverridesError, RuntimeError) as error:
-        # Without a context it was interrupted, and rcl complains of that wherever it was just then.
+        # Without a context: it was interrupted, and rcl complains of that wherever it was.
         if rclpy.ok():
             if node is not None:
                 raise
