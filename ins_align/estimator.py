@@ -473,17 +473,20 @@ class MapEstimator:
         C, _, _, spread = self._now()
         return C, spread[:3, :3]
 
-    def _now(self) -> tuple[Array, Array, Array, Array]:
+    def _now(self, heading_free: bool = False) -> tuple[Array, Array, Array, Array]:
         """
         Attitude, velocity and position of the IMU in n0 now, relative to the antenna's track.
 
         The last result is the joint covariance of (attitude, velocity, position, unknowns),
-        shape (9 + n, 9 + n).
+        shape (9 + n, 9 + n). It belongs to the heading of the linearisation point; with
+        `heading_free` the attitude is told with that heading too, since any is as good.
         """
         s = self.solution
         if s is None:
             raise RuntimeError('no solution yet')
         x = self.estimate()
+        if heading_free:
+            x = replace(x, C=exp_so3([0.0, 0.0, -s.dx[2]]) @ x.C)
         time = self._gnss.time[self.count - 1]
         n = self._columns.size
         error = np.zeros(9)
@@ -542,14 +545,14 @@ class MapEstimator:
             Variance by which the unknowns may have changed since t0.
 
         """
-        C, v, p, joint = self._now()
+        heading_free = not self.heading_std < HEADING_RESOLVED_STD
+        C, v, p, joint = self._now(heading_free)
         x = self.estimate()
         T = np.eye(joint.shape[0])
         for block in range(3):
             T[3 * block:3 * block + 3, 3 * block:3 * block + 3] = C_n0n.T
         joint = scale * T @ joint @ T.T
         joint[9:, 9:] += np.diag(wander[self._columns])
-        heading_free = not math.sqrt(joint[2, 2]) < HEADING_RESOLVED_STD
         if heading_free:
             # The gyros cannot tell their biases from the Earth's rate seen under a heading that
             # may be anything; the linear picture knows the tangent of that circle only.
