@@ -124,7 +124,7 @@ def test_short_form_stays_below_its_limit():
 
 
 def test_cost_counts_every_minute():
-    result = cost.run_case('car, defaults', 61.0)
+    result = cost.run_case(('car, defaults', 61.0))
     assert len(result['us_per_epoch']) == len(result['resident_mb']) == 1
     assert min(result['us_per_epoch']) > 0
     assert result['largest_ms'] * 1e3 >= max(result['us_per_epoch'])

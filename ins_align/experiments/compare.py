@@ -51,7 +51,7 @@ COLOURS = {'course': '#009E73', 'note': '#0072B2', 'centred': '#E69F00', 'map': 
 def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
     """Run all methods on the same data; recordings too where they are given."""
     runs = runs or 20
-    report = Report('compare', 'The same data, four methods', out, ' --data DIR')
+    report = Report('compare', 'The same data, four methods', out, f' --data DIR --runs {runs}')
     report.text(
         f'Error of the current heading: median of {runs} runs of each simulated case (MEMS unless '
         'said otherwise, lever arm [1 1 1] m unless said otherwise, GNSS 5 Hz, 0.1 m/s), and of '

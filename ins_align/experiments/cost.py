@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Experiment ``cost``: time per GNSS epoch and memory over an hour of data."""
+"""Experiment ``cost``: time per GNSS epoch and memory over minutes of data, an hour by default."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ins_align.report import new_figure
 from ins_align.simulation import simulate
 import numpy as np
 
-DURATION = 3600.0
+MINUTES = 60
 TABLE_MINUTES = (1, 2, 5, 10, 20, 40, 60)
 CASES: dict[str, tuple[str, Callable[..., Config], dict[str, Any]]] = {
     'car, defaults': ('car', config_for, {}),
@@ -38,28 +38,32 @@ CASES: dict[str, tuple[str, Callable[..., Config], dict[str, Any]]] = {
 
 
 def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
-    """Run every case alone: `runs` and `jobs` do not matter."""
-    report = Report('cost', 'Cost over an hour', out)
-    report.text('MEMS, IMU 100 Hz, GNSS 5 Hz: processor time of one thread per GNSS epoch, IMU '
-                'samples included, and resident memory at the end of the minute.')
-    results = parallel(run_case, list(CASES), 1, 'cases', apart=True)
+    """Run every case alone, over so many minutes as `runs` says; `jobs` does not matter."""
+    minutes = runs or MINUTES
+    report = Report('cost', 'Cost over time', out, f' --runs {minutes}')
+    report.text(f'{minutes} minutes of MEMS data, IMU 100 Hz, GNSS 5 Hz: processor time of one '
+                'thread per GNSS epoch, IMU samples included, and resident memory at the end of '
+                'the minute.')
+    results = parallel(run_case, [(name, 60.0 * minutes) for name in CASES], 1, 'cases',
+                       apart=True)
     rows = []
+    shown = [minute for minute in TABLE_MINUTES if minute <= minutes]
     for name, result in zip(CASES, results):
         us, mb = np.array(result['us_per_epoch']), np.array(result['resident_mb'])
-        minutes = [minute for minute in TABLE_MINUTES if minute <= len(us)]
-        rows.append([name, *(f'{us[minute - 1]:.0f}' for minute in minutes),
+        rows.append([name, *(f'{us[minute - 1]:.0f}' for minute in shown),
                      f'{us[-1] / us[0]:.2f}', f'{mb[0]:.0f}', f'{mb[-1] - mb[0]:+.1f}',
                      f"{result['largest_ms']:.0f}", result['rebases']])
     report.table('Microseconds per GNSS epoch', [
-        'case', *(f'minute {minute}' for minute in minutes), 'last/first', 'MB, minute 1',
+        'case', *(f'minute {minute}' for minute in shown), 'last/first', 'MB, minute 1',
         'growth, MB', 'longest epoch, ms', 't0 moved'], rows)
     report.figure(figure(results), '', 'Processor time per GNSS epoch and growth of resident '
                                        'memory')
     report.write(dict(zip(CASES, results)))
 
 
-def run_case(name: str, duration: float = DURATION) -> dict[str, Any]:
-    """Feed one recording and look at clock and memory every minute."""
+def run_case(task: tuple[str, float]) -> dict[str, Any]:
+    """Feed one recording of so many seconds and look at clock and memory every minute."""
+    name, duration = task
     scenario, configure, changes = CASES[name]
     simulation = simulate(scenario, imu_grade='mems', duration=duration)
     aligner = Aligner(configure(simulation, **changes))
@@ -99,7 +103,7 @@ def resident_mb() -> float:
 
 
 def figure(results: list[dict[str, Any]]) -> Any:
-    """Draw time and memory over the hour."""
+    """Draw time and memory over the minutes."""
     picture = new_figure(10.0, 4.0)
     left, right = picture.subplots(1, 2)
     for name, result in zip(CASES, results):
