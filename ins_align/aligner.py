@@ -33,8 +33,8 @@ from ins_align.methods import Epoch as MethodEpoch
 from ins_align.methods import ImuSteps, MapMethod, Method, NoteMethod, Nuisance
 from ins_align.plausibility import ForceCheck, VelocityCheck
 from ins_align.preintegration import Noise, split_at_epochs, white_noise
-from ins_align.rotation import (Array, exp_so3, orthonormalized, quaternion_from_matrix,
-                                roll_pitch_yaw)
+from ins_align.rotation import (Array, cumulative_rotations, exp_so3, orthonormalized,
+                                quaternion_from_matrix, roll_pitch_yaw)
 from ins_align.unknowns import Prior
 import numpy as np
 
@@ -140,6 +140,17 @@ class Status:
     counts: dict[str, int]
 
 
+@dataclass
+class _Now:
+    """The attitude carried on from the last epoch with the gyros."""
+
+    stamp_ns: int
+    C_nb: Array
+    gyro_bias: Array
+    scale: Array
+    bias_variance: float
+
+
 class Aligner:
     """
     In-motion alignment from messages as they come.
@@ -184,7 +195,7 @@ class Aligner:
         self._current: Attitude | None = None
         self._time_to_align_s: float | None = None
         self.declared: Attitude | None = None
-        self._now: tuple[int, Array] | None = None
+        self._now: _Now | None = None
 
     # Input
 
@@ -284,7 +295,7 @@ class Aligner:
                 done.append(epoch)
         self._dry_epochs(upto_ns)
         if self._method is None:
-            self._imu.forget_before(upto_ns)
+            self._imu.forget_before(upto_ns - NOISE_WINDOW_NS)
             if self._verdict.state is State.WAITING_FOR_IMU:
                 self._set_verdict(Verdict(State.WAITING_FOR_GNSS, 'no GNSS position yet'))
         return done
@@ -437,7 +448,8 @@ class Aligner:
         self._force_check.add(samples[:, 3:])
         steps = split_at_epochs(seconds, samples[:, :3], samples[:, 3:],
                                 np.array([0.0, (stamp_ns - start_ns) * 1e-9]))
-        noise = self._noise(seconds, samples, steps.dt)
+        window = int(np.searchsorted(stamps, start_ns - NOISE_WINDOW_NS))
+        noise = self._noise(seconds[window:], samples[window:], steps.dt)
         self._imu.forget_before(stamp_ns - NOISE_WINDOW_NS)
         self._imu.used_ns = stamp_ns
         return ImuSteps(steps, noise)
@@ -474,13 +486,16 @@ class Aligner:
             fit = method.fit()
         initial, current = method.initial(), method.current()
         self._now = None
+        measured = epoch.v_n is not None or epoch.position_measured
+        verdict = self._verdict
         if initial is None or current is None:
             self._initial = self._current = None
             verdict = Verdict(State.ALIGNING, f'{fit.offered} GNSS epochs so far: more are '
                                               'needed')
         else:
-            verdict = self._declaration.update(time_s, (initial[1], current[1]), fit,
-                                               method.unconfirmed)
+            if measured:
+                verdict = self._declaration.update(time_s, (initial[1], current[1]), fit,
+                                                   method.unconfirmed)
             scale = fit.factor ** 2 if math.isfinite(fit.factor) else 1.0
             self._initial = Attitude(method.t0_ns, initial[0], initial[1] * scale)
             self._current = Attitude(stamp_ns, current[0], current[1] * scale)
@@ -516,23 +531,24 @@ class Aligner:
             return None
         self._imu.consolidate()
         if self._now is None:
-            C = (method.current() or (None,))[0]
-            assert C is not None
-            self._now = self._last_ns, C
-        stamp_ns, C = self._now
-        first = int(np.searchsorted(self._imu.stamps, stamp_ns, side='right'))
+            nuisance = method.nuisance()
+            gyro_bias, _, gyro_scale = method.sensor_errors()
+            self._now = _Now(self._last_ns, current.C_nb, gyro_bias, 1 - gyro_scale,
+                             float(np.max(nuisance.gyro_bias_std) ** 2) + EARTH_RATE ** 2)
+        now = self._now
+        first = int(np.searchsorted(self._imu.stamps, now.stamp_ns, side='right'))
         if first < self._imu.stamps.size:
-            bias, _, scale = method.sensor_errors()
-            stamps = np.concatenate([[stamp_ns], self._imu.stamps[first:]])
-            for dt, omega in zip(np.diff(stamps) * 1e-9, self._imu.samples[first:, :3]):
-                C = C @ exp_so3((omega * (1 - scale) - bias) * dt)
-            C = orthonormalized(C)
-            stamp_ns = int(stamps[-1])
-            self._now = stamp_ns, C
-        age = (stamp_ns - self._last_ns) * 1e-9
+            stamps = self._imu.stamps[first:]
+            dt = np.diff(stamps, prepend=now.stamp_ns) * 1e-9
+            omega = self._imu.samples[first:, :3] * now.scale - now.gyro_bias
+            turns = exp_so3(omega * dt[:, None])
+            turned = turns[0] if dt.size == 1 else cumulative_rotations(turns)[-1]
+            now.C_nb = orthonormalized(now.C_nb @ turned)
+            now.stamp_ns = int(stamps[-1])
+        age = (now.stamp_ns - self._last_ns) * 1e-9
         drift = (self.config.imu_noise.angle_random_walk ** 2 * age
-                 + (np.max(method.nuisance().gyro_bias_std) ** 2 + EARTH_RATE ** 2) * age ** 2)
-        return Attitude(stamp_ns, C, current.covariance + drift * np.eye(3))
+                 + now.bias_variance * age ** 2)
+        return Attitude(now.stamp_ns, now.C_nb, current.covariance + drift * np.eye(3))
 
     def status(self) -> Status:
         """Return the state, the reason for it, the estimates and the counts."""

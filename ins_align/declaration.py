@@ -77,6 +77,7 @@ class Declaration:
         self.levelled = False
         self.aligned = False
         self._recent_nis = 1.0
+        self._rejected = 0
 
     def update(self, time_s: float, covariances: tuple[Array, ...], fit: Fit,
                unconfirmed: Callable[[], str]) -> Verdict:
@@ -106,7 +107,10 @@ class Declaration:
         tilt = math.degrees(max(math.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1])
                                 for P in covariances)) * factor
         heading = math.degrees(max(math.sqrt(P[2, 2]) for P in covariances)) * factor
-        good = not contradiction and fit.converged and fit.dof >= MIN_DOF
+        rejected = fit.rejected_velocity + fit.rejected_position
+        just_rejected, self._rejected = rejected > self._rejected, rejected
+        good = (not contradiction and not just_rejected and fit.converged
+                and fit.dof >= MIN_DOF)
         tilt_good = good and tilt <= self.config.tilt_std_threshold
         heading_good = tilt_good and heading <= self.config.heading_std_threshold
         self._level_since_s = _since(self._level_since_s, time_s, tilt_good)

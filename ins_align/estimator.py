@@ -40,8 +40,8 @@ WEAK_INFORMATION = np.zeros(SIZE)
 WEAK_INFORMATION[ATTITUDE] = UNIFORM_ANGLE_STD ** -2
 WEAK_INFORMATION[START_VELOCITY] = 1e4 ** -2
 WEAK_INFORMATION[START_POSITION] = 1e7 ** -2
-# The motion that the fit attributes to the vehicle has the noise of what was fitted to it, one unit
-# of information for each: horizontal slope (tilt) and curvature (gyro bias) of the velocity.
+# The motion that the fit attributes to the vehicle has the noise of what was fitted to it, one
+# unit of information for each: horizontal slope (tilt) and curvature (gyro bias) of the velocity.
 FITTED_DIRECTIONS = 4
 # Median of chi-square with three degrees of freedom.
 MEDIAN_CHI2_3 = 2.366
@@ -147,6 +147,7 @@ class MapEstimator:
         self.fits = 0
         self._nonlinearity = 0.0
         self.excess = excess
+        self._gated = True
         self._recent: deque[float] = deque(maxlen=self.GATE_WINDOW)
         self._gate_scale = 1.0
 
@@ -270,7 +271,8 @@ class MapEstimator:
         s.P = inverse_spd(information)
         s.dx = s.P @ right
         column = s.P[:, 2]
-        feigned = min(s.whitener.spurious + FITTED_DIRECTIONS, 1 / column[2] - 1 / UNIFORM_ANGLE_STD ** 2)
+        feigned = min(s.whitener.spurious + FITTED_DIRECTIONS,
+                      1 / column[2] - 1 / UNIFORM_ANGLE_STD ** 2)
         s.P = s.P + np.outer(column, column) * feigned / (1 - feigned * column[2])
         s.chi2 = float(s.whitener.normal[0, 0] + s.mean_step @ s.information @ s.mean_step
                        - right @ s.dx)
@@ -311,7 +313,7 @@ class MapEstimator:
         else:
             starts = [self.estimate()]
         resolved = old is not None and self.heading_std < HEADING_RESOLVED_STD
-        gate = old.P if old is not None and resolved else None
+        gate = old.P if old is not None and resolved and self._gated else None
         if not resolved and self.count >= self.FIRST_FIT:
             rough = self._rough_attitude(starts[0])
             if old is None and not self._prior.information[0, 0] > 0:
@@ -422,6 +424,7 @@ class MapEstimator:
                                  capacity=gnss.time.size, excess=self.excess)
             trial._intervals, trial._gnss = raw.mirrored(*signs), gnss
             trial.count = gnss.time.size
+            trial._gated = False           # or the wrong signs throw out what speaks against them
             trial._fit()
             trial._fit()
             assert trial.solution is not None
