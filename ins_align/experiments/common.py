@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+import io
 import json
 import math
 import multiprocessing
@@ -37,6 +38,7 @@ LATENESS = 0.5
 GRADES = ('navigation', 'tactical', 'mems')
 _THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 _PROGRESS_STEP = 0.02
+COLOURS = 64        # of a figure
 
 
 def parallel(function: Callable[[Any], Any], tasks: Sequence[Any],
@@ -223,8 +225,13 @@ class Report:
 
     def figure(self, figure: Any, suffix: str, caption: str) -> None:
         """Write a figure as PNG and refer to it."""
+        from PIL import Image
+
         file = f'{self._name}{suffix}.png'
-        figure.savefig(self._out / file, dpi=110)
+        drawn = io.BytesIO()
+        figure.savefig(drawn, dpi=110)
+        # A palette makes the files of the documentation a third as large.
+        Image.open(drawn).convert('RGB').quantize(COLOURS).save(self._out / file, optimize=True)
         self._parts.append(f'![{caption}]({file})\n\n{caption}')
         print(f'{self._out / file}: {caption}\n')
 
