@@ -399,8 +399,6 @@ class Aligner:
         if self._first_fix_ns is None:
             self._first_fix_ns = epoch.stamp_ns
         wanted = self.config.use_velocity is not False
-        if self.config.method == 'pif' and self.config.use_velocity == 'auto':
-            wanted = True
         alone = (not wanted or (self.config.use_velocity == 'auto' and self.config.method != 'vif'
                                 and epoch.stamp_ns - self._first_fix_ns >= NO_VELOCITY_NS))
         if epoch.v_n is None and not alone:

@@ -144,7 +144,6 @@ class MapEstimator:
         self.count = 0
         self.solution: Solution | None = None
         self._last_fit = self._last_tuned = 0
-        self.fits = 0
         self._nonlinearity = 0.0
         self.excess = excess
         self._gated = True
@@ -298,7 +297,6 @@ class MapEstimator:
                 s, P = self._start(point), None
                 self._extend(s, slice(0, self.count), None)
             self._solve(s)
-            self.fits += 1
             if self.nonlinearity(s) <= self.NONLINEARITY:
                 break
             point = self.estimate(s)
@@ -308,17 +306,13 @@ class MapEstimator:
         """Move the linearisation point; while the heading is not resolved, try the q-method."""
         self._last_fit = self.count
         old = self.solution
-        if old is None:
-            starts = [self._prior.mean]
-        else:
-            starts = [self.estimate()]
         resolved = old is not None and self.heading_std < HEADING_RESOLVED_STD
         gate = old.P if old is not None and resolved and self._gated else None
+        here = self.estimate()
+        known = old is not None or self._prior.information[0, 0] > 0
+        starts = [here] if known else []
         if not resolved and self.count >= self.FIRST_FIT:
-            rough = self._rough_attitude(starts[0])
-            if old is None and not self._prior.information[0, 0] > 0:
-                starts = []
-            starts.append(replace(starts[0] if starts else self._prior.mean, C=rough))
+            starts.append(replace(here, C=self._rough_attitude(here)))
         solutions = [self._converge(start, gate) for start in starts]
         self.solution = min(solutions, key=lambda s: s.chi2)
         self._nonlinearity = self.nonlinearity()
