@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The command ``ins_align``: replay recordings, simulate, repeat experiments."""
+"""The command ``ins_align``: look into recordings, replay, simulate, repeat experiments."""
 
 from __future__ import annotations
 
@@ -37,11 +37,28 @@ DESCRIPTION = """\
 Finds roll, pitch and true heading of a moving IMU with a GNSS receiver.
 
 commands:
+  info        tell what recordings hold and how to align them, before any run
   replay      align recordings (rosbag2 mcap and sqlite3, ROS 1), no ROS needed
   simulate    write a recording of a simulated vehicle, with truth
   experiment  repeat a documented experiment: figure and numbers
 
 "ins_align COMMAND --help" explains each.
+"""
+
+INFO_EPILOG = """\
+It reads the topics that an alignment could use and tells their rates and gaps, how old stamps are
+when recorded, the unit and the noise of the IMU, the frame of the velocity, whether the motion
+shows a heading and from when on, and the "ins_align replay" command with the options that the
+recording needs.
+
+exit status:
+  0  told, whether it can be aligned or not
+  2  bad usage or a recording that cannot be read
+
+With several recordings --json writes an array with an object for each.
+
+example:
+  ins_align info drive.bag
 """
 
 REPLAY_EPILOG = """\
@@ -117,6 +134,7 @@ def parser() -> argparse.ArgumentParser:
                  formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = top.add_subparsers(dest='command', metavar='COMMAND', required=True,
                                   help=argparse.SUPPRESS)
+    _add_info(commands)
     _add_replay(commands)
     _add_simulate(commands)
     _add_experiment(commands)
@@ -150,10 +168,21 @@ def _count(text: str) -> int:
 _seconds.__name__, _count.__name__ = 'number of seconds', 'number of 1 or more'
 
 
-def _add_replay(commands: Any) -> None:
-    command = _add_command(commands, 'replay', run_replay, 'Align recordings.', REPLAY_EPILOG)
+def _add_info(commands: Any) -> None:
+    command = _add_command(commands, 'info', run_info,
+                           'Tell what recordings hold and how to align them.', INFO_EPILOG)
+    _add_bags(command)
+    command.add_argument('--json', metavar='FILE', help='write what is known, for programs')
+
+
+def _add_bags(command: argparse.ArgumentParser) -> None:
     command.add_argument('bags', nargs='+', metavar='BAG',
                          help='rosbag2 directory or file (.mcap, .db3), or ROS 1 .bag')
+
+
+def _add_replay(commands: Any) -> None:
+    command = _add_command(commands, 'replay', run_replay, 'Align recordings.', REPLAY_EPILOG)
+    _add_bags(command)
     group = command.add_argument_group('parameters')
     group.add_argument('--params', metavar='FILE', help='parameter file of the node (YAML)')
     group.add_argument('--set', action='append', default=[], metavar='NAME=VALUE',
@@ -236,6 +265,34 @@ def _add_experiment(commands: Any) -> None:
     command.add_argument('--data', metavar='DIR', help='folder of the real recordings')
     command.add_argument('--runs', type=_count, metavar='N', help='of a Monte Carlo experiment')
     command.add_argument('--jobs', type=_count, metavar='N', help='processes at a time')
+
+
+def run_info(arguments: argparse.Namespace) -> int:
+    """Run ``ins_align info``."""
+    _check_writable(arguments.json)
+    from ins_align.bag_files import BagError
+    from ins_align.info import describe, inspect
+
+    several = len(arguments.bags) > 1
+    objects: list[dict[str, Any]] = []
+    status = 0
+    for bag in arguments.bags:
+        try:
+            info = inspect(bag)
+        except BagError as error:
+            if not several:
+                raise UsageError(error) from None
+            print(f'ins_align info: {error}', file=sys.stderr)
+            objects.append({'bag': bag, 'error': str(error)})
+            status = UNUSABLE
+            continue
+        for warning in info.warnings:
+            print(f'ins_align info: warning: {warning}', file=sys.stderr)
+        print(describe(info) + '\n')
+        objects.append(info.to_json())
+    if arguments.json:
+        _write_json(arguments.json, objects if several else objects[0])
+    return status
 
 
 def run_replay(arguments: argparse.Namespace) -> int:

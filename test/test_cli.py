@@ -266,14 +266,13 @@ def test_help_names_the_scenarios():
     assert SCENARIOS.split(', ') == list(simulated)
 
 
-@pytest.mark.parametrize('arguments', [['--help'], ['replay', '--help'], ['simulate', '--help'],
-                                       ['experiment', '--help']])
-def test_help_imports_nothing_heavy(arguments):
+@pytest.mark.parametrize('command', [[], ['info'], ['replay'], ['simulate'], ['experiment']])
+def test_help_imports_nothing_heavy(command):
     code = ('import sys; from ins_align.cli import main\n'
             'try: main(sys.argv[1:])\n'
             'except SystemExit as stop: assert stop.code == 0\n'
             'assert not {"numpy", "rosbags", "matplotlib", "yaml"} & set(sys.modules)')
-    subprocess.run([sys.executable, '-c', code, *arguments], check=True,
+    subprocess.run([sys.executable, '-c', code, *command, '--help'], check=True,
                    stdout=subprocess.DEVNULL, cwd=Path(__file__).parents[1])
 
 

@@ -1,0 +1,241 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The topics of a recording that an alignment could read: all their messages, and their timing."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+import itertools
+import math
+from typing import Any, NamedTuple
+
+from ins_align.bag_files import BagError, Topic
+from ins_align.bags import Bag, FIX_TYPE, IMU_TYPE, REFERENCE_NAMESPACE, VELOCITY_TYPES
+from ins_align.buffers import MAX_ACCELERATION, MAX_RATE, MAX_SPEED, NO_FIX
+from ins_align.config import Config
+from ins_align.decoding import decode_imu, deserialize
+from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
+from ins_align.rotation import Array
+import numpy as np
+
+KINDS = ('imu', 'fix', 'velocity')
+WIDTHS = {'imu': 6, 'fix': 3, 'velocity': 3}
+MAX_ASTRAY = 60.0  # s: a stamp further off the recorded time than the others is not used
+GAP_INTERVALS = 3.5  # times the usual interval without a message is a gap
+
+
+class Gap(NamedTuple):
+    """Time without messages, seconds."""
+
+    start_s: float  # of the recording
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When the messages of a topic came; seconds of the recording."""
+
+    count: int
+    rate_hz: float | None
+    first_s: float | None  # recorded
+    last_s: float | None
+    stamp_age_s: float | None  # recorded time less the header's stamp, median
+    stamp_age_spread_s: float | None  # 98 percent of the ages lie within this
+    astray: int  # stamps more than MAX_ASTRAY off the usual age
+    out_of_order: int  # stamps that are not later than the one before
+    gaps: int
+    longest_gap: Gap | None
+
+
+class Recorded:
+    """
+    All messages of a topic, in recorded order.
+
+    Parameters
+    ----------
+    topic : Topic
+        Of one of the types that an alignment reads.
+    kind : str
+        One of KINDS.
+
+    """
+
+    def __init__(self, topic: Topic, kind: str) -> None:
+        self.topic = topic
+        self.kind = kind
+        self.recorded_ns = np.zeros(0, np.int64)
+        self.stamps_ns = np.zeros(0, np.int64)
+        # (N, 6) rate and specific force, (N, 3) latitude, longitude, altitude in degrees and
+        # metres, or (N, 3) velocity as if it were ENU.
+        self.values: Array = np.zeros((0, WIDTHS[kind]))
+        self.sigmas: Array = np.zeros((0, 2))  # stated, horizontal and vertical; NaN: none
+        self.usable = np.zeros(0, bool)  # finite and, of fixes, with a fix
+        self.no_fix = 0
+        self.undecodable = 0
+        self.refusals: Counter[str] = Counter()  # why messages cannot be used, in words
+        self._rows: list[tuple[Any, ...]] = []
+        self._config = Config(velocity_type=topic.msgtype.rsplit('/', 1)[-1]
+                              if kind == 'velocity' else Config.velocity_type)
+
+    def add(self, times_ns: list[int], messages: list[bytes]) -> None:
+        """Decode messages."""
+        if self.kind == 'imu':
+            if not self._rows and not self.refusals:
+                self._look_at(messages[0])
+            samples = decode_imu(messages, self.topic)
+            self.undecodable += int(np.count_nonzero(~samples.decoded))
+            self._rows.append((np.array(times_ns)[samples.decoded], samples.stamps_ns,
+                               np.hstack([samples.gyro, samples.accel])))
+            return
+        for time_ns, data in zip(times_ns, messages):
+            try:
+                message = deserialize(data, self.topic)
+            except MessageError:
+                self.undecodable += 1
+                continue
+            try:
+                self._add_gnss(time_ns, fix_from_msg(message) if self.kind == 'fix'
+                               else velocity_from_msg(message, self._config))
+            except MessageError as error:
+                self.refusals[str(error)] += 1
+
+    def finish(self) -> None:
+        """Turn what has been added into arrays."""
+        rows, self._rows = self._rows, []
+        if not rows:
+            return
+        if self.kind == 'imu':
+            self.recorded_ns, self.stamps_ns, self.values = (
+                np.concatenate(columns) for columns in zip(*rows))
+            limits = [MAX_RATE] * 3 + [MAX_ACCELERATION] * 3
+            self.usable = np.asarray(np.all(np.abs(self.values) < limits, axis=1))
+        else:
+            times, stamps, values, sigmas, usable = zip(*rows)
+            self.recorded_ns, self.stamps_ns = np.array(times), np.array(stamps)
+            self.values, self.sigmas = np.array(values), np.array(sigmas)
+            self.usable = np.array(usable)
+        self.usable &= ~self._astray()
+
+    def times(self, start_ns: int) -> Array:
+        """
+        Return the stamps as seconds of the recording, shape (N,).
+
+        They are moved by the median age of the messages: clocks that differ do not matter.
+        """
+        return (self.stamps_ns - start_ns + self.age_ns).astype(float) * 1e-9
+
+    @property
+    def age_ns(self) -> int:
+        """Median of recorded time less stamp."""
+        if not self.stamps_ns.size:
+            return 0
+        return int(np.median(self.recorded_ns - self.stamps_ns))
+
+    def timing(self, start_ns: int) -> Timing:
+        """Return when messages came."""
+        count = self.stamps_ns.size
+        if count == 0:
+            return Timing(self.undecodable + self.refusals.total(), None, None, None, None, None,
+                          0, 0, 0, None)
+        ages = (self.recorded_ns - self.stamps_ns) * 1e-9
+        astray = self._astray()
+        low, high = np.quantile(ages[~astray], (0.01, 0.99)).tolist()
+        steps = np.diff(self.stamps_ns[~astray])
+        stamps = np.unique(self.stamps_ns[~astray])
+        rate = gap = None
+        gaps = np.zeros(0, int)
+        if stamps.size > 1:
+            intervals = np.diff(stamps) * 1e-9
+            usual = float(np.median(intervals))
+            rate = 1.0 / usual
+            gaps = np.flatnonzero(intervals > GAP_INTERVALS * usual)
+            if gaps.size:
+                longest = int(gaps[np.argmax(intervals[gaps])])
+                gap = Gap(float(stamps[longest] - start_ns + self.age_ns) * 1e-9,
+                          float(intervals[longest]))
+        return Timing(
+            count + self.undecodable + self.refusals.total(), rate,
+            (int(self.recorded_ns[0]) - start_ns) * 1e-9,
+            (int(self.recorded_ns[-1]) - start_ns) * 1e-9,
+            float(np.median(ages)), high - low, int(np.count_nonzero(astray)),
+            int(np.count_nonzero(steps <= 0)), gaps.size, gap)
+
+    def _astray(self) -> np.ndarray:
+        """Return which stamps are of another time than the others."""
+        ages = self.recorded_ns - self.stamps_ns
+        astray: np.ndarray = np.abs(ages - self.age_ns) > MAX_ASTRAY * 1e9
+        return astray
+
+    def _look_at(self, data: bytes) -> None:
+        """See whether an IMU says that it does not measure what is needed."""
+        try:
+            message = deserialize(data, self.topic)
+        except MessageError:
+            return
+        if -1.0 in (message.angular_velocity_covariance[0],
+                    message.linear_acceleration_covariance[0]):
+            self.refusals['its messages say that it does not measure rate or specific force '
+                          '(covariance -1)'] = 0
+
+    def _add_gnss(self, time_ns: int, message: Fix | Velocity) -> None:
+        if isinstance(message, Fix):
+            values = (message.latitude_deg, message.longitude_deg, message.altitude_m)
+            has_fix = message.status != NO_FIX
+            usable = has_fix and abs(values[0]) <= 90.0 and abs(values[1]) <= 360.0
+            self.no_fix += not has_fix
+        else:
+            values = tuple(message.velocity.tolist())
+            usable = max(map(abs, values)) < MAX_SPEED
+        covariance = message.covariance
+        sigmas = (math.nan, math.nan) if covariance is None else (
+            math.sqrt((covariance[0, 0] + covariance[1, 1]) / 2.0), math.sqrt(covariance[2, 2]))
+        self._rows.append((time_ns, message.stamp_ns, values, sigmas,
+                           usable and all(map(math.isfinite, values))))
+
+
+def read_candidates(bag: Bag) -> list[Recorded]:
+    """
+    Read every topic that an alignment could read, sorted by kind and name.
+
+    Raises
+    ------
+    BagError
+        If the recording cannot be read.
+
+    """
+    candidates = sorted((Recorded(topic, kind) for topic in bag.topics
+                         if (kind := _kind(topic)) and REFERENCE_NAMESPACE not in topic.name),
+                        key=lambda data: (KINDS.index(data.kind), data.topic.name))
+    topics = [data.topic for data in candidates]
+    try:
+        for block in bag.blocks(topics) if topics else ():
+            indices = np.array(block.topics)
+            for index in np.unique(indices).tolist():
+                chosen = (indices == index).tolist()
+                candidates[index].add(list(itertools.compress(block.times_ns, chosen)),
+                                      list(itertools.compress(block.messages, chosen)))
+    except OSError as error:
+        raise BagError(f'{bag.path} cannot be read: {error.strerror}') from None
+    for data in candidates:
+        data.finish()
+    return candidates
+
+
+def _kind(topic: Topic) -> str:
+    if topic.msgtype == IMU_TYPE:
+        return 'imu'
+    if topic.msgtype == FIX_TYPE:
+        return 'fix'
+    return 'velocity' if topic.msgtype in VELOCITY_TYPES.values() else ''

@@ -1,0 +1,362 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What is told of a recording before a run, against recordings whose faults are known."""
+
+import dataclasses
+import json
+import math
+import shlex
+
+from ins_align.bag_files import BagError
+from ins_align.bags import Bag
+from ins_align.cli import main
+from ins_align.decoding import deserialize
+from ins_align.info import describe, inspect
+from ins_align.motion_survey import find_manoeuvres, Series, track, velocity_frame
+from ins_align.simulation import simulate, write_bag
+import numpy as np
+import pytest
+from recordings import FIX, IMU, real_recording, TWIST, typestore, write_messages, write_recording
+
+TOPICS = {'/imu/data_raw': IMU, '/fix': FIX, '/fix_velocity': TWIST}
+
+
+@pytest.fixture(scope='module')
+def drive(tmp_path_factory):
+    """Record a car that stands still for 15 s; its messages."""
+    path = tmp_path_factory.mktemp('info') / 'drive'
+    write_bag(simulate('car', seed=1, duration=60.0, stand_still=15.0, imu_grade='tactical'), path)
+    with Bag(path) as bag:
+        topics = [topic for topic in bag.topics if topic.name in TOPICS]
+        messages = [(topic, time, data) for topic, time, data in bag.messages(topics)]
+    return path, messages
+
+
+@pytest.fixture
+def changed(drive, tmp_path):
+    """Return a function that writes the drive with its messages changed by another."""
+    def write(change, kind='mcap', name='changed', topics=None):
+        messages = ((topic.name, time, deserialize(data, topic))
+                    for topic, time, data in drive[1])
+        return write_messages(tmp_path / name, kind, (
+            new for message in messages for new in change(*message)), topics or TOPICS)
+    return write
+
+
+def by_name(info, name):
+    return next(topic for topic in info.topics if topic.name == name)
+
+
+def velocity_changed(function):
+    """Return a change of each velocity in place."""
+    def change(name, time, message):
+        if name == '/fix_velocity':
+            linear = message.twist.twist.linear
+            linear.x, linear.y, linear.z = (
+                float(value) for value in function(linear.x, linear.y, linear.z))
+        return [(name, time, message)]
+    return change
+
+
+def command_of(info):
+    assert info.command is not None, info.obstacles
+    arguments = shlex.split(info.command)
+    assert arguments[:3] == ['ins_align', 'replay', info.bag]
+    return arguments[3:]
+
+
+def test_good_recording(drive):
+    path, _ = drive
+    info = inspect(path)
+    assert command_of(info) == ['--set', 'imu_grade=tactical']
+    assert info.notes == info.obstacles == info.warnings == ()
+    assert [topic.name for topic in info.topics] == list(TOPICS)
+    imu, fix, velocity = info.topics
+    assert imu.timing.count == 6001 and imu.timing.rate_hz == pytest.approx(100.0)
+    assert fix.timing.rate_hz == pytest.approx(5.0)
+    assert imu.timing.gaps == fix.timing.gaps == 0
+    assert velocity.frame.frame == 'enu'
+    assert velocity.frame.speed_ratio == pytest.approx(1.0, abs=0.1)
+    assert velocity.sigma == pytest.approx((0.1, 0.1))
+    assert fix.sigma == pytest.approx((2.5, 5.0))
+    assert velocity.vertical_absent is False
+    # It sets off after 15 s and then gains 5 m/s in some seconds.
+    assert 13.0 < info.manoeuvres.starts[0] < 20.0
+    assert info.heading.startswith('yes')
+
+
+def test_noise_and_bias_are_those_of_the_simulation(drive):
+    imu = inspect(drive[0]).topics[0].imu
+    truth = simulate('car', seed=1, duration=60.0, stand_still=15.0, imu_grade='tactical')
+    noise = truth.imu_noise
+    assert imu.angle_random_walk == pytest.approx(
+        math.degrees(noise.angle_random_walk) * 60.0, rel=0.1)
+    assert imu.velocity_random_walk == pytest.approx(noise.velocity_random_walk * 60.0, rel=0.1)
+    assert 12.0 < imu.rest_s < 16.0
+    still = truth.truth_gyro[200:1200].mean(axis=0) + truth.gyro_bias
+    sigma = noise.angle_random_walk / math.sqrt(imu.rest_s)
+    assert np.radians(imu.rest_rate_deg_s) == pytest.approx(still, abs=3.0 * sigma)
+    assert imu.turn_ratio == pytest.approx(1.0, abs=0.1)
+    assert imu.grade == 'tactical' and imu.grade_is_sure
+
+
+@pytest.mark.parametrize('grade', ['navigation', 'mems'])
+def test_grade_at_rest(tmp_path, grade):
+    write_bag(simulate('static', seed=2, duration=40.0, imu_grade=grade), tmp_path / 'a')
+    info = inspect(tmp_path / 'a')
+    assert info.topics[0].imu.grade == grade
+    assert info.heading.startswith('no')
+    assert info.manoeuvres.starts == ()
+
+
+def test_noise_in_motion_is_an_upper_bound_only(tmp_path):
+    write_bag(simulate('flight', seed=2, duration=30.0, imu_grade='navigation'), tmp_path / 'a')
+    info = inspect(tmp_path / 'a')
+    assert not info.topics[0].imu.grade_is_sure
+    assert command_of(info) == []
+    assert 'at most, measured in motion' in describe(info)
+
+
+@pytest.mark.parametrize('function, settings', [
+    (lambda e, n, u: (n, e, -u), ['velocity_frame=ned']),
+    (lambda e, n, u: (e, n, 0.0), ['velocity_vertical=absent']),
+    (lambda e, n, u: (n, e, 0.0), ['velocity_frame=ned', 'velocity_vertical=absent']),
+    (lambda e, n, u: (math.hypot(e, n), 0.01, u), ['use_velocity=false']),
+    (lambda e, n, u: (0.8 * e - 0.6 * n, 0.6 * e + 0.8 * n, u), ['use_velocity=false']),
+    (lambda e, n, u: (3.6 * e, 3.6 * n, 3.6 * u), ['use_velocity=false'])],
+    ids=['ned', 'flat', 'flat ned', 'body', 'turned', 'km/h'])
+def test_frame_of_the_velocity(changed, function, settings):
+    info = inspect(changed(velocity_changed(function)))
+    useless = settings == ['use_velocity=false']
+    if not useless:  # standing still is not seen in positions of 2.5 m
+        settings = ['imu_grade=tactical', *settings]
+    assert command_of(info) == [word for setting in settings for word in ('--set', setting)]
+    assert bool(by_name(info, '/fix_velocity').faults) == useless
+
+
+def test_velocity_that_says_it_is_in_the_body_frame(changed):
+    def change(name, time, message):
+        if name == '/fix_velocity':
+            message.header.frame_id = 'base_link'
+        return [(name, time, message)]
+
+    info = inspect(changed(change))
+    assert 'base_link' in by_name(info, '/fix_velocity').faults[0]
+    assert 'use_velocity=false' in info.command
+
+
+def test_no_velocity_topic(changed):
+    info = inspect(changed(lambda name, *rest: [(name, *rest)] if name != '/fix_velocity' else [],
+                           topics={name: TOPICS[name] for name in ('/imu/data_raw', '/fix')}))
+    assert command_of(info) == []
+    assert 'positions alone' in info.notes[0]
+    assert info.chosen['velocity'] is None
+    assert info.heading.startswith('yes')
+
+
+def test_two_imus_quoted_for_a_shell(changed):
+    """The one whose gravity is taken out is not proposed, and names stay words of a shell."""
+    vector = typestore().types['geometry_msgs/msg/Vector3']
+    odd = '/camera/imu; touch x'
+
+    def change(name, time, message):
+        copies = [(name, time, message)]
+        if name == '/imu/data_raw':
+            copies.append((odd, time, dataclasses.replace(
+                message, linear_acceleration=vector(0.1, 0.0, 0.0))))
+        return copies
+
+    info = inspect(changed(change, name="it's a bag", topics={**TOPICS, odd: IMU}))
+    assert command_of(info) == ['--imu-topic', '/imu/data_raw', '--set', 'imu_grade=tactical']
+    assert 'gravity is 9.8' in by_name(info, odd).faults[0]
+
+
+@pytest.mark.parametrize('factors, word', [((57.29578, 1.0), 'deg/s'), ((-1.0, 1.0), 'sign'),
+                                           ((1.0, 0.10197), 'unit (g?)')])
+def test_units_and_signs_of_the_imu(changed, factors, word):
+    def change(name, time, message):
+        if name == '/imu/data_raw':
+            for vector, factor in zip((message.angular_velocity, message.linear_acceleration),
+                                      factors):
+                vector.x, vector.y, vector.z = (
+                    vector.x * factor, vector.y * factor, vector.z * factor)
+        return [(name, time, message)]
+
+    info = inspect(changed(change))
+    assert word in by_name(info, '/imu/data_raw').faults[0]
+    assert info.command is None
+    assert word in info.obstacles[0]
+
+
+def test_late_messages(changed):
+    info = inspect(changed(lambda name, time, message: [
+        (name, time + (2_000_000_000 if name != '/imu/data_raw' else 0), message)]))
+    assert info.gnss_lateness_s == pytest.approx(2.0, abs=0.05)
+    assert by_name(info, '/fix').timing.stamp_age_s == pytest.approx(2.0, abs=0.01)
+    assert '--set gnss_lateness=2.5' in info.command
+
+
+def test_different_clocks(changed):
+    def change(name, time, message):
+        if name != '/imu/data_raw':
+            message.header.stamp.sec -= 1_000_000
+        return [(name, time, message)]
+
+    info = inspect(changed(change))
+    assert info.command is None
+    assert 'different clocks' in info.obstacles[0]
+
+
+def test_stamps_gone_astray(changed):
+    """Some stamps of 0 neither stretch the time over decades nor spoil what is measured."""
+    def change(name, time, message):
+        if time % 7 == 0:
+            message.header.stamp.sec = 0
+        return [(name, time, message)]
+
+    info = inspect(changed(change))
+    imu = by_name(info, '/imu/data_raw')
+    assert imu.timing.astray > 500
+    assert imu.imu.grade == 'tactical'
+    assert by_name(info, '/fix_velocity').frame.frame == 'enu'
+
+
+def test_gaps_and_no_fix(changed, drive):
+    start = drive[1][0][1]
+
+    def change(name, time, message):
+        seconds = (time - start) * 1e-9
+        if name == '/imu/data_raw' and 30.0 < seconds < 33.0:
+            return []
+        if name == '/fix' and seconds > 45.0:
+            message.status.status = -1
+        return [(name, time, message)]
+
+    info = inspect(changed(change, 'sqlite3 file'))
+    gap = by_name(info, '/imu/data_raw').timing.longest_gap
+    assert gap == pytest.approx((30.0, 3.0), abs=0.03)
+    assert 'silent for 3.0 s' in info.notes[0]
+    assert by_name(info, '/fix').no_fix_share == pytest.approx(0.25, abs=0.01)
+    assert '25%' in info.notes[1]
+
+
+def test_nothing_has_a_fix(changed):
+    def change(name, time, message):
+        if name == '/fix':
+            message.status.status = -1
+        return [(name, time, message)]
+
+    info = inspect(changed(change))
+    assert info.command is None and 'no message has a fix' in info.obstacles[0]
+
+
+@pytest.mark.parametrize('topics', [{'/fix': FIX}, {'/imu': IMU}, {'/fix_velocity': TWIST}, {
+    '/reference/imu': IMU}])
+def test_topics_that_are_missing(tmp_path, topics):
+    info = inspect(write_recording(tmp_path / 'a', 'mcap', 6.0, topics))
+    assert info.command is None
+    assert 'has no ' in info.obstacles[-1]
+    assert 'it cannot be aligned' in describe(info)
+    json.dumps(info.to_json(), allow_nan=False)
+
+
+def test_values_that_are_no_numbers(changed):
+    def change(name, time, message):
+        if name == '/imu/data_raw' and time % 3 == 0:
+            message.angular_velocity.x = math.nan
+        if name == '/fix':
+            message.altitude = math.nan
+        if name == '/fix_velocity':
+            message.twist.twist.linear.z = math.inf
+        return [(name, time, message)]
+
+    info = inspect(changed(change))
+    assert by_name(info, '/imu/data_raw').imu.grade == 'tactical'
+    assert by_name(info, '/fix').usable_share == 0.0
+    json.dumps(info.to_json(), allow_nan=False)
+
+
+def test_text_of_a_recording_cannot_move_the_cursor(tmp_path):
+    info = inspect(write_recording(tmp_path / 'a', 'mcap', 6.0, {'/imu\x1b[2J': IMU, '/fix': FIX}))
+    assert '\x1b' not in describe(info)
+
+
+@pytest.mark.parametrize('content, message', [(b'', 'is empty'), (b'x' * 100, 'no recording')])
+def test_what_cannot_be_read(tmp_path, content, message):
+    (tmp_path / 'a').write_bytes(content)
+    with pytest.raises(BagError, match=message):
+        inspect(tmp_path / 'a')
+
+
+def test_track_and_manoeuvres_by_hand():
+    """A quarter turn at 10 m/s between two straights of 30 s."""
+    times = np.arange(0.0, 60.0, 0.5)
+    east = np.where(times < 30.0, 10.0, 0.0)
+    velocities = Series(times, np.column_stack([east, 10.0 - east, np.zeros_like(times)]))
+    found = find_manoeuvres(velocities)
+    assert found.max_speed == pytest.approx(10.0)
+    assert found.largest_change == pytest.approx(10.0 * math.sqrt(2.0))
+    assert found.starts == (29.5,)
+    degree = math.degrees(1.0 / 6_371_000.0)
+    north = np.cumsum(velocities.vectors[:, 1]) * 0.5
+    cosine = math.cos(math.radians(60.0))
+    positions = track(times, 60.0 + north * degree, 179.999 + np.remainder(
+        np.cumsum(east) * 0.5 * degree / cosine + 180.0, 360.0) - 180.0, np.zeros_like(times))
+    assert positions.vectors[-1, :2] == pytest.approx([295.0, 300.0], abs=0.2)
+    frame = velocity_frame(velocities, positions)
+    assert frame.frame == 'enu' and frame.windows > 40
+    swapped = Series(times, velocities.vectors[:, [1, 0, 2]])
+    assert velocity_frame(swapped, positions).frame == 'ned'
+
+
+@pytest.mark.parametrize('name, rate, frame, rest, first', [
+    ('uav_thor75', 50.0, 'enu', True, 45.0), ('car_drive0708', 100.0, 'enu', True, 53.0),
+    ('quad_dot08.bag', 120.5, None, False, 2.7)])
+def test_real_recordings(name, rate, frame, rest, first):
+    path = real_recording(name)
+    info = inspect(path)
+    assert info.command == f'ins_align replay {shlex.quote(str(path))}'
+    imu = by_name(info, '/imu/data_raw')
+    assert imu.timing.rate_hz == pytest.approx(rate, rel=0.01)
+    assert imu.faults == () and imu.imu.grade == 'mems' and imu.imu.grade_is_sure == rest
+    assert (info.chosen['velocity'] is None) == (frame is None)
+    if frame:
+        assert by_name(info, '/fix_velocity').frame.frame == frame
+    assert info.manoeuvres.starts[0] == pytest.approx(first, abs=2.0)
+    lines = describe(info).splitlines()
+    assert max(map(len, lines)) < 130
+
+
+def test_command_line(drive, tmp_path, capsys):
+    path, _ = drive
+    out = tmp_path / 'a.json'
+    assert main(['info', str(path), '--json', str(out)]) == 0
+    captured = capsys.readouterr()
+    content = json.loads(out.read_text())
+    assert content['command'] in captured.out and captured.err == ''
+    assert content['topics'][2]['frame']['frame'] == 'enu'
+    assert main(['info', str(tmp_path / 'none')]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == '' and captured.err.count('\n') == 1
+    assert main(['info', str(tmp_path / 'none'), str(path), '--json', str(out)]) == 2
+    content = json.loads(out.read_text())
+    assert 'does not exist' in content[0]['error'] and content[1]['command']
+    assert main(['info', str(path), '--json', str(tmp_path / 'no' / 'a.json')]) == 2
+
+
+def test_proposed_command_runs(changed, capsys):
+    """A recording that does not align by itself does with what is proposed."""
+    path = changed(velocity_changed(lambda e, n, u: (n, e, -u)))
+    assert main(['replay', str(path)]) == 1
+    assert main([*shlex.split(inspect(path).command)[1:], '--set', 'lever_arm=[1,1,1]']) == 0
