@@ -20,6 +20,7 @@ their place and the results depend on the messages alone.
 """
 
 from collections import Counter
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 import math
@@ -32,9 +33,9 @@ from ins_align.messages import Fix, Velocity
 from ins_align.methods import Epoch as MethodEpoch
 from ins_align.methods import ImuSteps, MapMethod, Method, NoteMethod, Nuisance
 from ins_align.plausibility import ForceCheck, VelocityCheck
+from ins_align.prediction import Prediction
 from ins_align.preintegration import Noise, split_at_epochs, white_noise
-from ins_align.rotation import (Array, cumulative_rotations, exp_so3, orthonormalized,
-                                quaternion_from_matrix, roll_pitch_yaw)
+from ins_align.rotation import Array, quaternion_from_matrix, roll_pitch_yaw
 from ins_align.unknowns import Prior
 import numpy as np
 
@@ -140,17 +141,6 @@ class Status:
     counts: dict[str, int]
 
 
-@dataclass
-class _Now:
-    """The attitude carried on from the last epoch with the gyros."""
-
-    stamp_ns: int
-    C_nb: Array
-    gyro_bias: Array
-    scale: Array
-    bias_variance: float
-
-
 class Aligner:
     """
     In-motion alignment from messages as they come.
@@ -195,7 +185,7 @@ class Aligner:
         self._current: Attitude | None = None
         self._time_to_align_s: float | None = None
         self.declared: Attitude | None = None
-        self._now: _Now | None = None
+        self._now: Prediction | None = None
 
     # Input
 
@@ -524,29 +514,26 @@ class Aligner:
 
     def attitude_now(self) -> Attitude | None:
         """Return the current attitude carried on with the gyros to the newest IMU sample."""
+        prediction = self.prediction()
+        return None if prediction is None else Attitude(prediction.stamp_ns,
+                                                        *prediction.matrices())
+
+    def prediction(self) -> Prediction | None:
+        """Return the attitude at the newest IMU sample to be carried on by whoever asks."""
         method, current = self._method, self._current
         if method is None or current is None or self._last_ns is None:
             return None
         self._imu.consolidate()
         if self._now is None:
-            nuisance = method.nuisance()
             gyro_bias, _, gyro_scale = method.sensor_errors()
-            self._now = _Now(self._last_ns, current.C_nb, gyro_bias, 1 - gyro_scale,
-                             float(np.max(nuisance.gyro_bias_std) ** 2) + EARTH_RATE ** 2)
-        now = self._now
-        first = int(np.searchsorted(self._imu.stamps, now.stamp_ns, side='right'))
-        if first < self._imu.stamps.size:
-            stamps = self._imu.stamps[first:]
-            dt = np.diff(stamps, prepend=now.stamp_ns) * 1e-9
-            omega = self._imu.samples[first:, :3] * now.scale - now.gyro_bias
-            turns = exp_so3(omega * dt[:, None])
-            turned = turns[0] if dt.size == 1 else cumulative_rotations(turns)[-1]
-            now.C_nb = orthonormalized(now.C_nb @ turned)
-            now.stamp_ns = int(stamps[-1])
-        age = (now.stamp_ns - self._last_ns) * 1e-9
-        drift = (self.config.imu_noise.angle_random_walk ** 2 * age
-                 + now.bias_variance * age ** 2)
-        return Attitude(now.stamp_ns, now.C_nb, current.covariance + drift * np.eye(3))
+            bias_std = float(np.max(method.nuisance().gyro_bias_std))
+            self._now = Prediction(
+                self._last_ns, current.C_nb, current.covariance, gyro_bias, 1 - gyro_scale,
+                self.config.imu_noise.angle_random_walk, bias_std ** 2 + EARTH_RATE ** 2)
+        stamps = self._imu.stamps
+        first = int(np.searchsorted(stamps, self._now.stamp_ns, side='right'))
+        self._now.carry_many(stamps[first:], self._imu.samples[first:, :3])
+        return copy(self._now)
 
     def status(self) -> Status:
         """Return the state, the reason for it, the estimates and the counts."""

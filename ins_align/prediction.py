@@ -1,0 +1,196 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+The attitude between epochs: carried on with the gyroscopes, sample by sample.
+
+Plain numbers instead of arrays, for the node does this for each IMU message: numpy would take
+several times as long for vectors of three.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+import copy
+import math
+
+from ins_align.rotation import Array, matrix_from_quaternion, quaternion_from_matrix
+import numpy as np
+
+# Faster than this (rad/s) nothing turns, and an attitude is lost when samples are missing for
+# longer (ns).
+MAX_RATE = 200.0
+MAX_GAP_NS = 2_000_000_000
+# So many samples are kept until it is known from which of them on to carry.
+HISTORY = 2000
+_SMALL_ANGLE = 1e-6  # rad: sin(x / 2) / x is 1 / 2 to rounding
+
+
+class Prediction:
+    """
+    An attitude that gyroscopes carry on from an epoch.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        Of the epoch.
+    C_nb : ndarray, shape (3, 3)
+        Body to ENU at the epoch.
+    covariance : ndarray, shape (3, 3)
+        Of the small rotation about the axes of ENU at the epoch, rad^2.
+    gyro_bias, gyro_scale : array_like, shape (3,)
+        The rate is ``measured * gyro_scale - gyro_bias``, rad/s.
+    angle_random_walk : float
+        Of the gyroscopes, rad/sqrt(s).
+    rate_variance : float
+        What else may be wrong with the rate, steadily, (rad/s)^2.
+
+    """
+
+    def __init__(self, stamp_ns: int, C_nb: Array, covariance: Array, gyro_bias: Array,
+                 gyro_scale: Array, angle_random_walk: float, rate_variance: float) -> None:
+        """Stand at the epoch."""
+        self.stamp_ns = stamp_ns
+        x, y, z, w = quaternion_from_matrix(C_nb).tolist()
+        self._quaternion = x, y, z, w
+        self._covariance = tuple(np.asarray(covariance, float).ravel().tolist())
+        self._bias = tuple(np.asarray(gyro_bias, float).tolist())
+        self._scale = tuple(np.asarray(gyro_scale, float).tolist())
+        self._epoch_ns = stamp_ns
+        self._white_variance = angle_random_walk ** 2
+        self._rate_variance = rate_variance
+
+    def carry(self, stamp_ns: int, gyro: Sequence[float]) -> bool:
+        """
+        Carry on to one sample, with its rate for all of the time since the last one.
+
+        Parameters
+        ----------
+        stamp_ns : int
+        gyro : three floats
+            As measured, rad/s.
+
+        Returns
+        -------
+        bool
+            Whether the attitude is now that at the sample. It is not when the sample is old or
+            broken.
+
+        """
+        x, y, z = gyro
+        if stamp_ns <= self.stamp_ns or not (
+                abs(x) < MAX_RATE and abs(y) < MAX_RATE and abs(z) < MAX_RATE):
+            return False
+        dt = (stamp_ns - self.stamp_ns) * 1e-9
+        (scale_x, scale_y, scale_z), (bias_x, bias_y, bias_z) = self._scale, self._bias
+        x, y, z = ((x * scale_x - bias_x) * dt, (y * scale_y - bias_y) * dt,
+                   (z * scale_z - bias_z) * dt)
+        angle = math.sqrt(x * x + y * y + z * z)
+        half_sinc = math.sin(0.5 * angle) / angle if angle > _SMALL_ANGLE else 0.5
+        x, y, z, w = x * half_sinc, y * half_sinc, z * half_sinc, math.cos(0.5 * angle)
+        a, b, c, d = self._quaternion
+        x, y, z, w = (d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x,
+                      d * z + a * y - b * x + c * w, d * w - a * x - b * y - c * z)
+        size = math.sqrt(x * x + y * y + z * z + w * w)
+        self._quaternion = x / size, y / size, z / size, w / size
+        self.stamp_ns = stamp_ns
+        return True
+
+    def carry_many(self, stamps_ns: np.ndarray, gyro: Array) -> None:
+        """Carry on to the last of many samples, shapes (N,), in order, and (N, 3)."""
+        if stamps_ns.size == 0:
+            return
+        dt = np.diff(stamps_ns, prepend=self.stamp_ns) * 1e-9
+        turns = (gyro * self._scale - self._bias) * dt[:, None]
+        half = 0.5 * np.sqrt(np.einsum('ij,ij->i', turns, turns))
+        # numpy's sinc is that of pi x.
+        steps = np.column_stack([0.5 * turns * np.sinc(half / np.pi)[:, None], np.cos(half)])
+        while len(steps) > 1:
+            odd = steps[len(steps) & ~1:]
+            steps = np.concatenate([_products(steps[:-1:2], steps[1::2]), odd])
+        x, y, z, w = _products(np.array([self._quaternion]), steps)[0].tolist()
+        size = math.sqrt(x * x + y * y + z * z + w * w)
+        self._quaternion = x / size, y / size, z / size, w / size
+        self.stamp_ns = int(stamps_ns[-1])
+
+    @property
+    def quaternion_xyzw(self) -> tuple[float, float, float, float]:
+        """Body to ENU, w >= 0."""
+        x, y, z, w = self._quaternion
+        return (x, y, z, w) if w >= 0.0 else (-x, -y, -z, -w)
+
+    @property
+    def covariance(self) -> tuple[float, ...]:
+        """Of the small rotation about the axes of ENU, rad^2, nine numbers."""
+        age = (self.stamp_ns - self._epoch_ns) * 1e-9
+        drift = (self._white_variance + self._rate_variance * age) * age
+        ee, en, eu, ne, nn, nu, ue, un, uu = self._covariance
+        return ee + drift, en, eu, ne, nn + drift, nu, ue, un, uu + drift
+
+    def matrices(self) -> tuple[Array, Array]:
+        """Return ``C_nb`` and its covariance, each of shape (3, 3)."""
+        return (matrix_from_quaternion(np.array(self._quaternion)),
+                np.array(self.covariance).reshape(3, 3))
+
+
+def _products(first: Array, second: Array) -> Array:
+    """Multiply quaternions, shape (N, 4), each of the first with the second in its row."""
+    a, b, c, d = first.T
+    x, y, z, w = second.T
+    return np.column_stack([d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x,
+                            d * z + a * y - b * x + c * w, d * w - a * x - b * y - c * z])
+
+
+class Follower:
+    """
+    Carries the latest prediction to each sample as it arrives.
+
+    Predictions come from somebody who has seen fewer samples so far, and come late; the samples
+    since then are remembered and carried over again.
+    """
+
+    def __init__(self) -> None:
+        """Begin without an attitude."""
+        self._samples: deque[tuple[int, Sequence[float]]] = deque(maxlen=HISTORY)
+        self._prediction: Prediction | None = None
+
+    def adopt(self, prediction: Prediction | None) -> None:
+        """Go on from another prediction; None: there is no attitude."""
+        self._prediction = None
+        if prediction is None:
+            return
+        # In the order of arrival, from the newest: before a clock was set back, the same stamp
+        # may have been there already.
+        since = []
+        for sample in reversed(self._samples):
+            if sample[0] == prediction.stamp_ns:
+                break
+            since.append(sample)
+        else:
+            return  # it has seen what has not arrived here: wait for the next one
+        self._prediction = copy.copy(prediction)
+        for stamp_ns, gyro in reversed(since):
+            self._carry(stamp_ns, gyro)
+
+    def follow(self, stamp_ns: int, gyro: Sequence[float]) -> Prediction | None:
+        """Take a sample and return the attitude at its stamp; None where there is none."""
+        self._samples.append((stamp_ns, gyro))
+        return self._prediction if self._carry(stamp_ns, gyro) else None
+
+    def _carry(self, stamp_ns: int, gyro: Sequence[float]) -> bool:
+        prediction = self._prediction
+        if prediction is None:
+            return False
+        if stamp_ns > prediction.stamp_ns + MAX_GAP_NS:
+            self._prediction = None
+            return False
+        return prediction.carry(stamp_ns, gyro)

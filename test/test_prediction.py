@@ -1,0 +1,118 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Attitudes carried on with gyros: against SciPy's rotations, one by one and many at once."""
+
+from ins_align.prediction import Follower, MAX_GAP_NS, Prediction
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+STEP_NS = 5_000_000
+BIAS, SCALE = np.array([0.02, -0.03, 0.01]), np.array([1.01, 0.99, 1.0])
+RANDOM = np.random.default_rng(7)
+GYRO = RANDOM.normal(scale=2.0, size=(400, 3))
+STAMPS = np.cumsum(RANDOM.integers(1, 2 * STEP_NS, 400))
+START = Rotation.from_rotvec([0.3, -0.2, 2.5])
+COVARIANCE = np.array([[4.0, 0.5, 0.2], [0.5, 3.0, -0.1], [0.2, -0.1, 9.0]]) * 1e-6
+
+
+def prediction():
+    return Prediction(0, START.as_matrix(), COVARIANCE, BIAS, SCALE, 2e-3, 1e-6)
+
+
+def truth(count):
+    """Return the attitude after so many samples."""
+    turns = (GYRO * SCALE - BIAS) * (np.diff(STAMPS, prepend=0) * 1e-9)[:, None]
+    attitude = START
+    for turn in turns[:count]:
+        attitude = attitude * Rotation.from_rotvec(turn)
+    return attitude.as_matrix()
+
+
+@pytest.mark.parametrize('count', [0, 1, 2, 3, 37, 400])
+def test_one_by_one_and_many_at_once(count):
+    single, many, both = prediction(), prediction(), prediction()
+    for stamp_ns, gyro in zip(STAMPS[:count].tolist(), GYRO.tolist()):
+        assert single.carry(stamp_ns, gyro)
+    many.carry_many(STAMPS[:count], GYRO[:count])
+    both.carry_many(STAMPS[:count // 2], GYRO[:count // 2])
+    both.carry_many(STAMPS[count // 2:count], GYRO[count // 2:count])
+    for each in (single, many, both):
+        assert each.stamp_ns == (STAMPS[count - 1] if count else 0)
+        assert each.matrices()[0] == pytest.approx(truth(count), abs=1e-12)
+        assert each.quaternion_xyzw[3] >= 0.0
+        assert np.linalg.norm(each.quaternion_xyzw) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_covariance_grows_with_the_noise_of_the_gyros():
+    carried = prediction()
+    assert carried.matrices()[1] == pytest.approx(COVARIANCE)
+    carried.carry_many(STAMPS, GYRO)
+    seconds = STAMPS[-1] * 1e-9
+    drift = 4e-6 * seconds + 1e-6 * seconds ** 2
+    assert carried.matrices()[1] == pytest.approx(COVARIANCE + drift * np.eye(3))
+
+
+def test_what_is_old_or_broken_changes_nothing():
+    carried = prediction()
+    carried.carry(STEP_NS, (0.1, 0.2, 0.3))
+    before = carried.quaternion_xyzw
+    for stamp_ns, x in ((STEP_NS, 1.0), (0, 1.0), (2 * STEP_NS, float('nan')),
+                        (2 * STEP_NS, float('inf')), (2 * STEP_NS, -1e300)):
+        assert not carried.carry(stamp_ns, (0.0, x, 0.0))
+    assert (carried.stamp_ns, carried.quaternion_xyzw) == (STEP_NS, before)
+
+
+def test_follower_catches_up_with_predictions_that_come_late():
+    follower = Follower()
+    slow = prediction()
+    for k, (stamp_ns, gyro) in enumerate(zip(STAMPS.tolist(), GYRO.tolist())):
+        now = follower.follow(stamp_ns, gyro)
+        assert (now is None) == (k <= 60)
+        if now is not None:
+            assert now.stamp_ns == stamp_ns
+        if k % 20 == 0 and k >= 40:  # a prediction up to forty samples ago
+            slow.carry_many(STAMPS[max(k - 60, 0):k - 40], GYRO[max(k - 60, 0):k - 40])
+            follower.adopt(slow)
+    assert now.matrices()[0] == pytest.approx(truth(400), abs=1e-12)
+    assert slow.stamp_ns < now.stamp_ns  # its own, not to be touched
+
+
+def test_follower_knows_which_round_of_a_loop_it_is_in():
+    follower = Follower()
+    for _ in range(2):
+        for stamp_ns in range(STEP_NS, 100 * STEP_NS, STEP_NS):
+            assert follower.follow(stamp_ns, (0.0, 0.0, 1.0)) is None
+    still = Prediction(90 * STEP_NS, np.eye(3), COVARIANCE, np.zeros(3), np.ones(3), 0.0, 0.0)
+    follower.adopt(still)
+    now = follower.follow(100 * STEP_NS, (0.0, 0.0, 1.0))
+    assert Rotation.from_quat(now.quaternion_xyzw).as_rotvec() == pytest.approx([0, 0, 0.05])
+
+
+def test_follower_has_nothing_where_nothing_is_known():
+    follower = Follower()
+    follower.adopt(prediction())  # it stands at a sample that has not been seen
+    assert follower.follow(STEP_NS, (0.0, 0.0, 0.0)) is None
+    beginning = prediction()
+    beginning.carry(STEP_NS, (0.0, 0.0, 0.0))
+    follower.adopt(beginning)
+    assert follower.follow(2 * STEP_NS, (0.0, 0.0, 0.0)) is not None
+    assert follower.follow(2 * STEP_NS, (0.0, 0.0, 0.0)) is None  # there twice
+    assert follower.follow(3 * STEP_NS, (0.0, 0.0, 0.0)) is not None
+    # What it did while samples were missing nobody knows.
+    late = 4 * STEP_NS + MAX_GAP_NS
+    assert follower.follow(late, (0.0, 0.0, 0.0)) is None
+    assert follower.follow(late + STEP_NS, (0.0, 0.0, 0.0)) is None
+    follower.adopt(None)
+    assert follower.follow(late + 2 * STEP_NS, (0.0, 0.0, 0.0)) is None
