@@ -21,26 +21,27 @@ their place and the results depend on the messages alone.
 
 from collections import Counter
 from copy import copy
-from dataclasses import dataclass
-from functools import cached_property
 import math
+from typing import NamedTuple
 
+from ins_align.antenna import Antenna
 from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer
 from ins_align.config import Config, ConfigError, parameters
 from ins_align.declaration import Declaration, State, Verdict
-from ins_align.earth import EARTH_RATE, SEMI_MAJOR_AXIS
+from ins_align.earth import EARTH_RATE
 from ins_align.messages import Fix, Velocity
 from ins_align.methods import Epoch as MethodEpoch
 from ins_align.methods import ImuSteps, MapMethod, Method, NoteMethod, Nuisance
-from ins_align.plausibility import ForceCheck, VelocityCheck
+from ins_align.plausibility import ForceCheck
 from ins_align.prediction import Prediction
 from ins_align.preintegration import Noise, split_at_epochs, white_noise
-from ins_align.rotation import Array, quaternion_from_matrix, roll_pitch_yaw
+from ins_align.results import Attitude, Epoch, Status
+from ins_align.rotation import Array, Index, orthonormalized
 from ins_align.unknowns import Prior
 import numpy as np
 
-# The IMU may be silent for this long; then the attitude is lost and alignment starts over (s).
-MAX_GAP_S = 2.0
+# The IMU may be silent for this long; then the attitude is lost and alignment starts over (ns).
+MAX_GAP_NS = 2_000_000_000
 # A step this many times the usual one holds lost samples; what the motion can do meanwhile
 # (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
 GAP_STEPS = 2.5
@@ -53,92 +54,16 @@ NOISE_EXCESS = 1.25
 DRY_INTERVAL_NS = 2_000_000_000
 # Positions alone are taken when no velocity came for this long (ns).
 NO_VELOCITY_NS = 2_000_000_000
-# A fix this far (m) from where the last one and the velocity lead is not believed at first.
-MAX_FIX_JUMP = 300.0
-FIX_JUMPS_BELIEVED = 5
-_UNKNOWN_VERTICAL_STD = 1e3
+# The IMU samples of a run of epochs that are handled at one go.
+MAX_RUN_SAMPLES = 4096
 
 
-@dataclass(frozen=True)
-class Attitude:
-    """
-    An attitude of the IMU frame in ENU.
+class _Located(NamedTuple):
+    """An epoch, what was known to be wrong with the GNSS then, and whether it is without GNSS."""
 
-    Attributes
-    ----------
-    stamp_ns : int
-    C_nb : ndarray, shape (3, 3)
-        Body to ENU.
-    covariance : ndarray, shape (3, 3)
-        Of the small rotation about the axes of ENU, rad^2.
-
-    """
-
-    stamp_ns: int
-    C_nb: Array
-    covariance: Array
-
-    @cached_property
-    def quaternion_xyzw(self) -> Array:
-        """Body to ENU, w >= 0, shape (4,)."""
-        return quaternion_from_matrix(self.C_nb)
-
-    @cached_property
-    def _rpy_deg(self) -> list[float]:
-        return list(np.degrees(roll_pitch_yaw(self.C_nb)).tolist())
-
-    @property
-    def roll_deg(self) -> float:
-        """Roll, degrees."""
-        return self._rpy_deg[0]
-
-    @property
-    def pitch_deg(self) -> float:
-        """Pitch, degrees; nose down is positive (REP-103)."""
-        return self._rpy_deg[1]
-
-    @property
-    def yaw_deg(self) -> float:
-        """Heading as yaw: degrees counter-clockwise from east."""
-        return self._rpy_deg[2]
-
-    @property
-    def sigma_deg(self) -> Array:
-        """One sigma about east, north, up, degrees, shape (3,)."""
-        return np.degrees(np.sqrt(np.diag(self.covariance)))
-
-
-@dataclass(frozen=True)
-class Epoch:
-    """What came of a GNSS epoch; `t_s` counts from the first t0."""
-
-    stamp_ns: int
-    t_s: float
-    state: State
-    initial: Attitude | None
-    current: Attitude | None
-
-
-@dataclass(frozen=True)
-class Status:
-    """The aligner's state in numbers; see the attributes' names and units."""
-
-    state: State
-    reason: str
-    stamp_ns: int | None
-    t0_ns: int | None
-    time_to_align_s: float | None
-    initial: Attitude | None
-    current: Attitude | None
-    gyro_bias: Array
-    gyro_bias_std: Array
-    accel_bias: Array
-    accel_bias_std: Array
-    lever_arm: Array
-    lever_arm_std: Array
-    gnss_delay: float
-    gnss_delay_std: float
-    counts: dict[str, int]
+    epoch: MethodEpoch
+    fault: str
+    dry: bool
 
 
 class Aligner:
@@ -158,6 +83,9 @@ class Aligner:
         self._events: list[str] = []
         self._delay_ns = round(self.config.gnss_delay * 1e9)
         self._lateness_ns = (round(self.config.gnss_lateness * 1e9) + max(self._delay_ns, 0))
+        self._stated_noise = np.array(self.config.imu_noise[:2])
+        self._done: list[Epoch] = []
+        self._silences: list[tuple[int, int]] = []
         self._start_over(None)
 
     def _start_over(self, prior: Prior | None) -> None:
@@ -171,16 +99,14 @@ class Aligner:
         self._prior = prior
         self._method: Method | None = None
         self._declaration = Declaration(self.config)
-        self._force_check, self._velocity_check = ForceCheck(), VelocityCheck()
+        self._force_check = ForceCheck()
+        self._antenna = Antenna(self.config, self.counts)
         self._verdict = Verdict(State.WAITING_FOR_IMU, 'no IMU sample yet')
         self._first_t0_ns: int | None = None
-        self._last_ns: int | None = None
-        self._place: tuple[float, float, float] | None = None
-        self._place_ns = 0
-        self._v_n: Array | None = None
-        self._fix_jumps = 0
         self._first_fix_ns: int | None = None
-        self._last_velocity_ns: int | None = None
+        self._last_ns: int | None = None            # the last epoch put into the run
+        self._steps_ns = 0                          # up to where the IMU is integrated
+        self._run: list[_Located] = []
         self._initial: Attitude | None = None
         self._current: Attitude | None = None
         self._time_to_align_s: float | None = None
@@ -218,6 +144,7 @@ class Aligner:
             self._add_imu_array(stamps_ns[first:], gyro[first:], accel[first:])
 
     def _clock_jumped(self) -> None:
+        self._done = self.update()                  # what could have been asked for before
         self.counts['clock_jumps'] += 1
         self._events.append('the clock of the IMU jumped back: alignment starts over')
         self._start_over(None)
@@ -273,119 +200,80 @@ class Aligner:
 
     def _process(self, upto_ns: int) -> list[Epoch]:
         self._imu.consolidate()
-        if self._imu.stamps.size < 4:
+        stamps = self._imu.stamps
+        if stamps.size < 4:
             return []
         # Interpolation at an epoch wants two samples after it.
-        upto_ns = min(upto_ns, int(self._imu.stamps[-2]))
-        done = []
+        upto_ns = min(upto_ns, int(stamps[-2]))
+        silent = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
+        self._silences = list(zip(stamps[silent].tolist(), stamps[silent + 1].tolist()))
         for message in self._gnss.release(upto_ns):
             self._dry_epochs(message.stamp_ns)
-            epoch = self._take(message)
-            if epoch is not None:
-                done.append(epoch)
+            self._take(message)
         self._dry_epochs(upto_ns)
+        self._advance()
         if self._method is None:
             self._imu.forget_before(upto_ns - NOISE_WINDOW_NS)
             if self._verdict.state is State.WAITING_FOR_IMU:
                 self._set_verdict(Verdict(State.WAITING_FOR_GNSS, 'no GNSS position yet'))
+        done, self._done = self._done, []
         return done
 
     def _dry_epochs(self, upto_ns: int) -> None:
         """Go on without GNSS up to a stamp in steps of bounded length."""
         while (self._method is not None and self._last_ns is not None
                and upto_ns - self._last_ns > DRY_INTERVAL_NS):
-            self._take(GnssEpoch(self._last_ns + DRY_INTERVAL_NS))
+            self._take(GnssEpoch(self._last_ns + DRY_INTERVAL_NS), dry=True)
 
-    def _take(self, message: GnssEpoch) -> Epoch | None:
-        """Process one epoch."""
+    def _take(self, message: GnssEpoch, dry: bool = False) -> None:
+        """Put an epoch into the run of those that the method takes at one go."""
         if self._last_ns is not None and message.stamp_ns <= self._last_ns:
             self.counts['gnss_out_of_order'] += 1
-            return None
-        v_n = None
-        if message.velocity is not None and self.config.use_velocity is not False:
-            v_n = np.asarray(message.velocity.velocity, float)
-            self._last_velocity_ns = message.stamp_ns
-        fix = self._locate(message, v_n)
-        if self._place is None:
-            return None
-        if v_n is not None:
-            self._v_n = v_n
-            if fix is not None:
-                self._velocity_check.add(message.stamp_ns * 1e-9, *self._place, v_n,
-                                         self._position_std(fix))
-        epoch = MethodEpoch(message.stamp_ns, *self._place, v_n,
-                            self._velocity_covariance(message.velocity),
-                            fix is not None, self._position_covariance(fix))
-        if self._method is None:
-            return self._start(epoch, fix)
-        imu = self._imu_steps(message.stamp_ns)
-        if imu is None:
-            return None
-        self._method.advance(epoch, imu)
-        return self._judge(epoch)
-
-    def _locate(self, message: GnssEpoch, v_n: Array | None) -> Fix | None:
-        """Bring the antenna's place to an epoch; return the fix if it is believed."""
-        dt = (message.stamp_ns - self._place_ns) * 1e-9
-        predicted = self._place
-        speed = self._v_n if v_n is None else v_n
-        if predicted is not None and speed is not None and dt < 60.0:
-            latitude, longitude, altitude = predicted
-            predicted = (latitude + speed[1] * dt / SEMI_MAJOR_AXIS,
-                         longitude + speed[0] * dt / (SEMI_MAJOR_AXIS
-                                                      * max(math.cos(latitude), 1e-3)),
-                         altitude + speed[2] * dt)
-        fix = message.fix
-        if fix is None:
-            if predicted is not None:
-                self._place, self._place_ns = predicted, message.stamp_ns
-            return None
-        place = (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg), fix.altitude_m)
-        if predicted is not None and self._distance(place, predicted) > MAX_FIX_JUMP * (1 + dt):
-            self.counts['fix_jump'] += 1
-            self._fix_jumps += 1
-            if self._fix_jumps < FIX_JUMPS_BELIEVED:
-                self._place, self._place_ns = predicted, message.stamp_ns
-                return None
+            return
+        epoch = self._antenna.epoch(message)
+        if self._antenna.jumped:
             self._lose('the position jumped')
-        self._fix_jumps = 0
-        self._place, self._place_ns = place, message.stamp_ns
-        return fix
-
-    @staticmethod
-    def _distance(a: tuple[float, float, float], b: tuple[float, float, float]) -> float:
-        """Rough distance of two places, metres."""
-        east = math.remainder(a[1] - b[1], 2 * math.pi) * math.cos(a[0])
-        return math.hypot(SEMI_MAJOR_AXIS * (a[0] - b[0]), SEMI_MAJOR_AXIS * east, a[2] - b[2])
-
-    def _velocity_covariance(self, velocity: Velocity | None) -> Array:
-        config = self.config
-        if velocity is None or velocity.covariance is None:
-            covariance = np.diag([config.velocity_std ** 2, config.velocity_std ** 2,
-                                  config.velocity_std_vertical ** 2])
+            epoch = self._antenna.epoch(message)
+        if epoch is None:
+            return
+        if self._method is None:
+            self._start(epoch)
+        elif self._silent(epoch.stamp_ns):
+            self.counts['imu_gap'] += 1
+            self._lose(f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s')
         else:
-            covariance = velocity.covariance
-        if config.velocity_vertical == 'absent':
-            covariance = covariance.copy()
-            covariance[2, :2] = covariance[:2, 2] = 0.0
-            covariance[2, 2] = _UNKNOWN_VERTICAL_STD ** 2
-        return covariance
+            self._run.append(_Located(epoch, self._antenna.fault, dry))
+            self._last_ns = epoch.stamp_ns
 
-    def _position_covariance(self, fix: Fix | None) -> Array:
-        config = self.config
-        if fix is None or fix.covariance is None:
-            return np.diag([config.position_std ** 2, config.position_std ** 2,
-                            config.position_std_vertical ** 2])
-        return fix.covariance
+    def _silent(self, stamp_ns: int) -> bool:
+        """Whether the IMU says too little between the last epoch and `stamp_ns`."""
+        start_ns = self._last_ns
+        assert start_ns is not None
+        return (bool(self._imu.stamps[0] > start_ns)
+                or any(start < stamp_ns and end > start_ns for start, end in self._silences))
 
-    def _position_std(self, fix: Fix) -> float:
-        """Horizontal sigma of a fix, metres."""
-        return math.sqrt(float(np.max(np.diag(self._position_covariance(fix))[:2])))
+    def _advance(self) -> None:
+        """Let the method take the run of epochs, so many at a time that memory stays bounded."""
+        run, self._run = self._run, []
+        if not run:
+            return
+        method = self._method
+        assert method is not None
+        place = np.searchsorted(self._imu.stamps, [located.epoch.stamp_ns for located in run])
+        cuts = np.flatnonzero(np.diff((place - place[0]) // MAX_RUN_SAMPLES)) + 1
+        for part in np.split(np.arange(len(run)), cuts):
+            epochs = [run[k].epoch for k in part]
+            imu, samples = self._imu_steps([epoch.stamp_ns for epoch in epochs])
+            for k, epoch in enumerate(method.advance(epochs, imu)):
+                self._force_check.add(samples[k])
+                done = self._judge(epoch, run[part[k]].fault)
+                if not run[part[k]].dry:
+                    self._done.append(done)
 
-    def _start(self, epoch: MethodEpoch, fix: Fix | None) -> Epoch | None:
+    def _start(self, epoch: MethodEpoch) -> None:
         """Make an epoch t0 if it can be one."""
-        if fix is None:
-            return None
+        if not epoch.position_measured:
+            return
         if self._first_fix_ns is None:
             self._first_fix_ns = epoch.stamp_ns
         wanted = self.config.use_velocity is not False
@@ -393,7 +281,7 @@ class Aligner:
                                 and epoch.stamp_ns - self._first_fix_ns >= NO_VELOCITY_NS))
         if epoch.v_n is None and not alone:
             self._set_verdict(Verdict(State.WAITING_FOR_GNSS, 'no GNSS velocity yet'))
-            return None
+            return
         use_position = self.config.use_position
         if use_position == 'auto':
             # Beside velocities positions gain little and hurt when their errors wander or their
@@ -402,69 +290,59 @@ class Aligner:
         if epoch.v_n is None and not use_position:
             self._set_verdict(Verdict(State.WAITING_FOR_GNSS, 'no GNSS velocity yet, and '
                                       'use_position is false'))
-            return None
-        stamps = self._imu.stamps
-        if stamps[0] > epoch.stamp_ns:
-            return None
-        self._last_ns = epoch.stamp_ns
-        imu = self._imu_steps(epoch.stamp_ns)
-        if imu is None:
-            return None
+            return
+        if self._imu.stamps[0] > epoch.stamp_ns:
+            return
+        self._last_ns = self._first_t0_ns = self._steps_ns = epoch.stamp_ns
+        imu, _ = self._imu_steps([epoch.stamp_ns])
         if self.config.method == 'map':
             self._method = MapMethod(self.config, epoch, imu, bool(use_position), self._prior)
         else:
             self._method = NoteMethod(self.config, epoch, imu, epoch.v_n is None)
-        self._first_t0_ns = epoch.stamp_ns
-        return self._judge(epoch)
+        self._done.append(self._judge(epoch, self._antenna.fault))
 
-    def _imu_steps(self, stamp_ns: int) -> ImuSteps | None:
-        """IMU steps from the last epoch to `stamp_ns`; None when the IMU was silent too long."""
-        start_ns = self._last_ns
-        assert start_ns is not None
-        self._last_ns = stamp_ns
-        stamps = self._imu.stamps
-        end = int(np.searchsorted(stamps, stamp_ns, side='left')) + 2
-        seconds = np.asarray((stamps[:end] - start_ns) * 1e-9, dtype=float)
-        between = np.diff(seconds)
-        if seconds.size < 2 or seconds[0] > 0 or np.max(between[max(
-                int(np.searchsorted(seconds, 0.0, side='right')) - 1, 0):-1],
-                initial=0.0) > MAX_GAP_S:
-            self.counts['imu_gap'] += 1
-            self._lose(f'no IMU sample for more than {MAX_GAP_S:g} s')
-            return None
-        samples = self._imu.samples[:end]
-        self._force_check.add(samples[:, 3:])
-        steps = split_at_epochs(seconds, samples[:, :3], samples[:, 3:],
-                                np.array([0.0, (stamp_ns - start_ns) * 1e-9]))
-        window = int(np.searchsorted(stamps, start_ns - NOISE_WINDOW_NS))
-        noise = self._noise(seconds[window:], samples[window:], steps.dt)
-        self._imu.forget_before(stamp_ns - NOISE_WINDOW_NS)
-        self._imu.used_ns = stamp_ns
-        return ImuSteps(steps, noise)
+    def _imu_steps(self, epochs_ns: list[int]) -> tuple[ImuSteps, list[Array]]:
+        """IMU steps up to each epoch since the one before, and the specific forces in them."""
+        stamps, start_ns = self._imu.stamps, self._steps_ns
+        ends_ns = np.array([start_ns, *epochs_ns])
+        ends = np.searchsorted(stamps, ends_ns, side='left') + 2
+        windows = np.searchsorted(stamps, ends_ns[:-1] - NOISE_WINDOW_NS)
+        stamps, samples = stamps[:ends[-1]], self._imu.samples[:ends[-1]]
+        steps = split_at_epochs(stamps, samples[:, :3], samples[:, 3:], ends_ns, unit=1e-9)
+        noise = self._noise(stamps, samples, windows, ends[1:], steps.dt)
+        forces = [samples[first:last, 3:] for first, last in zip(ends[:-1] - 2, ends[1:] - 2)]
+        self._steps_ns = epochs_ns[-1]
+        self._imu.forget_before(self._steps_ns - NOISE_WINDOW_NS)
+        self._imu.used_ns = self._steps_ns
+        return ImuSteps(steps, noise), forces
 
-    def _noise(self, seconds: Array, samples: Array, dt: Array) -> Noise:
+    def _noise(self, stamps: Array, samples: Array, first: Index, last: Index,
+               dt: Array) -> Noise:
         """White noise of each step: stated, measured, and what motion can do in a gap."""
-        stated = np.array(self.config.imu_noise[:2])
-        measured = white_noise(seconds, samples)
+        stated = self._stated_noise
+        measured = white_noise(stamps, samples, first, last, unit=1e-9)
         excess = np.where(measured > NOISE_EXCESS * stated,
                           np.sqrt(np.maximum(measured ** 2 - stated ** 2, 0.0)), 0.0)
-        gap = np.where(dt > GAP_STEPS * float(np.median(np.diff(seconds))), dt, 0.0)
+        between = np.diff(stamps)
+        usual = np.array([_median(between[i:j - 1]) for i, j in zip(first, last)]) * 1e-9
+        gap = np.where(dt > GAP_STEPS * usual[:, None], dt, 0.0)
         self.counts['imu_gap'] += int(np.count_nonzero(gap))
         # An error of acceleration * dt^2 over the step, as a density: squared, over dt.
         density = gap ** 1.5
         return Noise(np.hypot(stated[0], GAP_ANGULAR_ACCELERATION * density),
-                     np.hypot(stated[1], GAP_JERK * density), excess[0], excess[1])
+                     np.hypot(stated[1], GAP_JERK * density), excess[:, :1], excess[:, 1:])
 
     def _lose(self, why: str) -> None:
         """Start the alignment over; biases are kept."""
+        self._advance()
         prior = None if self._method is None else self._method.prior_without_attitude()
         if self._method is not None:
             self.counts['restarts'] += 1
             self._events.append(f'alignment starts over: {why}')
         self._forget_alignment(prior)
 
-    def _judge(self, epoch: MethodEpoch) -> Epoch:
-        """Results and state after an epoch."""
+    def _judge(self, epoch: MethodEpoch, fault: str) -> Epoch:
+        """Results and state after an epoch; `fault` is what is known to be wrong with the GNSS."""
         method, stamp_ns = self._method, epoch.stamp_ns
         assert method is not None and self._first_t0_ns is not None
         time_s = (stamp_ns - self._first_t0_ns) * 1e-9
@@ -487,7 +365,7 @@ class Aligner:
             scale = fit.factor ** 2 if math.isfinite(fit.factor) else 1.0
             self._initial = Attitude(method.t0_ns, initial[0], initial[1] * scale)
             self._current = Attitude(stamp_ns, current[0], current[1] * scale)
-        fault = self._force_check.fault or self._velocity_check.fault
+        fault = self._force_check.fault or fault
         if fault:
             self._declaration.levelled = self._declaration.aligned = False
             verdict = Verdict(State.FAULT, fault)
@@ -498,7 +376,9 @@ class Aligner:
             self.declared = self._time_to_align_s = None
             self.counts['withdrawals'] += 1
         self._set_verdict(verdict)
-        return Epoch(stamp_ns, time_s, verdict.state, self._initial, self._current)
+        gyro_bias, accel_bias, _ = method.sensor_errors()
+        return Epoch(stamp_ns, time_s, verdict.state, self._initial, self._current,
+                     fit.innovation.normalised, gyro_bias, accel_bias)
 
     def _set_verdict(self, verdict: Verdict) -> None:
         if verdict.state is not self._verdict.state:
@@ -557,3 +437,9 @@ class Aligner:
             counts['epochs_used'] = (fit.offered - fit.rejected_velocity - fit.rejected_position)
             counts['rebases'] = self._method.moved
         return counts
+
+
+def _median(values: Array) -> float:
+    """Upper median."""
+    half = values.size // 2
+    return float(np.partition(values, half)[half])

@@ -26,7 +26,6 @@ import math
 from ins_align.config import Config
 from ins_align.methods import Fit
 from ins_align.rotation import Array
-import numpy as np
 
 
 class State(str, Enum):
@@ -100,12 +99,12 @@ class Declaration:
         Verdict
 
         """
-        if math.isfinite(fit.nis):
-            self._recent_nis += (min(fit.nis, 10.0) - self._recent_nis) / RECENT
+        nis = fit.innovation.nis
+        if math.isfinite(nis):
+            self._recent_nis += (min(nis, 10.0) - self._recent_nis) / RECENT
         contradiction = self._contradiction(fit)
         factor = fit.factor
-        tilt = math.degrees(max(math.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1])
-                                for P in covariances)) * factor
+        tilt = math.degrees(max(_largest_std(P) for P in covariances)) * factor
         heading = math.degrees(max(math.sqrt(P[2, 2]) for P in covariances)) * factor
         rejected = fit.rejected_velocity + fit.rejected_position
         just_rejected, self._rejected = rejected > self._rejected, rejected
@@ -170,6 +169,12 @@ class Declaration:
                     'allows: check the lever arm, the GNSS delay, the velocity frame, the IMU '
                     'axes and signs')
         return ''
+
+
+def _largest_std(P: Array) -> float:
+    """Largest sigma about a horizontal axis: from the larger eigenvalue of the leading 2 x 2."""
+    (a, b), (_, c) = P[:2, :2].tolist()
+    return math.sqrt(0.5 * (a + c) + math.hypot(0.5 * (a - c), b))
 
 
 def _since(since_s: float | None, time_s: float, good: bool) -> float | None:

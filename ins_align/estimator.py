@@ -21,17 +21,17 @@ their sensitivity to x at once, and the normal equations accumulate (docs, "Theo
 """
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 import math
 
-from ins_align.earth import EARTH_RATE
 from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals
-from ins_align.rotation import Array, cross, exp_so3, skew
-from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, BODY_FIXED, DELAY, GYRO, GYRO_BIAS,
-                                GYRO_SCALE, inverse_spd, LEVER_ARM, Prior, prior_of, SIZE,
-                                START_POSITION, START_VELOCITY, UNIFORM_ANGLE_STD, Unknowns)
-from ins_align.whitening import (Chain, HEADING_RESOLVED_STD, Measurements, POSITION,
+from ins_align.rotation import Array, cross, exp_so3
+from ins_align.unknowns import (ATTITUDE, BODY_FIXED, DELAY, GYRO, GYRO_BIAS, GYRO_SCALE,
+                                inverse_spd, LEVER_ARM, Prior, prior_of, SIZE, START_POSITION,
+                                START_VELOCITY, UNIFORM_ANGLE_STD, Unknowns)
+from ins_align.whitening import (Chain, chain_noise, HEADING_RESOLVED_STD, Measurements, POSITION,
                                  sensitivities, VELOCITY, Whitener)
 import numpy as np
 
@@ -45,6 +45,9 @@ WEAK_INFORMATION[START_POSITION] = 1e7 ** -2
 FITTED_DIRECTIONS = 4
 # Median of chi-square with three degrees of freedom.
 MEDIAN_CHI2_3 = 2.366
+
+
+SensorErrors = tuple[Array, Array, Array]       # gyro bias, accelerometer bias, gyro scale factor
 
 
 @dataclass
@@ -62,6 +65,7 @@ class Solution:
         Step from the point to the estimate, of the unknowns that are estimated.
     P : ndarray, shape (n, n)
         Covariance of the estimate.
+    estimate : Unknowns
     chi2 : float
         Sum of squares of the whitened residuals at the estimate, prior included.
     dof : int
@@ -75,8 +79,51 @@ class Solution:
     whitener: Whitener
     dx: Array
     P: Array
+    estimate: Unknowns
     chi2: float = math.nan
     dof: int = 0
+
+    def step(self) -> Array:
+        """Step from the point to the estimate, of all unknowns, shape (22,)."""
+        dx = np.zeros(SIZE)
+        dx[self.whitener.columns[1:] - 1] = self.dx
+        return dx
+
+    def chain_errors(self) -> Array:
+        """Estimated errors of the chain at the last epoch, as seen at t0, shape (6,) or (9,)."""
+        return self.whitener.X[:, 0] - self.whitener.X[:, 1:] @ self.dx
+
+
+@dataclass
+class Rows:
+    """What a linearisation point makes of stored epochs; K of them."""
+
+    chain: Chain
+    noise: Array            # of the chain over each interval, (K, size, size)
+    Y: Array                # residual and columns of the unknowns, (K, 6, 1 + n)
+    covariance: Array       # of velocity and position, (K, 2, 3, 3)
+    present: list[list[bool]]
+
+
+@dataclass(frozen=True)
+class Innovation:
+    """
+    What was new in an epoch.
+
+    Attributes
+    ----------
+    nis : float
+        Normalised innovation squared, per row; nan where nothing was tested.
+    normalised : ndarray, shape (3,)
+        Innovation of the velocity (of the position where only that is used) over its sigma.
+
+    """
+
+    nis: float
+    normalised: Array
+
+
+NOTHING_NEW = Innovation(math.nan, np.full(3, math.nan))
 
 
 class MapEstimator:
@@ -84,7 +131,7 @@ class MapEstimator:
     Recursive generalised least squares for the initial attitude and the nuisances with it.
 
     Epochs and intervals are stored, so that the linearisation point can move; when the store is
-    full, `handover` gives the prior with which the next estimator starts at the present epoch.
+    full, `handover.prior_from_now` gives the prior with which the next estimator starts.
 
     Parameters
     ----------
@@ -132,13 +179,13 @@ class MapEstimator:
         wanted[LEVER_ARM] = estimate_lever_arm
         wanted[DELAY] = estimate_delay
         wanted[GYRO_SCALE] = estimate_gyro_scale
-        self._columns = np.flatnonzero(wanted)
-        self._weak = WEAK_INFORMATION[self._columns]
-        self._size = 9 if use_position else 6
-        self._prior = prior
+        self.columns = np.flatnonzero(wanted)
+        self._weak = np.diag(WEAK_INFORMATION[self.columns])
+        self.size = 9 if use_position else 6
+        self.prior = prior
         self._capacity = capacity
         self._intervals = Intervals.empty(capacity)
-        # With which the intervals were integrated: gyro bias, accelerometer bias, gyro scale.
+        # With which the intervals were integrated.
         self._sensor_errors = np.zeros((capacity, 3, 3))
         self._gnss = Measurements.empty(capacity)
         self.count = 0
@@ -146,30 +193,36 @@ class MapEstimator:
         self._last_fit = self._last_tuned = 0
         self._nonlinearity = 0.0
         self.excess = excess
-        self._gated = True
+        self.gated = True
         self._recent: deque[float] = deque(maxlen=self.GATE_WINDOW)
         self._gate_scale = 1.0
 
     # Input
 
-    def add(self, interval: Intervals, sensor_errors: tuple[Array, Array, Array],
-            gnss: Measurements) -> Array:
+    @property
+    def sensor_errors(self) -> SensorErrors:
+        """Those of the linearisation point: integrate the next intervals with them."""
+        x = self.prior.mean if self.solution is None else self.solution.point
+        return x.gyro_bias, x.accel_bias, x.gyro_scale
+
+    def add(self, intervals: Intervals, gnss: Measurements) -> Iterator[Innovation]:
         """
-        Append an epoch; the first one is t0 and its interval has no length.
+        Append epochs one after the other; the very first one is t0, its interval has no length.
+
+        Stops early, after an epoch at which the linearisation point has moved: the intervals
+        behind it want to be integrated anew. Whoever iterates may call `settle` in between.
 
         Parameters
         ----------
-        interval : Intervals
-            One interval, up to the epoch.
-        sensor_errors : tuple of ndarray, shape (3,)
-            Gyro bias, accelerometer bias and gyro scale factor with which it was integrated.
+        intervals : Intervals
+            K of them, integrated with `sensor_errors`.
         gnss : Measurements
-            One epoch.
+            The K epochs at their ends.
 
-        Returns
-        -------
-        ndarray, shape (2,)
-            Normalised innovation squared of velocity and position; nan where there was none.
+        Yields
+        ------
+        Innovation
+            Of one epoch after the other.
 
         Raises
         ------
@@ -179,25 +232,35 @@ class MapEstimator:
         """
         if self.full:
             raise RuntimeError('the store is full: hand over to a new estimator')
-        k = self.count
-        self._intervals.put(k, interval, 0)
-        self._sensor_errors[k] = sensor_errors
-        self._gnss.put(k, gnss)
-        self.count += 1
-        if self.solution is None:
-            nis = np.full(2, math.nan)
-            if self._prior.information[0, 0] > 0:
-                self._fit()
-            elif self.count >= self.FIRST_FIT:
-                self._fit()
-            return nis
+        count = min(gnss.time.size, self._capacity - self.count)
+        places = slice(self.count, self.count + count)
+        self._intervals.put(places, intervals.take(slice(0, count)))
+        self._sensor_errors[places] = self.sensor_errors
+        self._gnss.put(places, gnss.take(slice(0, count)))
         s = self.solution
+        rows = None if s is None else self._rows(s, places)
+        for k in range(count):
+            self.count += 1
+            if s is None or rows is None:
+                if self.prior.information[0, 0] > 0 or self.count >= self.FIRST_FIT:
+                    self._fit()
+                yield NOTHING_NEW
+            else:
+                yield self._update(s, rows, k)
+            if self.solution is not s:
+                return
+
+    def _update(self, s: Solution, rows: Rows, k: int) -> Innovation:
+        """Take an epoch into the solution; move the linearisation point where that is due."""
         # Far from the linearisation point an innovation says nothing about its measurement.
-        nis = self._extend(s, slice(k, k + 1),
-                           (s.dx, s.P) if self._nonlinearity <= self.FAR else None)
-        self._recent.extend(nis[np.isfinite(nis)])
+        gate = (s.dx, s.P) if self._nonlinearity <= self.FAR else None
+        innovations = self._whiten(s, rows, k, gate)
+        for nis, _ in innovations:
+            if math.isfinite(nis):
+                self._recent.append(nis)
         if len(self._recent) == self.GATE_WINDOW:
             self._gate_scale = max(1.0, float(np.median(self._recent)) / MEDIAN_CHI2_3)
+        s.chain = rows.chain.at(k)
         self._solve(s)
         if self.count >= max(self.TUNE_FROM, self._last_tuned * (1 + self.TUNE_GROWTH)):
             self._tune()
@@ -206,7 +269,10 @@ class MapEstimator:
         if (self._nonlinearity > self.NONLINEARITY
                 and self.count >= self._last_fit * (1 + growth)):
             self._fit()
-        return nis
+        tested = [nis for nis, _ in innovations if math.isfinite(nis)]
+        if not tested:
+            return NOTHING_NEW
+        return Innovation(sum(tested) / (3 * len(tested)), innovations[0][1])
 
     @property
     def full(self) -> bool:
@@ -225,81 +291,89 @@ class MapEstimator:
         s = self.solution
         if s is None:
             return False
-        age = self._gnss.time[self.count - 1]
+        age = self.time
         if s.P[2, 2] <= self.IDLE_HEADING_STD ** 2:
             return bool(age >= self.MAX_AGE)
-        covariance = self.covariance
-        bias_std = math.sqrt(np.max(np.diag(covariance)[GYRO_BIAS]))
+        variances = self.variances
+        bias_std = math.sqrt(np.max(variances[GYRO_BIAS]))
         if age * bias_std < self.IDLE_HEADING_LOSS:
             return False
-        start = np.diag(covariance)[START_VELOCITY]
+        start = variances[START_VELOCITY]
         still = start[0] + start[1] < 2 * self.IDLE_VELOCITY_STD ** 2
         return bool(age >= (self.IDLE_TIME if still else self.MAX_IDLE_TIME))
 
-    def _extend(self, s: Solution, epochs: slice, gate: 'tuple[Array, Array] | None') -> Array:
-        """Take stored epochs into a solution; return the last one's innovations squared."""
+    def _rows(self, s: Solution, epochs: slice) -> Rows:
+        """Linearise stored epochs that follow the chain of a solution."""
         gnss = self._gnss.take(epochs)
         interval = self._corrected(epochs, s.point)
-        chain, F, W = s.chain.extended(interval, self.excess)
-        Y, L = sensitivities(s.point, chain, gnss, interval)
-        nis = np.full(2, math.nan)
-        for k in range(gnss.time.size):
-            s.whitener.predict(F[k], W[k])
-            for kind, rows in enumerate((VELOCITY, POSITION)):
-                if gnss.present[k, kind]:
-                    nis[kind] = s.whitener.update(kind, Y[k, rows], L[k, rows],
-                                                  gnss.covariance[k, kind], gate,
-                                                  self._gate_scale)
-        s.chain = chain.at(-1)
-        return nis
+        chain = s.chain.extended(interval)
+        return Rows(chain,
+                    chain_noise(s.point.C, gnss.time, chain, interval, self.size, self.excess),
+                    sensitivities(s.point, chain, gnss, interval)[:, :, s.whitener.columns],
+                    gnss.covariance, gnss.present.tolist())
+
+    def _whiten(self, s: Solution, rows: Rows, k: int,
+                gate: 'tuple[Array, Array] | None') -> list[tuple[float, Array]]:
+        """Take one epoch into the normal equations; return the innovations of what is there."""
+        s.whitener.P += rows.noise[k]
+        return [s.whitener.update(kind, rows.Y[k, block], rows.covariance[k, kind], gate,
+                                  self._gate_scale)
+                for kind, block in enumerate((VELOCITY, POSITION)) if rows.present[k][kind]]
+
+    def _run(self, s: Solution, gate: 'tuple[Array, Array] | None') -> None:
+        """Take all stored epochs into an empty solution."""
+        rows = self._rows(s, slice(0, self.count))
+        for k in range(self.count):
+            self._whiten(s, rows, k, gate)
+        s.chain = rows.chain.at(-1)
 
     def _corrected(self, epochs: slice, point: Unknowns) -> Intervals:
         """Return stored intervals as they would be with the sensor errors of a point."""
-        used = self._sensor_errors[epochs]
-        return self._intervals.take(epochs).corrected(
-            point.gyro_bias - used[:, 0], point.accel_bias - used[:, 1],
-            point.gyro_scale - used[:, 2])
+        change = (np.stack([point.gyro_bias, point.accel_bias, point.gyro_scale])
+                  - self._sensor_errors[epochs])
+        intervals = self._intervals.take(epochs)
+        if not np.any(change):
+            return intervals
+        return intervals.corrected(change[:, 0], change[:, 1], change[:, 2])
 
     # Solution
 
     def _solve(self, s: Solution) -> None:
         """Solve the normal equations and judge the fit."""
-        information = s.information + s.whitener.normal[1:, 1:]
-        right = s.whitener.normal[1:, 0] + s.information @ s.mean_step
-        information[range(self._columns.size), range(self._columns.size)] += self._weak
-        s.P = inverse_spd(information)
+        prior = s.information @ s.mean_step
+        right = s.whitener.normal[1:, 0] + prior
+        s.P = inverse_spd(s.information + s.whitener.normal[1:, 1:] + self._weak)
         s.dx = s.P @ right
         column = s.P[:, 2]
         feigned = min(s.whitener.spurious + FITTED_DIRECTIONS,
                       1 / column[2] - 1 / UNIFORM_ANGLE_STD ** 2)
-        s.P = s.P + np.outer(column, column) * feigned / (1 - feigned * column[2])
-        s.chi2 = float(s.whitener.normal[0, 0] + s.mean_step @ s.information @ s.mean_step
-                       - right @ s.dx)
-        s.dof = (s.whitener.rows - self._columns.size
-                 + int(np.count_nonzero(np.diag(s.information))))
+        s.P += np.outer(column, column) * (feigned / (1 - feigned * column[2]))
+        s.chi2 = float(s.whitener.normal[0, 0] + s.mean_step @ prior - right @ s.dx)
+        s.dof = (s.whitener.rows - self.columns.size
+                 + int(np.count_nonzero(s.information.diagonal())))
+        s.estimate = s.point.moved(s.step())
 
     def _start(self, point: Unknowns) -> Solution:
         """Return an empty solution at a linearisation point."""
-        information, step = self._prior.at(point)
-        n = self._columns.size
-        return Solution(point, information[np.ix_(self._columns, self._columns)],
-                        step[self._columns], Chain.start(),
-                        Whitener(self._columns, self._size), np.zeros(n), np.zeros((n, n)))
+        information, step = self.prior.at(point)
+        n = self.columns.size
+        return Solution(point, information[np.ix_(self.columns, self.columns)],
+                        step[self.columns], Chain.start(), Whitener(self.columns, self.size),
+                        np.zeros(n), np.zeros((n, n)), point)
 
     def _converge(self, point: Unknowns, P: 'Array | None') -> Solution:
         """Gauss-Newton over the store from a starting point."""
         for _ in range(self.MAX_ITERATIONS):
             s = self._start(point)
-            self._extend(s, slice(0, self.count),
-                         None if P is None else (np.zeros(self._columns.size), P))
+            self._run(s, None if P is None else (s.dx, P))
             if sum(s.whitener.rejected) > self.MAX_REJECTED * self.count:
                 # Not a few outliers but a wrong picture: look at everything again.
                 s, P = self._start(point), None
-                self._extend(s, slice(0, self.count), None)
+                self._run(s, None)
             self._solve(s)
             if self.nonlinearity(s) <= self.NONLINEARITY:
                 break
-            point = self.estimate(s)
+            point = s.estimate
         return s
 
     def _fit(self) -> None:
@@ -307,9 +381,9 @@ class MapEstimator:
         self._last_fit = self.count
         old = self.solution
         resolved = old is not None and self.heading_std < HEADING_RESOLVED_STD
-        gate = old.P if old is not None and resolved and self._gated else None
+        gate = old.P if old is not None and resolved and self.gated else None
         here = self.estimate()
-        known = old is not None or self._prior.information[0, 0] > 0
+        known = old is not None or self.prior.information[0, 0] > 0
         starts = [here] if known else []
         if not resolved and self.count >= self.FIRST_FIT:
             starts.append(replace(here, C=self._rough_attitude(here)))
@@ -333,8 +407,8 @@ class MapEstimator:
             if not self.MIN_EXCESS <= trial <= self.MAX_EXCESS:
                 continue
             self.excess = trial
-            solution = self._start(self.estimate(old))
-            self._extend(solution, slice(0, self.count), None)
+            solution = self._start(old.estimate)
+            self._run(solution, None)
             self._solve(solution)
             likelihood = self._likelihood(solution)
             if likelihood > best + gain:
@@ -352,7 +426,7 @@ class MapEstimator:
         """Centred q-method over the store, with the biases and lever arm of `point`."""
         epochs = slice(0, self.count)
         interval = self._corrected(epochs, point)
-        chain = Chain.start().extended(interval)[0]
+        chain = Chain.start().extended(interval)
         gnss = self._gnss.take(epochs)
         moments = np.zeros((3, 3))
         total = 0.0
@@ -376,12 +450,14 @@ class MapEstimator:
         s = self.solution if solution is None else solution
         if s is None:
             return math.inf
-        time = self._gnss.time[self.count - 1]
-        tilt = math.hypot(s.dx[0], s.dx[1]) + time * float(np.linalg.norm(s.dx[GYRO_BIAS]))
-        turn = abs(float(s.dx[2]))
-        sigma = np.sqrt(np.diag(s.P)[:3])
-        return max(tilt * (0.5 * tilt + turn) / float(min(sigma[:2])),
-                   0.5 * turn * turn / float(sigma[2]))
+        time = self.time
+        tilt_e, tilt_n, turn = s.dx[:3].tolist()
+        tilt = (math.hypot(tilt_e, tilt_n)
+                + time * math.hypot(*s.dx[GYRO_BIAS].tolist()))
+        turn = abs(turn)
+        variances = s.P.diagonal()[:3].tolist()
+        return max(tilt * (0.5 * tilt + turn) / math.sqrt(min(variances[:2])),
+                   0.5 * turn * turn / math.sqrt(variances[2]))
 
     def settle(self) -> None:
         """Move the linearisation point now if that is worth it at all, growth or hardly."""
@@ -389,61 +465,64 @@ class MapEstimator:
                 and self.count > self._last_fit * (1 + self.GROWTH_FAR)):
             self._fit()
 
-    def sign_evidence(self) -> dict[tuple[int, int], float]:
+    def fitted_afresh(self, prior: Prior, intervals: Intervals) -> Solution:
         """
-        Fit the stored epochs afresh with the signs of gyros and accelerometers as they are or not.
+        Fit the stored epochs once more, with another prior and other intervals; nothing changes.
 
-        A wrong sign, or one wrong axis (which is all three wrong in a body frame turned half
-        around), fits as well as the right ones until the vehicle has turned.
+        No epoch is rejected, whatever it says.
 
-        Returns
-        -------
-        dict
-            Chi-square by (sign of the gyros, sign of the accelerometers), in units of what is
-            usual for (1, 1).
+        Parameters
+        ----------
+        prior : Prior
+        intervals : Intervals
+            Integrated with sensor errors of zero.
 
         """
-        epochs = slice(0, self.count)
-        nothing = replace(self._prior.mean, gyro_bias=np.zeros(3), accel_bias=np.zeros(3),
-                          gyro_scale=np.zeros(3))
-        raw = self._corrected(epochs, nothing)
-        gnss = self._gnss.take(epochs)
-        chi2 = {}
-        scale = 1.0
-        for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-            trial = MapEstimator(self._prior.mirrored(*signs), use_position=self._size == 9,
-                                 estimate_lever_arm=LEVER_ARM.start in self._columns,
-                                 estimate_delay=DELAY.start in self._columns,
-                                 estimate_gyro_scale=GYRO_SCALE.start in self._columns,
-                                 capacity=gnss.time.size, excess=self.excess)
-            trial._intervals, trial._gnss = raw.mirrored(*signs), gnss
-            trial.count = gnss.time.size
-            trial._gated = False           # or the wrong signs throw out what speaks against them
-            trial._fit()
-            trial._fit()
-            assert trial.solution is not None
-            if signs == (1, 1):
-                scale = max(1.0, trial.solution.chi2 / max(trial.solution.dof, 1))
-            chi2[signs] = trial.solution.chi2 / scale
-        return chi2
+        other = MapEstimator(prior, use_position=self.size == 9,
+                             estimate_lever_arm=LEVER_ARM.start in self.columns,
+                             estimate_delay=DELAY.start in self.columns,
+                             estimate_gyro_scale=GYRO_SCALE.start in self.columns,
+                             capacity=self.count, excess=self.excess)
+        other._intervals, other._gnss = intervals, self._gnss.take(slice(0, self.count))
+        other.count = self.count
+        other.gated = False
+        other._fit()
+        other._fit()
+        assert other.solution is not None
+        return other.solution
+
+    def raw_intervals(self) -> Intervals:
+        """Return the stored intervals as they would be with sensor errors of zero."""
+        zero = np.zeros(3)
+        return self._corrected(slice(0, self.count),
+                               replace(self.prior.mean, gyro_bias=zero, accel_bias=zero,
+                                       gyro_scale=zero))
 
     # Results
 
-    def estimate(self, solution: 'Solution | None' = None) -> Unknowns:
-        """Return the estimate, or that of another solution."""
-        s = self.solution if solution is None else solution
-        if s is None:
-            return self._prior.mean
-        dx = np.zeros(SIZE)
-        dx[self._columns] = s.dx
-        return s.point.moved(dx)
+    @property
+    def time(self) -> float:
+        """Seconds from t0 to the last epoch."""
+        return float(self._gnss.time[self.count - 1])
+
+    def estimate(self) -> Unknowns:
+        """Return the estimate."""
+        return self.prior.mean if self.solution is None else self.solution.estimate
 
     @property
     def covariance(self) -> Array:
         """Covariance of the 22 unknowns; zero where one is not estimated, shape (22, 22)."""
         full = np.zeros((SIZE, SIZE))
         if self.solution is not None:
-            full[np.ix_(self._columns, self._columns)] = self.solution.P
+            full[np.ix_(self.columns, self.columns)] = self.solution.P
+        return full
+
+    @property
+    def variances(self) -> Array:
+        """Diagonal of `covariance`, shape (22,)."""
+        full = np.zeros(SIZE)
+        if self.solution is not None:
+            full[self.columns] = self.solution.P.diagonal()
         return full
 
     @property
@@ -467,114 +546,22 @@ class MapEstimator:
             Before the first solution.
 
         """
-        C, _, _, spread = self._now()
-        return C, spread[:3, :3]
-
-    def _now(self, heading_free: bool = False) -> tuple[Array, Array, Array, Array]:
-        """
-        Attitude, velocity and position of the IMU in n0 now, relative to the antenna's track.
-
-        The last result is the joint covariance of (attitude, velocity, position, unknowns),
-        shape (9 + n, 9 + n). It belongs to the heading of the linearisation point; with
-        `heading_free` the attitude is told with that heading too, since any is as good.
-        """
         s = self.solution
         if s is None:
             raise RuntimeError('no solution yet')
-        x = self.estimate()
-        if heading_free:
-            x = replace(x, C=exp_so3([0.0, 0.0, -s.dx[2]]) @ x.C)
-        time = self._gnss.time[self.count - 1]
-        n = self._columns.size
-        error = np.zeros(9)
-        error[:self._size] = s.whitener.X[:, 0] - s.whitener.X[:, 1:] @ s.dx
-        # The stored chain holds the biases of the point; its errors were estimated with the
-        # step of the biases as one of the unknowns, so that step is still to be applied.
-        dx = np.zeros(SIZE)
-        dx[self._columns] = s.dx
-        gyro, accel = dx[GYRO], dx[ACCEL_BIAS]
-        error[:3] += s.chain.R_g @ gyro
-        error[3:6] += s.chain.v_g @ gyro + s.chain.v_a @ accel
-        error[6:] += s.chain.p_g @ gyro + s.chain.p_a @ accel
-        C = x.C @ exp_so3(error[:3]) @ s.chain.R
-        Cv, Cp = x.C @ (s.chain.v + error[3:6]), x.C @ (s.chain.p + error[6:])
-        # d(state now) / d(unknowns), d(chain errors)
-        J = np.zeros((9, SIZE))
-        J[:3, ATTITUDE] = np.eye(3)
-        J[:3, GYRO] = x.C @ s.chain.R_g
-        J[3:6, ATTITUDE] = -skew(Cv)
-        J[3:6, GYRO] = x.C @ s.chain.v_g
-        J[3:6, ACCEL_BIAS] = x.C @ s.chain.v_a
-        J[3:6, START_VELOCITY] = np.eye(3)
-        J[6:, ATTITUDE] = -skew(Cp)
-        J[6:, GYRO] = x.C @ s.chain.p_g
-        J[6:, ACCEL_BIAS] = x.C @ s.chain.p_a
-        J[6:, START_VELOCITY] = time * np.eye(3)
-        J[6:, START_POSITION] = np.eye(3)
-        E = np.zeros((9, self._size))
-        for block in range(self._size // 3):
-            E[3 * block:3 * block + 3, 3 * block:3 * block + 3] = x.C
-        total = np.vstack([J[:, self._columns] - E @ s.whitener.X[:, 1:], np.eye(n)])
-        covariance = total @ s.P @ total.T
-        covariance[:9, :9] += E @ s.whitener.P @ E.T
-        return (C, x.start_velocity + Cv, x.start_position + time * x.start_velocity + Cp,
-                covariance)
-
-    def handover(self, C_n0n: Array, shift_v: Array, shift_p: Array, scale: float,
-                 wander: Array) -> Prior:
-        """
-        Return what is known now as the prior of an estimator whose t0 is the last epoch.
-
-        While the heading is not resolved, the linear picture of how it hangs together with the
-        rest is not good for long: then tilt, biases, lever arm and delay are kept, the heading
-        and the start are not.
-
-        Parameters
-        ----------
-        C_n0n : ndarray, shape (3, 3)
-            How far the local level has turned since t0.
-        shift_v, shift_p : ndarray, shape (3,)
-            s_v and s_p of an antenna track that starts at the last epoch, minus those of this one,
-            in n0 axes.
-        scale : float
-            Factor on the covariance, for data that fit worse than stated.
-        wander : ndarray, shape (22,)
-            Variance by which the unknowns may have changed since t0.
-
-        """
-        heading_free = not self.heading_std < HEADING_RESOLVED_STD
-        C, v, p, joint = self._now(heading_free)
-        x = self.estimate()
-        T = np.eye(joint.shape[0])
-        for block in range(3):
-            T[3 * block:3 * block + 3, 3 * block:3 * block + 3] = C_n0n.T
-        joint = scale * T @ joint @ T.T
-        joint[9:, 9:] += np.diag(wander[self._columns])
-        if heading_free:
-            # The gyros cannot tell their biases from the Earth's rate seen under a heading that
-            # may be anything; the linear picture knows the tangent of that circle only.
-            gyro_bias = slice(9 + GYRO_BIAS.start, 9 + GYRO_BIAS.stop)
-            least = np.linalg.eigvalsh(joint[gyro_bias, gyro_bias])[0]
-            joint[gyro_bias, gyro_bias] += max(EARTH_RATE ** 2 - least, 0.0) * np.eye(3)
-        # Places of what is kept in the joint covariance, and in the vector of unknowns.
-        kept = np.flatnonzero(np.isin(self._columns, BODY_FIXED))
-        if heading_free:
-            places, unknowns = np.arange(2), np.arange(2)
-        else:
-            places = np.arange(self._size)
-            unknowns = np.concatenate([places[:3], places[3:] + START_VELOCITY.start - 3])
-        places = np.concatenate([places, 9 + kept])
-        unknowns = np.concatenate([unknowns, self._columns[kept]])
-        mean = Unknowns(C_n0n.T @ C, x.gyro_bias, x.gyro_scale, x.accel_bias,
-                        C_n0n.T @ (v + shift_v),
-                        C_n0n.T @ (p + shift_p), x.lever_b, x.delay)
-        return prior_of(mean, joint[np.ix_(places, places)], unknowns, heading_free)
+        J = -s.whitener.X[:3, 1:]
+        J[:, ATTITUDE] += np.eye(3)
+        gyro = np.flatnonzero((self.columns >= GYRO.start) & (self.columns < GYRO.stop))
+        J[:, gyro] += (s.estimate.C @ s.chain.R_g)[:, self.columns[gyro] - GYRO.start]
+        turned = exp_so3(s.chain_errors()[:3]) @ s.estimate.C
+        return (turned @ exp_so3(s.chain.R_g @ s.step()[GYRO]) @ s.chain.R,
+                J @ s.P @ J.T + s.whitener.P[:3, :3])
 
     def prior_without_attitude(self) -> Prior:
         """Return what is known of biases, lever arm and delay as the prior of a fresh start."""
         if self.solution is None:
-            return self._prior
-        unknowns = self._columns[np.isin(self._columns, BODY_FIXED)]
+            return self.prior
+        unknowns = self.columns[np.isin(self.columns, BODY_FIXED)]
         mean = replace(self.estimate(), C=np.eye(3), start_velocity=np.zeros(3),
                        start_position=np.zeros(3))
         return prior_of(mean, self.covariance[np.ix_(unknowns, unknowns)], unknowns, False)

@@ -19,10 +19,12 @@ coarse alignment'", and the free start, the position form (Remark 2.3) and the f
 non-rotating frame that this package adds (docs, "Theory").
 """
 
+from dataclasses import dataclass, replace
+
 from ins_align.earth import (earth_rate_n, gravitation_n, gravity_n, ground_velocity_n,
                              LocalLevel, position_n)
 from ins_align.preintegration import Intervals
-from ins_align.rotation import Array, cross, matrix_from_quaternion, orthonormalized, skew
+from ins_align.rotation import Array, cross, matrix_from_quaternion, orthonormalized, running_sum, skew
 import numpy as np
 
 
@@ -163,6 +165,7 @@ class NavigationIntegrals:
         return self.s_p - self.time * self.v_n0
 
 
+@dataclass(frozen=True)
 class InertialTrack:
     """
     The navigation side in the non-rotating frame n0, from positions and velocities as they come.
@@ -172,48 +175,94 @@ class InertialTrack:
     start takes out; nothing between epochs has to be interpolated but gravitation, so gaps do no
     harm. Both are kept relative to a point that is fixed in the Earth at t0, against rounding.
 
-    Parameters
+    Attributes
     ----------
-    latitude, longitude, altitude : float
-        Of the antenna at t0, radians and metres.
+    n0 : LocalLevel
+    time : ndarray, shape (...)
+        Seconds since t0.
+    C_n0n : ndarray, shape (..., 3, 3)
+    still_v : ndarray, shape (..., 3)
+        s_v of an antenna that rests on the Earth here, m/s.
+    s_p : ndarray, shape (..., 3)
+        Metres.
+    gravity, gravitation : ndarray, shape (..., 3)
+        In n0 axes, m/s^2.
+    int_gravitation, int_int_gravitation : ndarray, shape (..., 3)
+    origin_r, origin_v : ndarray, shape (3,)
+        Position and ground velocity at t0.
 
     """
 
-    def __init__(self, latitude: float, longitude: float, altitude: float) -> None:
-        """Start at t0."""
-        self._n0 = LocalLevel(latitude, longitude)
-        self.time = 0.0
-        self.C_n0n = np.eye(3)
-        self._see(latitude, altitude)
-        self._r0, self._v0 = self._r, self._ground_velocity
-        self.int_gravitation, self.int_int_gravitation = np.zeros(3), np.zeros(3)
+    n0: LocalLevel
+    time: Array
+    C_n0n: Array
+    still_v: Array
+    s_p: Array
+    gravity: Array
+    gravitation: Array
+    int_gravitation: Array
+    int_int_gravitation: Array
+    origin_r: Array
+    origin_v: Array
 
-    def advance(self, time: float, latitude: float, longitude: float, altitude: float) -> None:
-        """Move to `time` seconds after t0, where the antenna is at the given position."""
-        h = time - self.time
-        self.time = time
-        self.C_n0n = self._n0.matrix(time, latitude, longitude)
-        g0 = self._gravitation
-        self._see(latitude, altitude)
-        g1 = self._gravitation
-        self.int_int_gravitation = (self.int_int_gravitation + h * self.int_gravitation
-                                    + h * h / 6 * (2 * g0 + g1))
-        self.int_gravitation = self.int_gravitation + h / 2 * (g0 + g1)
+    @staticmethod
+    def start(latitude: float, longitude: float, altitude: float) -> 'InertialTrack':
+        """Start at t0, with the antenna there: radians and metres."""
+        zero = np.zeros(3)
+        return InertialTrack(
+            LocalLevel(latitude, longitude), np.zeros(()), np.eye(3), zero, zero,
+            gravity_n(latitude, altitude), gravitation_n(latitude, altitude), zero, zero,
+            position_n(latitude, altitude), ground_velocity_n(latitude, altitude))
 
-    def _see(self, latitude: float, altitude: float) -> None:
-        """Bring what belongs to a place into n0 axes."""
-        self._r = self.C_n0n @ position_n(latitude, altitude)
-        self._ground_velocity = self.C_n0n @ ground_velocity_n(latitude, altitude)
-        self._gravitation = self.C_n0n @ gravitation_n(latitude, altitude)
+    def extended(self, time: Array, latitude: Array, longitude: Array,
+                 altitude: Array) -> 'InertialTrack':
+        """
+        Follow the antenna through K epochs.
+
+        Parameters
+        ----------
+        time : ndarray, shape (K,)
+            Seconds since t0, increasing.
+        latitude, longitude, altitude : ndarray, shape (K,)
+            Of the antenna, radians and metres.
+
+        Returns
+        -------
+        InertialTrack
+            With a leading axis of K.
+
+        """
+        C_n0n = self.n0.matrix(time, latitude, longitude)
+
+        def seen(vector_n: Array) -> Array:
+            return (C_n0n @ vector_n[..., None])[..., 0]
+
+        gravity_here = gravity_n(latitude, altitude)
+        ground_velocity = ground_velocity_n(latitude, altitude)
+        gravitation = seen(gravity_here + cross(earth_rate_n(latitude), ground_velocity))
+        before = np.concatenate([self.gravitation[None], gravitation[:-1]])
+        h = np.diff(time, prepend=self.time)[:, None]
+        steps = h / 2 * (before + gravitation)
+        int_gravitation = running_sum(self.int_gravitation, steps)
+        int_int_gravitation = running_sum(
+            self.int_int_gravitation,
+            h * (int_gravitation - steps) + h * h / 6 * (2 * before + gravitation))
+        return InertialTrack(
+            self.n0, time, C_n0n, seen(ground_velocity) - self.origin_v - int_gravitation,
+            (seen(position_n(latitude, altitude)) - self.origin_r
+             - time[:, None] * self.origin_v - int_int_gravitation),
+            seen(gravity_here), gravitation, int_gravitation, int_int_gravitation,
+            self.origin_r, self.origin_v)
+
+    def at(self, index: int) -> 'InertialTrack':
+        """Return one epoch of a track over many."""
+        return replace(self, **{name: getattr(self, name)[index] for name in (
+            'time', 'C_n0n', 'still_v', 's_p', 'gravity', 'gravitation', 'int_gravitation',
+            'int_int_gravitation')})
 
     def s_v(self, v_n: Array) -> Array:
-        """Velocity side for the antenna velocity `v_n` (ENU, m/s) at the present time."""
-        return self.C_n0n @ v_n + self._ground_velocity - self._v0 - self.int_gravitation
-
-    @property
-    def s_p(self) -> Array:
-        """Position side at the present time and position."""
-        return self._r - self._r0 - self.time * self._v0 - self.int_int_gravitation
+        """Velocity side for antenna velocities `v_n` (ENU, m/s), shape (..., 3)."""
+        return (self.C_n0n @ v_n[..., None])[..., 0] + self.still_v
 
 
 class AttitudeMoments:
@@ -310,7 +359,7 @@ def exact_lever_remainder(time: Array, C_b0b: Array, omega_eb_b: Array, omega_ie
     Returns
     -------
     ndarray, shape (N, 3)
-        m/s; at most ``2 W^2 t |lever|``.
+        m/s; at most ``W^2 t |lever|``.
 
     """
     rate = skew(omega_eb_b)

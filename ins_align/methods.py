@@ -18,16 +18,18 @@ A method takes GNSS epochs with the IMU steps before them and tells the initial 
 t0), the current one, and how well its model fits.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import Protocol
 
 from ins_align.config import Config
-from ins_align.earth import gravity_n
-from ins_align.estimator import MapEstimator
+from ins_align.estimator import Innovation, MapEstimator, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
+from ins_align.handover import prior_from_now
 from ins_align.preintegration import Noise, preintegrate, Steps
 from ins_align.rotation import Array, orthonormalized
+from ins_align.signs import SignCheck
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
                                 Prior, SIZE, UNIFORM_ANGLE_STD)
 from ins_align.whitening import Measurements
@@ -37,17 +39,9 @@ import numpy as np
 WANDER, WANDER_TIME = 0.1, 100.0
 # After t0 has moved, the fit so far counts like this many rows.
 PAST_DOF = 300
-# The signs of the sensors are judged again when the data have grown by the first share, and by
-# the second beyond so many epochs; they are confirmed when every other choice of signs has so much
-# more chi-square.
-EVIDENCE_GROWTH = 0.05, 0.3
-EVIDENCE_SOON = 200
-EVIDENCE_GAIN = 12.0
-WRONG_SIGNS = {
-    (1, -1): 'the accelerations reversed (sign of gravity instead of specific force?)',
-    (-1, 1): 'the angular rates reversed',
-    (-1, -1): 'one IMU axis reversed (left-handed axes?)',
-}
+# Epochs that are integrated at one go: few right after the linearisation point has moved, because
+# then it will soon again.
+MAX_AHEAD = 64
 
 
 @dataclass(frozen=True)
@@ -81,19 +75,23 @@ class Epoch:
 
 @dataclass(frozen=True)
 class ImuSteps:
-    """IMU steps up to an epoch and the white noise in them."""
+    """IMU steps before each of K epochs and the white noise in them."""
 
     steps: Steps
     noise: Noise
 
+    def take(self, index: slice) -> 'ImuSteps':
+        """Return those of some epochs."""
+        return ImuSteps(self.steps.take(index), self.noise.take(index))
+
 
 @dataclass(frozen=True)
 class Fit:
-    """How well the data fit the model: sums, and the last epoch's innovations."""
+    """How well the data fit the model: sums, and the last epoch's innovation."""
 
     chi2: float
     dof: int
-    nis: float                  # of the last epoch, per row; nan without
+    innovation: Innovation
     converged: bool
     rejected_velocity: int
     rejected_position: int
@@ -132,8 +130,8 @@ class Method(Protocol):
     t0_ns: int
     moved: int                          # how often t0 was moved forward
 
-    def advance(self, epoch: Epoch, imu: ImuSteps) -> None:
-        """Take the next epoch and the IMU steps before it."""
+    def advance(self, epochs: Sequence[Epoch], imu: ImuSteps) -> Iterator[Epoch]:
+        """Take epochs and the IMU steps before each; yield each when the results are its."""
 
     def initial(self) -> tuple[Array, Array] | None:
         """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
@@ -187,6 +185,7 @@ class MapMethod:
         self._capacity = capacity
         self.moved = 0
         noise = config.imu_noise
+        self._scaled = noise.gyro_scale_std > 0
         self._wander = np.zeros(SIZE)
         self._wander[GYRO_BIAS] = (WANDER * noise.gyro_bias_std) ** 2 / WANDER_TIME
         self._wander[ACCEL_BIAS] = (WANDER * noise.accel_bias_std) ** 2 / WANDER_TIME
@@ -194,74 +193,92 @@ class MapMethod:
             prior = first_prior(noise.gyro_bias_std, noise.accel_bias_std,
                                 np.array(config.lever_arm), config.lever_arm_std,
                                 0.0, config.gnss_delay_std, noise.gyro_scale_std)
-        self._doubt = 'the signs of the IMU axes are not judged yet'
-        self._next_evidence = 0.0
+        self._signs = SignCheck()
         self._offered = 0
         self._rejected = [0, 0]
         self._past = 0.0, 0
+        self._innovation = NOTHING_NEW
         self._start(epoch, prior)
-        self._nis = math.nan
-        self._add(epoch, imu)
+        self._take_start(epoch, imu)
 
     def _start(self, epoch: Epoch, prior: Prior, excess: float = 1.0) -> None:
         self.t0_ns = epoch.stamp_ns
-        self._track = InertialTrack(epoch.latitude, epoch.longitude, epoch.altitude)
+        self._track = InertialTrack.start(epoch.latitude, epoch.longitude, epoch.altitude)
         self._estimator = MapEstimator(
             prior, use_position=self._use_position,
             estimate_lever_arm=self._config.lever_arm_std > 0,
             estimate_delay=self._config.gnss_delay_std > 0, capacity=self._capacity,
-            estimate_gyro_scale=self._config.imu_noise.gyro_scale_std > 0, excess=excess)
+            estimate_gyro_scale=self._scaled, excess=excess)
 
-    def advance(self, epoch: Epoch, imu: ImuSteps) -> None:
-        """Take the next epoch and the IMU steps before it."""
-        if self._estimator.full or self._estimator.stale:
-            self._move_start()
-        time = (epoch.stamp_ns - self.t0_ns) * 1e-9
-        self._track.advance(time, epoch.latitude, epoch.longitude, epoch.altitude)
-        self._add(epoch, imu)
+    def _take_start(self, epoch: Epoch, imu: ImuSteps) -> None:
+        """Take the epoch at t0."""
+        for _ in self._take([epoch], imu):
+            pass
 
-    def _add(self, epoch: Epoch, imu: ImuSteps) -> None:
-        track = self._track
-        C_n0n = track.C_n0n
-        present = [epoch.v_n is not None, epoch.position_measured and self._use_position]
-        still = track.s_v(np.zeros(3))
-        s_v = still if epoch.v_n is None else track.s_v(epoch.v_n)
-        gnss = Measurements(
-            np.array([track.time]), np.concatenate([s_v, track.s_p])[None],
-            (C_n0n @ np.stack([epoch.velocity_covariance, epoch.position_covariance])
-             @ C_n0n.T)[None],
-            np.array([present]), (C_n0n @ gravity_n(epoch.latitude, epoch.altitude))[None],
-            -still[None])
-        errors = self.sensor_errors()
-        gyro_bias, accel_bias, gyro_scale = errors
-        interval = preintegrate(imu.steps, gyro_bias, accel_bias, imu.noise, gyro_scale)
-        nis = self._estimator.add(interval, errors, gnss)
-        self._last, self._last_epoch = imu, epoch
-        self._offered += any(present)
-        self._nis = float(np.nanmean(nis)) / 3 if np.any(np.isfinite(nis)) else math.nan
+    def advance(self, epochs: Sequence[Epoch], imu: ImuSteps) -> Iterator[Epoch]:
+        """Take epochs and the IMU steps before each; yield each when the results are its."""
+        done, ahead = 0, 1
+        while done < len(epochs):
+            if self._estimator.full or self._estimator.stale:
+                self._move_start()
+            solution = self._estimator.solution
+            part = slice(done, done + ahead)
+            for epoch in self._take(epochs[part], imu.take(part)):
+                done += 1
+                yield epoch
+                if self._estimator.stale:
+                    break
+            ahead = min(2 * ahead, MAX_AHEAD) if self._estimator.solution is solution else 1
+
+    def _take(self, epochs: Sequence[Epoch], imu: ImuSteps) -> Iterator[Epoch]:
+        """Take epochs as long as the estimator stays where it is."""
+        track = self._track.extended(
+            np.array([epoch.stamp_ns - self.t0_ns for epoch in epochs]) * 1e-9,
+            *(np.array([getattr(epoch, name) for epoch in epochs])
+              for name in ('latitude', 'longitude', 'altitude')))
+        present = np.array([[epoch.v_n is not None,
+                             epoch.position_measured and self._use_position]
+                            for epoch in epochs])
+        v_n = np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n for epoch in epochs])
+        covariance = np.array([[epoch.velocity_covariance, epoch.position_covariance]
+                               for epoch in epochs])
+        C_n0n = track.C_n0n[:, None]
+        gnss = Measurements(track.time, np.hstack([track.s_v(v_n), track.s_p]),
+                            C_n0n @ covariance @ C_n0n.transpose(0, 1, 3, 2), present,
+                            track.gravity, -track.still_v)
+        gyro_bias, accel_bias, gyro_scale = self._estimator.sensor_errors
+        intervals = preintegrate(imu.steps, gyro_bias, accel_bias, imu.noise,
+                                 gyro_scale if self._scaled else None)
+        for k, self._innovation in enumerate(self._estimator.add(intervals, gnss)):
+            self._track, self._last_epoch = track.at(k), epochs[k]
+            self._last_imu = imu.take(slice(k, k + 1))
+            self._offered += bool(present[k].any())
+            yield epochs[k]
 
     def _move_start(self) -> None:
         """Move t0 to the last epoch; what was learnt becomes the prior."""
-        track, steps = self._track, self._last.steps
+        track, steps = self._track, self._last_imu.steps
         fit = self.fit()
-        prior = self._estimator.handover(track.C_n0n, -track.s_v(np.zeros(3)), -track.s_p,
-                                         fit.significant_scale, self._wander * track.time)
+        prior = prior_from_now(self._estimator, track.C_n0n, -track.still_v, -track.s_p,
+                               fit.significant_scale, self._wander * track.time)
         self._rejected = [fit.rejected_velocity, fit.rejected_position]
         self._past = PAST_DOF * fit.chi2 / max(fit.dof, 1), PAST_DOF
-        self._next_evidence = 0.0
+        self._signs.restart()
         self.moved += 1
         start = replace(self._last_epoch, v_n=None, position_measured=False)
         self._start(start, prior, self._estimator.excess)
         instant = Steps(np.zeros((1, 1)), *(np.repeat(array[:, -1:], 2, axis=1) for array in (
             steps.omega, steps.f, steps.omega_dot, steps.f_dot)))
-        self._add(start, ImuSteps(instant, Noise()))
+        innovation = self._innovation
+        self._take_start(start, ImuSteps(instant, Noise(*np.zeros((4, 1, 1)))))
+        self._innovation = innovation
 
     def initial(self) -> tuple[Array, Array] | None:
         """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
-        if self._estimator.solution is None:
+        solution = self._estimator.solution
+        if solution is None:
             return None
-        return (self._estimator.estimate().C,
-                self._estimator.covariance[ATTITUDE, ATTITUDE])
+        return solution.estimate.C, solution.P[ATTITUDE, ATTITUDE]
 
     def current(self) -> tuple[Array, Array] | None:
         """Return ``C_nb`` at the last epoch and the covariance of its error in ENU."""
@@ -275,10 +292,10 @@ class MapMethod:
         """Return how well the data fit."""
         solution = self._estimator.solution
         if solution is None:
-            return Fit(math.nan, 0, math.nan, False, 0, 0, self._offered)
+            return Fit(math.nan, 0, NOTHING_NEW, False, 0, 0, self._offered)
         rejected = solution.whitener.rejected
         past_chi2, past_dof = self._past
-        return Fit(past_chi2 + solution.chi2, past_dof + solution.dof, self._nis,
+        return Fit(past_chi2 + solution.chi2, past_dof + solution.dof, self._innovation,
                    self._estimator.nonlinearity() <= self._estimator.NONLINEARITY,
                    self._rejected[0] + rejected[0], self._rejected[1] + rejected[1],
                    self._offered)
@@ -289,25 +306,12 @@ class MapMethod:
 
     def unconfirmed(self) -> str:
         """Return why the data do not show yet that the sensors' signs are right, or nothing."""
-        if self._doubt and self._estimator.count >= self._next_evidence:
-            growth = EVIDENCE_GROWTH[self._estimator.count > EVIDENCE_SOON]
-            self._next_evidence = self._estimator.count * (1 + growth)
-            chi2 = self._estimator.sign_evidence()
-            right = chi2.pop((1, 1))
-            rival = min(chi2, key=chi2.__getitem__)
-            if chi2[rival] > right + EVIDENCE_GAIN:
-                self._doubt = ''
-            elif chi2[rival] > right - EVIDENCE_GAIN:
-                self._doubt = ('the signs of the IMU axes are not confirmed by the motion yet: '
-                               'turn')
-            else:
-                self._doubt = f'the data fit better with {WRONG_SIGNS[rival]}: check the IMU axes'
-        return self._doubt
+        return self._signs.doubt(self._estimator)
 
     def nuisance(self) -> Nuisance:
         """Return biases, lever arm and delay."""
         x = self._estimator.estimate()
-        std = np.sqrt(np.maximum(np.diag(self._estimator.covariance), 0.0))
+        std = np.sqrt(self._estimator.variances)
         return Nuisance(x.gyro_bias, std[GYRO_BIAS], x.accel_bias, std[ACCEL_BIAS],
                         x.lever_b, std[LEVER_ARM], self._config.gnss_delay + x.delay,
                         float(std[DELAY][0]))
@@ -353,7 +357,7 @@ class NoteMethod:
         self._zero = np.zeros(3)
         self._body = BodyIntegrals(self._lever_b, imu.steps.omega[0, -1])
         place = epoch.latitude, epoch.longitude, epoch.altitude
-        self._track = InertialTrack(*place)
+        self._track = InertialTrack.start(*place)
         self._start_place = place
         self._navigation: NavigationIntegrals | None = None
         if epoch.v_n is not None:
@@ -372,20 +376,22 @@ class NoteMethod:
         if self._free or self._from_positions:
             self._pair(epoch)
 
-    def advance(self, epoch: Epoch, imu: ImuSteps) -> None:
-        """Take the next epoch and the IMU steps before it."""
-        interval = preintegrate(imu.steps, self._zero, self._zero, Noise())
-        self._body.advance(interval, 0)
-        time = (epoch.stamp_ns - self.t0_ns) * 1e-9
-        place = epoch.latitude, epoch.longitude, epoch.altitude
-        self._track.advance(time, *place)
-        if epoch.v_n is not None and self._navigation is not None:
-            self._navigation.advance(time, *place, epoch.v_n)
-        self._pair(epoch)
+    def advance(self, epochs: Sequence[Epoch], imu: ImuSteps) -> Iterator[Epoch]:
+        """Take epochs and the IMU steps before each; yield each when the results are its."""
+        intervals = preintegrate(imu.steps, self._zero, self._zero, Noise())
+        for k, epoch in enumerate(epochs):
+            self._body.advance(intervals, k)
+            time = (epoch.stamp_ns - self.t0_ns) * 1e-9
+            place = epoch.latitude, epoch.longitude, epoch.altitude
+            self._track = self._track.extended(*np.array([time, *place])[:, None]).at(0)
+            if epoch.v_n is not None and self._navigation is not None:
+                self._navigation.advance(time, *place, epoch.v_n)
+            self._pair(epoch)
+            yield epoch
 
     def _pair(self, epoch: Epoch) -> None:
         """Add the pair of vectors of an epoch and solve."""
-        body, time = self._body, self._track.time
+        body, time = self._body, float(self._track.time)
         if self._from_positions:
             if not epoch.position_measured:
                 return
@@ -434,9 +440,9 @@ class NoteMethod:
         """Return how well the data fit."""
         dof = 3 * self._moments.count - 3 - 3 * self._nuisance
         if self._solution is None or dof <= 0:
-            return Fit(math.nan, 0, math.nan, False, 0, 0, self._offered)
+            return Fit(math.nan, 0, NOTHING_NEW, False, 0, 0, self._offered)
         variance = self._variance / self._offered
-        return Fit(self._residual / variance, dof, math.nan, True, 0, 0, self._offered)
+        return Fit(self._residual / variance, dof, NOTHING_NEW, True, 0, 0, self._offered)
 
     def settle(self) -> None:
         """Nothing to bring: the estimate is closed form."""

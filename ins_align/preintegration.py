@@ -22,7 +22,7 @@ interpolation. All samples of an interval, and all intervals of a batch, are han
 from dataclasses import dataclass, fields
 
 from ins_align.rotation import (Array, cross, cumulative_rotations, exp_and_left_jacobian, exp_so3,
-                                skew)
+                                Index, skew)
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -90,10 +90,10 @@ class Intervals:
         return Intervals(**{field.name: np.zeros((capacity,) + shapes.get(field.name, (3, 3)))
                             for field in fields(Intervals)})
 
-    def put(self, index: int, other: 'Intervals', other_index: int) -> None:
-        """Copy one interval of `other` into place `index`."""
+    def put(self, index: slice, other: 'Intervals') -> None:
+        """Copy the intervals of `other` into the places `index`."""
         for name, array in vars(self).items():
-            array[index] = getattr(other, name)[other_index]
+            array[index] = getattr(other, name)
 
     def take(self, index: 'slice | Array') -> 'Intervals':
         """Return the intervals of `index`."""
@@ -154,6 +154,10 @@ class Noise:
     gyro_excess: ArrayLike = 0.0
     accel_excess: ArrayLike = 0.0
 
+    def take(self, index: slice) -> 'Noise':
+        """Return the noise in the intervals of `index`, of fields that are all (K, n) or (K, 1)."""
+        return Noise(*(np.asarray(array)[index] for array in vars(self).values()))
+
 
 @dataclass(frozen=True)
 class Steps:
@@ -176,8 +180,13 @@ class Steps:
     omega_dot: Array
     f_dot: Array
 
+    def take(self, index: slice) -> 'Steps':
+        """Return the intervals of `index`."""
+        return Steps(*(array[index] for array in vars(self).values()))
 
-def split_at_epochs(stamps: Array, gyro: Array, accel: Array, epochs: Array) -> Steps:
+
+def split_at_epochs(stamps: Array, gyro: Array, accel: Array, epochs: Array,
+                    unit: float = 1.0) -> Steps:
     """
     Cut a run of samples into the intervals between epochs.
 
@@ -187,11 +196,13 @@ def split_at_epochs(stamps: Array, gyro: Array, accel: Array, epochs: Array) -> 
     Parameters
     ----------
     stamps : ndarray, shape (N,)
-        Sample times, seconds, strictly increasing, first <= epochs[0], last >= epochs[-1].
+        Sample times, strictly increasing, first <= epochs[0], last >= epochs[-1].
     gyro, accel : ndarray, shape (N, 3)
         Angular rate, rad/s; specific force, m/s^2.
     epochs : ndarray, shape (K + 1,)
         Increasing; two equal ones make an interval of no length.
+    unit : float
+        Of stamps and epochs, seconds. Integers of 1e-9 keep the result free of the origin of time.
 
     Returns
     -------
@@ -208,23 +219,32 @@ def split_at_epochs(stamps: Array, gyro: Array, accel: Array, epochs: Array) -> 
     knots[:, -1] = epochs[1:]
 
     samples = np.hstack([gyro, accel])
-    slopes = np.gradient(samples, stamps, axis=0)
+    slopes = _slopes(samples, np.diff(stamps) * unit)
     right = np.clip(np.searchsorted(stamps, knots, side='left'), 1, stamps.size - 1)
     left = right - 1
-    h = (stamps[right] - stamps[left])[..., None]
-    t = (knots - stamps[left])[..., None] / h
+    h = ((stamps[right] - stamps[left]) * unit)[..., None]
+    t = ((knots - stamps[left]) * unit)[..., None] / h
     rise = samples[right] - samples[left]
     bend0, bend1 = h * slopes[left] - rise, rise - h * slopes[right]
     value = samples[left] + t * rise + t * (1 - t) * ((1 - t) * bend0 + t * bend1)
     slope = (rise + (1 - 2 * t) * ((1 - t) * bend0 + t * bend1)
              + t * (1 - t) * (bend1 - bend0)) / h
-    return Steps(np.diff(knots, axis=1), value[..., :3], value[..., 3:],
+    return Steps(np.diff(knots, axis=1) * unit, value[..., :3], value[..., 3:],
                  slope[..., :3], slope[..., 3:])
 
 
-def white_noise(stamps: Array, samples: Array) -> Array:
+def _slopes(samples: Array, spacing: Array) -> Array:
+    """Central differences at uneven spacing, one-sided at both ends."""
+    rise = np.diff(samples, axis=0) / spacing[:, None]
+    before, after = spacing[:-1, None], spacing[1:, None]
+    inner = (after * rise[:-1] + before * rise[1:]) / (before + after)
+    return np.concatenate([rise[:1], inner, rise[-1:]])
+
+
+def white_noise(stamps: Array, samples: Array, first: Index, last: Index,
+                unit: float = 1.0) -> Array:
     """
-    White noise density of gyros and accelerometers, measured in the data.
+    White noise density of gyros and accelerometers, measured in K windows of the data.
 
     Third divided differences take out everything that is quadratic over four samples, which
     motion is, and leave what is new in each sample. Vibration counts as noise.
@@ -232,31 +252,42 @@ def white_noise(stamps: Array, samples: Array) -> Array:
     Parameters
     ----------
     stamps : ndarray, shape (N,)
-        Seconds, strictly increasing.
+        Strictly increasing.
     samples : ndarray, shape (N, 6)
         Angular rate and specific force.
+    first, last : ndarray of int, shape (K,)
+        Each window's first sample and the one after its last.
+    unit : float
+        Of stamps, seconds.
 
     Returns
     -------
-    ndarray, shape (2,)
+    ndarray, shape (K, 2)
         rad/sqrt(s) and m/s/sqrt(s), mean over the axes; 0 for fewer than eight samples.
 
     """
-    count = stamps.size - 3
-    if count < 5:
-        return np.zeros(2)
-    t = np.stack([stamps[i:i + count] for i in range(4)])
-    apart = t[:, None] - t[None]
+    count = last - first - 3
+    enough = count >= 5
+    if not np.any(enough):
+        return np.zeros((first.size, 2))
+    n = stamps.size - 3
+    t = np.stack([stamps[i:i + n] for i in range(4)])
+    apart = (t[:, None] - t[None]) * unit
     apart[range(4), range(4)] = 1.0
     weights = 1 / np.prod(apart, axis=1)
     weights /= np.sqrt(np.sum(weights ** 2, axis=0))
-    left = sum(weights[i, :, None] * samples[i:i + count] for i in range(4))
-    variance = np.mean(np.square(left).reshape(count, 2, 3), axis=(0, 2))
-    return np.sqrt(variance * (stamps[-1] - stamps[0]) / (stamps.size - 1))
+    left = np.zeros((n + 1, 6))
+    for i in range(4):
+        left[:-1] += weights[i, :, None] * samples[i:i + n]
+    first, last, count = (np.where(enough, x, y) for x, y in ((first, 0), (last, n), (count, 1)))
+    sums = np.add.reduceat(np.square(left), np.stack([first, last - 3], axis=1).ravel())[::2]
+    spacing = (stamps[last - 1] - stamps[first]) * unit / (last - first - 1)
+    density = np.sqrt(sums.reshape(-1, 2, 3).mean(axis=2) * (spacing / count)[:, None])
+    return np.where(enough[:, None], density, 0.0)
 
 
 def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise,
-                 gyro_scale: ArrayLike = 0.0) -> Intervals:
+                 gyro_scale: 'Array | None' = None) -> Intervals:
     """
     Integrate the steps of K intervals.
 
@@ -272,8 +303,9 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
         Subtracted first.
     noise : Noise
         Of the sensors, in each step.
-    gyro_scale : array_like, shape () or (3,)
-        Scale factors less one: the true rate is ``omega (1 - gyro_scale) - gyro_bias``.
+    gyro_scale : ndarray, shape (3,), optional
+        Scale factors less one: the true rate is ``omega (1 - gyro_scale) - gyro_bias``. Without
+        it the derivatives to it are left out, that is zero.
 
     Returns
     -------
@@ -287,7 +319,9 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
 
     """
     dt = steps.dt
-    omega = steps.omega * (1 - np.asarray(gyro_scale)) - gyro_bias
+    omega = steps.omega - gyro_bias
+    if gyro_scale is not None:
+        omega -= steps.omega * gyro_scale
     f = steps.f - accel_bias
     omega0, omega1 = omega[:, :-1], omega[:, 1:]
     f0, f1 = f[:, :-1], f[:, 1:]
@@ -322,16 +356,20 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     v_g = np.cumsum(v_g_step, axis=1)
     p_g = np.sum(hh * (v_g - 0.5 * v_g_step), axis=1)
     p_a = np.sum(hh * A_mid, axis=1)
-    # A scale factor is a bias in proportion to the rate of its axis.
-    S_step = A_step * (0.5 * (omega0 + omega1))[..., None, :]
-    S_sum = np.cumsum(S_step, axis=1)
-    v_s_step = skew_u @ (S_sum - 0.5 * S_step)
-    v_s = np.cumsum(v_s_step, axis=1)
-    p_s = np.sum(hh * (v_s - 0.5 * v_s_step), axis=1)
+    J_Rs = J_vs = J_ps = np.zeros((dt.shape[0], 3, 3))
+    if gyro_scale is not None:
+        # A scale factor is a bias in proportion to the rate of its axis.
+        S_step = A_step * (0.5 * (omega0 + omega1))[..., None, :]
+        S_sum = np.cumsum(S_step, axis=1)
+        v_s_step = skew_u @ (S_sum - 0.5 * S_step)
+        v_s = np.cumsum(v_s_step, axis=1)
+        J_Rs, J_vs = -S_sum[:, -1], v_s[:, -1]
+        J_ps = np.sum(hh * (v_s - 0.5 * v_s_step), axis=1)
 
-    duration = np.sum(dt, axis=1)
+    passed = np.cumsum(dt, axis=1)
+    duration = passed[:, -1]
     v, p = v_end[:, -1], p_end[:, -1]
-    remaining = duration[:, None] - np.cumsum(dt, axis=1) + 0.5 * dt
+    remaining = duration[:, None] - passed + 0.5 * dt
     v_rest = v[:, None] - v_mid
     p_rest = p[:, None] - (p_end - 0.5 * p_step) - v_mid * remaining[..., None]
     Q, Q_excess = (
@@ -339,7 +377,7 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
         for gyro, accel in ((noise.angle_random_walk, noise.velocity_random_walk),
                             (noise.gyro_excess, noise.accel_excess)))
     return Intervals(duration, turned[:, -1], v, p, -A_sum[:, -1], v_g[:, -1], p_g, -p_a,
-                     -S_sum[:, -1], v_s[:, -1], p_s, Q, Q_excess, omega[:, -1], f[:, -1])
+                     J_Rs, J_vs, J_ps, Q, Q_excess, omega[:, -1], f[:, -1])
 
 
 def _noise(gyro_variance: Array, accel_variance: Array, dt: Array, remaining: Array,
@@ -351,19 +389,27 @@ def _noise(gyro_variance: Array, accel_variance: Array, dt: Array, remaining: Ar
     and distance still to come after each step (remaining, v_rest, p_rest) matter. The variances
     are those of each step's angle and velocity increment, shape (K, n).
     """
-    eye = np.eye(3)
+    K = dt.shape[0]
+    Q = np.zeros((K, 9, 9))
     if not (np.any(gyro_variance) or np.any(accel_variance)):
-        return np.zeros((dt.shape[0], 9, 9))
-    lever = np.zeros(dt.shape + (9, 3))           # error at the end per error of a step's angle
-    lever[..., :3, :] = eye
-    lever[..., 3:6, :] = -skew(v_rest)
-    lever[..., 6:, :] = -skew(p_rest)
-    lever *= np.sqrt(gyro_variance)[..., None, None]
-    columns = lever.transpose(0, 2, 1, 3).reshape(dt.shape[0], 9, -1)
-    Q = columns @ columns.transpose(0, 2, 1)
-    v, p = slice(3, 6), slice(6, 9)
+        return Q
+    # An error of a step's angle turns what is still to come: sums of the products of
+    # [1, v_rest, p_rest], from which those of [I, -[v_rest x], -[p_rest x]] follow.
+    rest = np.concatenate([np.ones(dt.shape + (1,)), v_rest, p_rest], axis=-1)
+    moment = np.sum((gyro_variance[..., None] * rest)[..., None] * rest[..., None, :], axis=1)
+    eye = np.eye(3)
+    angle, v, p = slice(0, 3), slice(3, 6), slice(6, 9)
+    Q[:, angle, angle] = moment[:, :1, :1] * eye
+    for block, place in ((v, slice(1, 4)), (p, slice(4, 7))):
+        Q[:, block, angle] = -skew(moment[:, 0, place])
+        Q[:, angle, block] = -Q[:, block, angle]
+    for row, i in ((v, slice(1, 4)), (p, slice(4, 7))):
+        for column, j in ((v, slice(1, 4)), (p, slice(4, 7))):
+            product = moment[:, i, j]             # [a x] [b x]^T = (a . b) I - b a^T
+            Q[:, row, column] = (np.trace(product, axis1=1, axis2=2)[:, None, None] * eye
+                                 - product.transpose(0, 2, 1))
     for row, column, weight in ((v, v, 1.0), (v, p, remaining), (p, v, remaining),
                                 # dt^2 / 12 is the variance within the step itself
                                 (p, p, remaining ** 2 + dt ** 2 / 12)):
-        Q[:, row, column] += np.sum(accel_variance * weight, axis=1)[:, None, None] * eye
+        Q[:, row, column] += np.cumsum(accel_variance * weight, axis=1)[:, -1, None, None] * eye
     return Q

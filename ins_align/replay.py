@@ -24,7 +24,8 @@ import math
 import os
 from typing import Any
 
-from ins_align.aligner import Aligner, Attitude, Epoch, Status
+from ins_align.aligner import Aligner
+from ins_align.results import Attitude, Epoch, Status
 from ins_align.bag_files import BagError, Topic
 from ins_align.bags import Bag, Block, Topics
 from ins_align.config import Config
@@ -252,7 +253,6 @@ class _Run:
                 self._add_fix(block.messages[index])
             else:
                 self._add_velocity(block.messages[index])
-            self._epochs += self._aligner.update()
         self._add_imu(samples, position, len(samples.stamps_ns))
         self._epochs += self._aligner.update()
         if topics.reference is not None and (kinds == 1).any():

@@ -18,13 +18,18 @@ Matrices are ``C_xy`` (components in y to components in x), quaternions are (x, 
 same rotation with w >= 0, angles are radians.
 """
 
+import math
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Index = NDArray[np.integer[Any]]
 
-# Below this angle (rad) the Taylor series of sin(x)/x and friends are exact to rounding.
-_SMALL_ANGLE = 1e-3
+# Below this angle (rad) four terms of the Taylor series of sin(x)/x and friends are exact to
+# rounding, below the second one two are.
+_SERIES_ANGLE, _SMALL_ANGLE = 0.05, 1e-3
 
 
 def skew(vector: ArrayLike) -> Array:
@@ -70,25 +75,49 @@ def cross(a: ArrayLike, b: ArrayLike) -> Array:
 
 def _trigonometric_factors(angle2: Array) -> tuple[Array, Array, Array]:
     """sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 of x^2."""
-    small = angle2 < _SMALL_ANGLE ** 2
+    series = (1 - angle2 / 6 * (1 - angle2 / 20 * (1 - angle2 / 42)),
+              0.5 - angle2 / 24 * (1 - angle2 / 30 * (1 - angle2 / 56)),
+              1 / 6 - angle2 / 120 * (1 - angle2 / 42 * (1 - angle2 / 72)))
+    small = angle2 < _SERIES_ANGLE ** 2
+    if np.all(small):
+        return series
     x2 = np.where(small, 1.0, angle2)
     x = np.sqrt(x2)
     sine = np.sin(x)
-    a = np.where(small, 1 - angle2 / 6, sine / x)
-    b = np.where(small, 0.5 - angle2 / 24, 2 * np.sin(x / 2) ** 2 / x2)
-    c = np.where(small, 1 / 6 - angle2 / 120, (x - sine) / (x * x2))
+    a, b, c = (np.where(small, near, far) for near, far in zip(series, (
+        sine / x, 2 * np.sin(x / 2) ** 2 / x2, (x - sine) / (x * x2))))
     return a, b, c
 
 
 def exp_and_left_jacobian(vector: ArrayLike) -> tuple[Array, Array]:
-    """Return `exp_so3` and `left_jacobian` of rotation vectors, shape (..., 3), at one go."""
+    """
+    Return `exp_so3` of rotation vectors, shape (..., 3), and the left Jacobian of SO(3).
+
+    The latter says what a change of a rotation vector does to its rotation:
+    ``exp_so3(v + d) ~ exp_so3(left_jacobian d) exp_so3(v)``.
+    """
     v = np.asarray(vector, dtype=float)
-    a, b, c = _trigonometric_factors(np.sum(v * v, axis=-1))
-    s = skew(v)
-    ss = s @ s
-    eye = np.eye(3)
-    return (eye + a[..., None, None] * s + b[..., None, None] * ss,
-            eye + b[..., None, None] * s + c[..., None, None] * ss)
+    squares = v * v
+    angle2 = squares[..., 0] + squares[..., 1] + squares[..., 2]
+    a, b, c = _trigonometric_factors(angle2)
+    return _rodrigues(v, angle2, a, b), _rodrigues(v, angle2, b, c)
+
+
+def _rodrigues(v: Array, angle2: Array, odd: Array, even: Array) -> Array:
+    """Return ``I + odd [v x] + even [v x]^2``, shape (..., 3, 3)."""
+    matrix = (even[..., None] * v)[..., :, None] * v[..., None, :]
+    diagonal = 1.0 - even * angle2
+    w = odd[..., None] * v
+    matrix[..., 0, 0] += diagonal
+    matrix[..., 1, 1] += diagonal
+    matrix[..., 2, 2] += diagonal
+    matrix[..., 0, 1] -= w[..., 2]
+    matrix[..., 0, 2] += w[..., 1]
+    matrix[..., 1, 0] += w[..., 2]
+    matrix[..., 1, 2] -= w[..., 0]
+    matrix[..., 2, 0] -= w[..., 1]
+    matrix[..., 2, 1] += w[..., 0]
+    return matrix
 
 
 def exp_so3(vector: ArrayLike) -> Array:
@@ -105,26 +134,20 @@ def exp_so3(vector: ArrayLike) -> Array:
     ndarray, shape (..., 3, 3)
 
     """
-    return exp_and_left_jacobian(vector)[0]
-
-
-def left_jacobian(vector: ArrayLike) -> Array:
-    """
-    Left Jacobian of SO(3): what a change of a rotation vector does to its rotation.
-
-    ``exp_so3(v + d) ~ exp_so3(left_jacobian(v) d) exp_so3(v)``.
-
-    Parameters
-    ----------
-    vector : array_like, shape (..., 3)
-        Radians.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-
-    """
-    return exp_and_left_jacobian(vector)[1]
+    v = np.asarray(vector, dtype=float)
+    if v.ndim > 1:
+        return exp_and_left_jacobian(v)[0]
+    x, y, z = v.tolist()                          # a single one is quicker without arrays
+    angle2 = x * x + y * y + z * z
+    if angle2 < _SMALL_ANGLE ** 2:
+        a, b = 1 - angle2 / 6, 0.5 - angle2 / 24
+    else:
+        angle = math.sqrt(angle2)
+        a, b = math.sin(angle) / angle, 2 * math.sin(angle / 2) ** 2 / angle2
+    d = 1 - b * angle2
+    return np.array([[d + b * x * x, b * x * y - a * z, b * x * z + a * y],
+                     [b * x * y + a * z, d + b * y * y, b * y * z - a * x],
+                     [b * x * z - a * y, b * y * z + a * x, d + b * z * z]])
 
 
 def log_so3(matrix: ArrayLike) -> Array:
@@ -271,7 +294,8 @@ def cumulative_rotations(steps: Array) -> Array:
     """
     Prefix products ``steps[0] @ steps[1] @ ... @ steps[k]`` for every k.
 
-    Doubling scan: log2(n) vectorised products instead of a loop over n.
+    One after the other, over all leading axes at once: what comes out for one run does not depend
+    on what else is worked out with it, to the last bit.
 
     Parameters
     ----------
@@ -284,8 +308,11 @@ def cumulative_rotations(steps: Array) -> Array:
 
     """
     total = steps.copy()
-    reach = 1
-    while reach < steps.shape[-3]:
-        total[..., reach:, :, :] = total[..., :-reach, :, :] @ total[..., reach:, :, :]
-        reach *= 2
+    for k in range(1, steps.shape[-3]):
+        np.matmul(total[..., k - 1, :, :], steps[..., k, :, :], out=total[..., k, :, :])
     return total
+
+
+def running_sum(start: Array, steps: Array) -> Array:
+    """Sums ``start + steps[0] + ... + steps[k]`` for every k, to the bit as one by one."""
+    return np.cumsum(np.concatenate([start[None], steps]), axis=0)[1:]

@@ -19,14 +19,10 @@ All 22 of them have their place in one vector; an estimator takes those columns 
 
 from dataclasses import dataclass, replace
 import math
-from typing import Any
 
 from ins_align.earth import EARTH_RATE
-from ins_align.rotation import Array, exp_so3, log_so3
+from ins_align.rotation import Array, exp_so3, Index, log_so3
 import numpy as np
-from numpy.typing import NDArray
-
-Index = NDArray[np.integer[Any]]
 
 # A heading is never known worse than uniform on the circle.
 UNIFORM_ANGLE_STD = math.pi / math.sqrt(3)

@@ -14,18 +14,19 @@
 """
 Whitening: residuals and sensitivities of the integration formulas, freed of the IMU's noise.
 
-Layout of the errors of the chain: ``epsilon = (rotation in b0, velocity, position)``; measurement
-rows: velocity first, then position; both in n0.
+The random-walk errors of the integrated IMU data are carried as what they amount to at t0: errors
+of the initial attitude, of the start velocity and, with positions, of the start position, in n0.
+Seen so they are a plain random walk, and a measurement's derivative to them is its derivative to
+those unknowns. Measurement rows: velocity first, then position; both in n0.
 """
 
 from dataclasses import dataclass
 import math
 
 from ins_align.preintegration import Intervals
-from ins_align.rotation import Array, cross, cumulative_rotations, skew
+from ins_align.rotation import Array, cross, cumulative_rotations, Index, running_sum, skew
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO, GYRO_BIAS, GYRO_SCALE,
-                                Index, LEVER_ARM, SIZE, START_POSITION, START_VELOCITY,
-                                Unknowns)
+                                LEVER_ARM, SIZE, START_POSITION, START_VELOCITY, Unknowns)
 import numpy as np
 
 # Below this heading sigma (rad) the problem is as good as linear in the heading.
@@ -33,6 +34,8 @@ HEADING_RESOLVED_STD = 0.35
 # Chi-square gate of three rows of innovation: one in 60 000 of good ones fails.
 GATE = 25.0
 VELOCITY, POSITION = slice(0, 3), slice(3, 6)
+# The unknowns that the errors of the chain look like.
+START = np.r_[ATTITUDE, START_VELOCITY, START_POSITION]
 
 
 @dataclass
@@ -73,10 +76,10 @@ class Measurements:
         """Return the epochs of `index`."""
         return Measurements(*(array[index] for array in vars(self).values()))
 
-    def put(self, index: int, other: 'Measurements') -> None:
-        """Copy the single epoch of `other` into place `index`."""
+    def put(self, index: slice, other: 'Measurements') -> None:
+        """Copy the epochs of `other` into the places `index`."""
         for name, array in vars(self).items():
-            array[index] = getattr(other, name)[0]
+            array[index] = getattr(other, name)
 
 
 @dataclass
@@ -102,40 +105,18 @@ class Chain:
         """Return one epoch of a chain over many."""
         return Chain(*(array[index] for array in vars(self).values()))
 
-    def extended(self, interval: Intervals,
-                 excess: float = 1.0) -> tuple['Chain', Array, Array]:
-        """
-        Chain K intervals.
-
-        Parameters
-        ----------
-        interval : Intervals
-            To be appended.
-        excess : float
-            Share of the noise measured in excess of the stated one that is believed.
-
-        Returns
-        -------
-        chain : Chain
-            With a leading axis of K, at the end of each interval.
-        F : ndarray, shape (K, 9, 9)
-            Transition of the chain's errors over each interval.
-        W : ndarray, shape (K, 9, 9)
-            What the interval's noise adds to their covariance.
-
-        """
-        K = interval.duration.size
-        R_end = self.R @ cumulative_rotations(interval.R)
-        R = np.concatenate([self.R[None], R_end[:-1]])
+    def extended(self, interval: Intervals) -> 'Chain':
+        """Chain K intervals; the result has a leading axis of K, at the end of each interval."""
+        turned = cumulative_rotations(np.concatenate([self.R[None], interval.R]))
+        R, R_end = turned[:-1], turned[1:]
         h = interval.duration[:, None, None]
-        u = (R @ interval.v[..., None])[..., 0]
-        w = (R @ interval.p[..., None])[..., 0]
+        u, w = _turned(R, interval.v), _turned(R, interval.p)
         skew_u, skew_w = skew(u), skew(w)
 
         def total(start: Array, steps: Array) -> tuple[Array, Array]:
             """Values before and after each interval."""
-            after = start + np.cumsum(steps, axis=0)
-            return after - steps, after
+            after = running_sum(start, steps)
+            return np.concatenate([start[None], after[:-1]]), after
 
         def gyro(bias: Array, scale: Array) -> Array:
             return R @ np.concatenate([bias, scale], axis=-1)
@@ -148,20 +129,55 @@ class Chain:
         p_end = total(self.p, w + interval.duration[:, None] * v)[1]
         p_g_end = total(self.p_g, h * v_g + gyro(interval.J_pg, interval.J_ps) - skew_w @ R_g)[1]
         p_a_end = total(self.p_a, h * v_a + R @ interval.J_pa)[1]
+        return Chain(R_end, v_end, p_end, R_g_end, v_g_end, v_a_end, p_g_end, p_a_end)
 
-        F = np.zeros((K, 9, 9))
-        F[:, range(9), range(9)] = 1.0
-        F[:, 3:6, :3] = -skew_u
-        F[:, 6:, :3] = -skew_w
-        F[:, 6:, 3:6] = h * np.eye(3)
-        turn = np.zeros((K, 9, 9))
-        turn[:, :3, :3] = turn[:, 3:6, 3:6] = turn[:, 6:, 6:] = R
-        W = turn @ (interval.Q + excess * interval.Q_excess) @ turn.transpose(0, 2, 1)
-        return Chain(R_end, v_end, p_end, R_g_end, v_g_end, v_a_end, p_g_end, p_a_end), F, W
+
+def _turned(matrix: Array, vectors: Array) -> Array:
+    """Products of 3 x 3 matrices and vectors, shape (K, 3), each on its own."""
+    return (matrix @ vectors[..., None])[..., 0]
+
+
+def chain_noise(C: Array, time: Array, chain: Chain, interval: Intervals, size: int,
+                excess: float = 1.0) -> Array:
+    """
+    Covariance that each interval's noise adds to the errors of the chain, as seen at t0.
+
+    Parameters
+    ----------
+    C : ndarray, shape (3, 3)
+        Initial attitude.
+    time : ndarray, shape (K,)
+        Seconds since t0, at the end of each interval.
+    chain : Chain
+        At the same K epochs.
+    interval : Intervals
+        The K intervals.
+    size : int
+        9 with the start position, 6 without.
+    excess : float
+        Share of the noise measured in excess of the stated one that is believed.
+
+    Returns
+    -------
+    ndarray, shape (K, size, size)
+
+    """
+    turn = (C @ chain.R) @ interval.R.transpose(0, 2, 1)       # from the interval's start to n0
+    spread = np.zeros((time.size, size, size))
+    arm = skew(_turned(C, chain.v))
+    spread[:, :3, :3] = spread[:, 3:6, 3:6] = turn
+    spread[:, 3:6, :3] = arm @ turn
+    if size == 9:
+        t = time[:, None, None]
+        spread[:, 6:, :3] = (skew(_turned(C, chain.p)) - t * arm) @ turn
+        spread[:, 6:, 3:6] = -t * turn
+        spread[:, 6:, 6:] = turn
+    Q = interval.Q[:, :size, :size] + excess * interval.Q_excess[:, :size, :size]
+    return spread @ Q @ spread.transpose(0, 2, 1)
 
 
 def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
-                  interval: Intervals) -> tuple[Array, Array]:
+                  interval: Intervals) -> Array:
     """
     Residuals of K epochs and their derivatives, at a linearisation point.
 
@@ -178,26 +194,23 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
 
     Returns
     -------
-    Y : ndarray, shape (K, 6, 23)
+    ndarray, shape (K, 6, 23)
         The residual ``s - model`` in the first column, then the derivative of the model to each
         unknown.
-    L : ndarray, shape (K, 6, 9)
-        Derivative of the model to the chain's errors.
 
     """
     K = gnss.time.size
-    C, lever = point.C, point.lever_b
+    C, lever, delay = point.C, point.lever_b, point.delay
     CR = C @ chain.R
-    spun = cross(interval.omega, lever)
-    lever_v = (CR @ spun[..., None])[..., 0]               # in n0
+    lever_v = _turned(CR, cross(interval.omega, lever))         # in n0
     lever_p = CR @ lever
-    Ca_v = chain.v @ C.T + lever_v
-    Ca_p = chain.p @ C.T + lever_p
+    Ca_v = _turned(C, chain.v) + lever_v
+    Ca_p = _turned(C, chain.p) + lever_p
     # Over the delay the acceleration is taken linear, from the specific force at the epoch and
     # its mean over the interval.
-    delay = point.delay
-    acceleration = (CR @ interval.f[..., None])[..., 0] + gnss.gravity
-    jerk = (CR @ interval.f_dot[..., None])[..., 0]
+    force = _turned(CR, interval.f)
+    acceleration = force + gnss.gravity
+    jerk = _turned(CR, interval.f_dot)
     acceleration_then = acceleration - delay * jerk
     ground_velocity = point.start_velocity + Ca_v + gnss.offset
     Y = np.zeros((K, 6, 1 + SIZE))
@@ -206,32 +219,31 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     Y[:, POSITION, 0] = (gnss.s[:, POSITION] - point.start_position
                          - gnss.time[:, None] * point.start_velocity - Ca_p
                          + delay * (ground_velocity - 0.5 * delay * acceleration))
+    # The measurement saw the chain as it was before the delay.
     H = Y[:, :, 1:]
+    seen_v = Ca_v - delay * force
+    seen_p = Ca_p - delay * (Ca_v - 0.5 * delay * force)
     lever_v_skew, lever_p_skew = skew(lever_v), skew(lever_p)
     eye = np.eye(3)
-    H[:, VELOCITY, ATTITUDE] = -skew(Ca_v)
-    H[:, POSITION, ATTITUDE] = -skew(Ca_p)
-    C_R_g = C @ chain.R_g
+    H[:, VELOCITY, ATTITUDE] = -skew(seen_v)
+    H[:, POSITION, ATTITUDE] = -skew(seen_p)
+    C_R_g, C_v_g, C_v_a = C @ chain.R_g, C @ chain.v_g, C @ chain.v_a
     CR_lever = CR @ skew(lever)
-    H[:, VELOCITY, GYRO] = C @ chain.v_g - lever_v_skew @ C_R_g
+    H[:, VELOCITY, GYRO] = C_v_g - (lever_v_skew - delay * skew(force)) @ C_R_g
     H[:, VELOCITY, GYRO_BIAS] += CR_lever
     H[:, VELOCITY, GYRO_SCALE] += CR_lever * interval.omega[:, None, :]
-    H[:, POSITION, GYRO] = C @ chain.p_g - lever_p_skew @ C_R_g
-    H[:, VELOCITY, ACCEL_BIAS] = C @ chain.v_a
-    H[:, POSITION, ACCEL_BIAS] = C @ chain.p_a
+    H[:, POSITION, GYRO] = C @ chain.p_g - delay * C_v_g - lever_p_skew @ C_R_g
+    H[:, VELOCITY, ACCEL_BIAS] = C_v_a + delay * CR
+    H[:, POSITION, ACCEL_BIAS] = C @ chain.p_a - delay * C_v_a
     H[:, VELOCITY, START_VELOCITY] = eye
     H[:, POSITION, START_VELOCITY] = (gnss.time - delay)[:, None, None] * eye
     H[:, POSITION, START_POSITION] = eye
-    H[:, VELOCITY, LEVER_ARM] = CR @ skew(interval.omega)
-    H[:, POSITION, LEVER_ARM] = CR
+    swing = CR @ skew(interval.omega)
+    H[:, VELOCITY, LEVER_ARM] = swing
+    H[:, POSITION, LEVER_ARM] = CR - delay * swing
     H[:, VELOCITY, DELAY.start] = -acceleration_then
     H[:, POSITION, DELAY.start] = -(ground_velocity - delay * acceleration)
-    L = np.zeros((K, 6, 9))
-    L[:, VELOCITY, :3] = -lever_v_skew @ C
-    L[:, POSITION, :3] = -lever_p_skew @ C
-    L[:, VELOCITY, 3:6] = C
-    L[:, POSITION, 6:] = C
-    return Y, L
+    return Y
 
 
 class Whitener:
@@ -249,24 +261,18 @@ class Whitener:
 
     def __init__(self, columns: Index, size: int) -> None:
         """Start at t0, where the chain has no error."""
-        self._columns = np.concatenate([[0], 1 + columns])
-        self._size = size
+        self.columns = np.concatenate([[0], 1 + columns])
+        self.start_columns = np.searchsorted(columns, START[:size]) + 1
         self.P = np.zeros((size, size))
-        self.X = np.zeros((size, self._columns.size))
-        self.normal = np.zeros((self._columns.size, self._columns.size))
+        self.X = np.zeros((size, self.columns.size))
+        self.normal = np.zeros((self.columns.size, self.columns.size))
         self.rows = 0
         self.rejected = [0, 0]
         self.spurious = 0.0
         self.log_det = 0.0
 
-    def predict(self, F: Array, W: Array) -> None:
-        """Go over an interval with transition `F` and noise `W`, shape (9, 9)."""
-        F = F[:self._size, :self._size]
-        self.X = F @ self.X
-        self.P = F @ self.P @ F.T + W[:self._size, :self._size]
-
-    def update(self, kind: int, Y: Array, L: Array, covariance: Array,
-               gate: 'tuple[Array, Array] | None', gate_scale: float) -> float:
+    def update(self, kind: int, Y: Array, covariance: Array,
+               gate: 'tuple[Array, Array] | None', gate_scale: float) -> tuple[float, Array]:
         """
         Take the three rows of a velocity (kind 0) or position (kind 1).
 
@@ -274,8 +280,8 @@ class Whitener:
         ----------
         kind : int
             0 or 1.
-        Y, L : ndarray, shapes (3, 23), (3, 9)
-            From `sensitivities`.
+        Y : ndarray, shape (3, 1 + n)
+            From `sensitivities`: the residual and the columns of the n unknowns.
         covariance : ndarray, shape (3, 3)
             Of the measurement.
         gate : (dx, P) or None
@@ -285,37 +291,45 @@ class Whitener:
 
         Returns
         -------
-        float
+        nis : float
             Normalised innovation squared, nan where it was not tested.
+        normalised : ndarray, shape (3,)
+            The innovation over its sigma, row by row.
 
         """
-        L = L[:, :self._size]
-        innovation = Y[:, self._columns] - L @ self.X
-        PL = self.P @ L.T
-        LPL = L @ PL
-        nis = math.nan
+        D = Y[:, self.start_columns]
+        innovation = Y - D @ self.X
+        PD = self.P @ D.T
+        own = D @ PD
+        S = own + covariance
+        nis, normalised = math.nan, _UNTESTED
         if gate is not None:
             residual = innovation[:, 0] - innovation[:, 1:] @ gate[0]
             spread = innovation[:, 1:] @ gate[1] @ innovation[:, 1:].T
             if gate[1][2, 2] > HEADING_RESOLVED_STD ** 2:
                 # A large error of heading shows along the motion too, not only across.
                 spread[:2, :2] = (spread[0, 0] + spread[1, 1]) * np.eye(2)
-            nis = float(residual @ _inverse3(spread + LPL + covariance)[0] @ residual)
+            spread += S
+            nis = float(residual @ _inverse3(spread)[0] @ residual)
+            normalised = residual / np.sqrt(spread.diagonal())
             if not nis < GATE * gate_scale:
                 self.rejected[kind] += 1
-                return nis
-        inverse, determinant = _inverse3(LPL + covariance)
+                return nis, normalised
+        inverse, determinant = _inverse3(S)
         self.normal += innovation.T @ (inverse @ innovation)
-        gain = PL @ inverse
-        self.X = self.X + gain @ innovation
-        P = self.P - gain @ PL.T
+        gain = PD @ inverse
+        self.X += gain @ innovation
+        P = self.P - gain @ PD.T
         self.P = 0.5 * (P + P.T)                  # or rounding grows in the antisymmetric part
         # The heading's column is made of integrated IMU data, whose own errors look like motion:
         # this is the information that they would feign, in expectation (errors in variables).
-        self.spurious += float(inverse[0] @ LPL[0] + inverse[1] @ LPL[1])
+        self.spurious += float(inverse[0] @ own[0] + inverse[1] @ own[1])
         self.rows += 3
         self.log_det += math.log(determinant)
-        return nis
+        return nis, normalised
+
+
+_UNTESTED = np.full(3, math.nan)
 
 
 def _inverse3(matrix: Array) -> tuple[Array, float]:

@@ -15,13 +15,15 @@
 
 from ins_align.config import Config
 from ins_align.declaration import Declaration, State
+from ins_align.estimator import Innovation
 from ins_align.methods import Fit
 import numpy as np
 import pytest
 
 
 def fit(**changes):
-    values = {'chi2': 300.0, 'dof': 300, 'nis': 1.0, 'converged': True, 'rejected_velocity': 0,
+    changes['innovation'] = Innovation(changes.pop('nis', 1.0), np.zeros(3))
+    values = {'chi2': 300.0, 'dof': 300, 'converged': True, 'rejected_velocity': 0,
               'rejected_position': 0, 'offered': 102}
     return Fit(**{**values, **changes})
 

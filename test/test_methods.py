@@ -14,6 +14,7 @@
 """The alignment methods on noise-free flights, and what they say of themselves."""
 
 from alignment import aligned, error_deg, error_of, normalised_error, simulated
+from ins_align.estimator import NOTHING_NEW
 from ins_align.methods import Fit
 import numpy as np
 import pytest
@@ -97,10 +98,10 @@ def test_what_the_note_does_not_estimate_it_says_to_be_as_configured():
 
 
 def test_a_posteriori_factor_only_widens():
-    good = Fit(chi2=50.0, dof=100, nis=1.0, converged=True, rejected_velocity=0,
+    good = Fit(chi2=50.0, dof=100, innovation=NOTHING_NEW, converged=True, rejected_velocity=0,
                rejected_position=0, offered=40)
-    bad = Fit(chi2=400.0, dof=100, nis=1.0, converged=True, rejected_velocity=0,
+    bad = Fit(chi2=400.0, dof=100, innovation=NOTHING_NEW, converged=True, rejected_velocity=0,
               rejected_position=0, offered=40)
-    empty = Fit(chi2=0.0, dof=0, nis=1.0, converged=True, rejected_velocity=0,
+    empty = Fit(chi2=0.0, dof=0, innovation=NOTHING_NEW, converged=True, rejected_velocity=0,
                 rejected_position=0, offered=2)
     assert good.factor == 1.0 and bad.factor == 2.0 and empty.factor == np.inf

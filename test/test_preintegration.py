@@ -260,6 +260,11 @@ def test_noise_may_differ_from_step_to_step():
     assert np.all(np.diag(halved)[3:5] > 3 * np.diag(uniform)[3:5])
 
 
+def whole(stamps):
+    """Return the one window that holds every sample."""
+    return np.array([0]), np.array([stamps.size])
+
+
 @pytest.mark.parametrize('jitter', (0.0, 0.4))
 @pytest.mark.parametrize('rate', (100.0, 400.0))
 def test_white_noise_is_measured_through_motion(rate, jitter):
@@ -271,17 +276,30 @@ def test_white_noise_is_measured_through_motion(rate, jitter):
         omega_of(stamps) + density[0] * np.sqrt(rate) * random.standard_normal((count, 3)),
         force_of(stamps) + density[1] * np.sqrt(rate) * random.standard_normal((count, 3))])
     # 3 * 6000 correlated differences: a percent or two.
-    assert np.allclose(white_noise(stamps, sample), density, rtol=0.05)
+    assert np.allclose(white_noise(stamps, sample, *whole(stamps))[0], density, rtol=0.05)
 
 
 def test_white_noise_of_motion_alone_is_nearly_none():
     stamps = np.arange(1000) / RATE
-    assert np.all(white_noise(stamps, np.hstack([omega_of(stamps), force_of(stamps)])) < 1e-6)
+    assert np.all(white_noise(stamps, np.hstack([omega_of(stamps), force_of(stamps)]),
+                              *whole(stamps)) < 1e-6)
 
 
 def test_white_noise_of_a_handful_of_samples_is_not_told():
     stamps = np.arange(7) / RATE
-    assert np.array_equal(white_noise(stamps, np.ones((7, 6))), [0.0, 0.0])
+    assert np.array_equal(white_noise(stamps, np.ones((7, 6)), *whole(stamps)), [[0.0, 0.0]])
+
+
+def test_white_noise_of_a_window_is_that_of_its_samples_alone():
+    random = np.random.default_rng(6)
+    stamps, sample = np.arange(400) / RATE, random.standard_normal((400, 6))
+    sample[:100] *= 1e6                            # what is before a window leaves no rounding
+    first, last = np.array([100, 250, 120, 395]), np.array([200, 400, 380, 400])
+    found = white_noise(stamps, sample, first, last)
+    for k, (i, j) in enumerate(zip(first, last)):
+        alone = white_noise(stamps[i:j], sample[i:j], *whole(stamps[i:j]))[0]
+        assert np.allclose(found[k], alone, rtol=1e-12)
+    assert np.all(found[:3] > 0) and np.all(found[3] == 0)
 
 
 def test_noise_in_excess_is_kept_apart():
@@ -310,6 +328,6 @@ def test_mirrored_intervals_are_those_of_mirrored_sensors():
 def test_storage_gives_back_what_was_put():
     interval = integrated([0.0, 0.2, 0.5])
     store = Intervals.empty(3)
-    store.put(2, interval, 1)
+    store.put(slice(2, 3), interval.take(slice(1, 2)))
     for name, array in vars(store.take(slice(2, 3))).items():
         assert np.array_equal(array[0], getattr(interval, name)[1]), name

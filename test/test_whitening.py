@@ -16,9 +16,10 @@
 from dataclasses import replace
 
 from ins_align.preintegration import Noise, preintegrate, Steps
-from ins_align.rotation import exp_so3, log_so3
-from ins_align.unknowns import DELAY, SIZE, Unknowns
-from ins_align.whitening import Chain, GATE, Measurements, sensitivities, Whitener
+from ins_align.rotation import exp_so3
+from ins_align.unknowns import SIZE, Unknowns
+from ins_align.whitening import (Chain, chain_noise, GATE, Measurements, sensitivities, START,
+                                 Whitener)
 import numpy as np
 import pytest
 
@@ -41,7 +42,7 @@ def some_intervals(count=5, seed=0):
     shape = (count, n + 1, 3)
     steps = Steps(np.full((count, n), 0.05), r.standard_normal(shape),
                   r.standard_normal(shape) + [0.0, 0.0, 9.8], np.zeros(shape), np.zeros(shape))
-    return preintegrate(steps, ZERO, ZERO, Noise(1e-3, 1e-2))
+    return preintegrate(steps, ZERO, ZERO, Noise(1e-3, 1e-2), gyro_scale=ZERO)
 
 
 def some_measurements(count=5, seed=0):
@@ -51,114 +52,105 @@ def some_measurements(count=5, seed=0):
                         np.tile([0.0, 0.0, -9.8], (count, 1)), r.standard_normal((count, 3)))
 
 
-def residuals(x, intervals, gnss, chain_error=np.zeros(9)):
-    """Residuals at x from scratch: intervals corrected, chained, spoilt, compared."""
+def residuals(x, intervals, gnss):
+    """Residuals at x and their derivatives, from scratch: intervals corrected, chained."""
     corrected = intervals.corrected(x.gyro_bias, x.accel_bias, x.gyro_scale)
-    chain, _, _ = Chain.start().extended(corrected)
-    chain = replace(chain, R=exp_so3(chain_error[:3]) @ chain.R, v=chain.v + chain_error[3:6],
-                    p=chain.p + chain_error[6:])
-    return sensitivities(x, chain, gnss, corrected)
+    return sensitivities(x, Chain.start().extended(corrected), gnss, corrected)
 
 
+@pytest.mark.parametrize('delay', (0.0, 0.03))
 @pytest.mark.parametrize('column', range(SIZE))
-def test_sensitivities_are_the_derivatives_of_the_residual(column):
+def test_sensitivities_are_the_derivatives_of_the_residual(column, delay):
     x, intervals, gnss = some_unknowns(), some_intervals(), some_measurements()
-    if column != DELAY.start:
-        x = replace(x, delay=0.0)                  # how a delay hangs together with the rest is
-    step = np.zeros(SIZE)                          # of second order
+    x = replace(x, delay=delay)
+    step = np.zeros(SIZE)
     step[column] = 1e-6
-    plus, minus = (residuals(x.moved(sign * step), intervals, gnss)[0][:, :, 0]
+    plus, minus = (residuals(x.moved(sign * step), intervals, gnss)[:, :, 0]
                    for sign in (1, -1))
     numeric = -(plus - minus) / 2e-6
-    H = residuals(x, intervals, gnss)[0][:, :, 1 + column]
-    # The intervals' derivatives are those at the bias they were integrated with.
+    H = residuals(x, intervals, gnss)[:, :, 1 + column]
+    # The intervals' derivatives are those at the bias they were integrated with; how the change
+    # of the force within an interval hangs together with the rest is of second order.
     assert np.allclose(H, numeric, atol=0.02 * np.max(np.abs(numeric)) + 1e-6)
 
 
 @pytest.mark.parametrize('row', range(9))
-def test_sensitivity_to_the_errors_of_the_chain(row):
+def test_noise_of_an_interval_looks_like_an_error_of_the_start(row):
+    """An error at the end of interval 1, seen at t0, acts on the later epochs as one of the start."""
     x, intervals, gnss = some_unknowns(), some_intervals(), some_measurements()
     x = replace(x, delay=0.0)
+    corrected = intervals.corrected(x.gyro_bias, x.accel_bias, x.gyro_scale)
+    before = Chain.start().extended(corrected.take(slice(0, 2)))
+    chain, later = before.at(-1), slice(2, 5)
     error = np.zeros(9)
     error[row] = 1e-6
-    plus, minus = (residuals(x, intervals, gnss, sign * error)[0][:, :, 0] for sign in (1, -1))
+
+    def spoilt(e):
+        start = replace(chain, R=chain.R @ exp_so3(e[:3]), v=chain.v + before_R @ e[3:6],
+                        p=chain.p + before_R @ e[6:])
+        return sensitivities(x, start.extended(corrected.take(later)), gnss.take(later),
+                             corrected.take(later))[:, :, 0]
+
+    # Noise of an interval is told in the axes at its start, the rotation too.
+    before_R = before.at(0).R
+    turn = corrected.R[1]
+    plus, minus = (spoilt(sign * np.concatenate([turn.T @ error[:3], error[3:]]))
+                   for sign in (1, -1))
+    Q = np.zeros((5, 9, 9))
+    Q[1, row, row] = 1.0
+    noise = chain_noise(x.C, gnss.time, Chain.start().extended(corrected),
+                        replace(corrected, Q=Q), 9)[1]
+    values, vectors = np.linalg.eigh(noise)
+    as_start = vectors[:, -1] * np.sqrt(values[-1])
+    assert np.allclose(noise, np.outer(as_start, as_start), atol=1e-9)     # of rank one
+    D = residuals(x, intervals, gnss)[later][:, :, 1 + START]
     numeric = -(plus - minus) / 2e-6
-    L = residuals(x, intervals, gnss)[1]
-    assert np.allclose(L[:, :, row], numeric, atol=1e-6)
+    sign = np.sign(np.sum(numeric * (D @ as_start)))
+    assert np.allclose(D @ as_start * sign, numeric, atol=2e-6)
 
 
 def test_chain_over_all_is_the_chain_one_by_one():
     intervals = some_intervals()
-    whole, F, W = Chain.start().extended(intervals)
+    whole = Chain.start().extended(intervals)
     chain = Chain.start()
     for k in range(5):
-        steps, F_k, W_k = chain.extended(intervals.take(slice(k, k + 1)))
-        chain = steps.at(-1)
+        chain = chain.extended(intervals.take(slice(k, k + 1))).at(-1)
         for name, array in vars(whole).items():
             assert np.allclose(array[k], getattr(chain, name), atol=1e-12), name
-        assert np.allclose(F[k], F_k[0]) and np.allclose(W[k], W_k[0])
-
-
-def test_transition_carries_errors_of_the_chain():
-    intervals = some_intervals(1)
-    start = Chain.start()
-    _, F, _ = start.extended(intervals)
-    for column in range(9):
-        error = np.zeros(9)
-        error[column] = 1e-6
-        ends = []
-        for e in (error, -error):
-            spoilt = replace(start, R=exp_so3(e[:3]) @ start.R, v=start.v + e[3:6],
-                             p=start.p + e[6:])
-            ends.append(spoilt.extended(intervals)[0].at(0))
-        plus, minus = ends
-        numeric = np.concatenate([log_so3(plus.R @ minus.R.T), plus.v - minus.v,
-                                  plus.p - minus.p]) / 2e-6
-        assert np.allclose(F[0][:, column], numeric, atol=1e-7)
 
 
 @pytest.mark.parametrize('size, kinds', [(6, (0,)), (9, (1,)), (9, (0, 1))])
 def test_whitener_is_dense_generalised_least_squares(size, kinds):
     r = np.random.default_rng(5)
-    epochs, columns = 7, np.arange(0, SIZE, 2)
+    epochs, columns = 7, np.union1d(np.arange(0, SIZE, 2), START[:size])
     whitener = Whitener(columns, size)
-    covariance = np.zeros((size, size))
-    rows, maps, noises = [], [], []
-    transitions = [np.eye(9)]                      # from the noise of each interval to now
-    sources = []
-    for _ in range(epochs):
-        F = np.eye(9) + 0.3 * np.tril(r.standard_normal((9, 9)), -3)
-        root = r.standard_normal((9, 9))
-        W = root @ root.T
-        whitener.predict(F, W)
-        covariance = F[:size, :size] @ covariance @ F[:size, :size].T + W[:size, :size]
-        sources = [(F @ T, Q) for T, Q in sources] + [(np.eye(9), W)]
+    rows, maps, noises, times, steps = [], [], [], [], []
+    for epoch in range(epochs):
+        root = r.standard_normal((size, size))
+        steps.append(root @ root.T)
+        whitener.P += steps[-1]
         for kind in kinds:
-            Y, L = r.standard_normal((3, 1 + SIZE)), r.standard_normal((3, 9))
-            L[:, size:] = 0.0
+            Y = r.standard_normal((3, 1 + columns.size))
             root = r.standard_normal((3, 3))
             R = root @ root.T + 0.1 * np.eye(3)
-            whitener.update(kind, Y, L, R, gate=None, gate_scale=1.0)
+            whitener.update(kind, Y, R, gate=None, gate_scale=1.0)
             rows.append(Y)
-            maps.append([L @ T for T, _ in sources])
+            maps.append(Y[:, 1 + np.searchsorted(columns, START[:size])])
             noises.append(R)
-    del transitions
-    Q = [W for _, W in sources]
+            times.append(epoch)
+    walk = np.cumsum(steps, axis=0)
     n = len(rows)
     V = np.zeros((3 * n, 3 * n))
     for i in range(n):
         for j in range(n):
-            block = sum((a @ W @ b.T for a, b, W in zip(maps[i], maps[j], Q)),
-                        start=np.zeros((3, 3)))
+            block = maps[i] @ walk[min(times[i], times[j])] @ maps[j].T
             V[3 * i:3 * i + 3, 3 * j:3 * j + 3] = block + (noises[i] if i == j else 0.0)
-    D = np.vstack(rows)[:, np.concatenate([[0], 1 + columns])]
+    D = np.vstack(rows)
     assert np.allclose(whitener.normal, D.T @ np.linalg.solve(V, D), rtol=1e-8)
     # What the filter knows of the errors at the end is the conditional mean and covariance.
-    cross = np.hstack([sum((T @ W @ m.T for (T, W), m in zip(sources, maps[i])),
-                           start=np.zeros((9, 3))) for i in range(n)])[:size]
-    P = sum((T @ W @ T.T for T, W in sources), start=np.zeros((9, 9)))[:size, :size]
+    cross = np.hstack([walk[times[i]] @ maps[i].T for i in range(n)])
     assert np.allclose(whitener.X, cross @ np.linalg.solve(V, D), rtol=1e-7, atol=1e-9)
-    assert np.allclose(whitener.P, P - cross @ np.linalg.solve(V, cross.T), atol=1e-8)
+    assert np.allclose(whitener.P, walk[-1] - cross @ np.linalg.solve(V, cross.T), atol=1e-8)
     assert whitener.rows == 3 * n
 
 
@@ -166,18 +158,18 @@ def test_an_outlier_is_counted_and_leaves_no_trace():
     r = np.random.default_rng(2)
     columns = np.arange(SIZE)
     whitener = Whitener(columns, 6)
-    whitener.predict(np.eye(9), 0.01 * np.eye(9))
-    Y, L = r.standard_normal((3, 1 + SIZE)), r.standard_normal((3, 9))
+    whitener.P += 0.01 * np.eye(6)
+    Y = r.standard_normal((3, 1 + SIZE))
     gate = np.zeros(SIZE), 1e-6 * np.eye(SIZE)
     Y[:, 0] = [0.1, -0.1, 0.1]
-    good = whitener.update(0, Y, L, np.eye(3), gate=gate, gate_scale=1.0)
+    good, _ = whitener.update(0, Y, np.eye(3), gate=gate, gate_scale=1.0)
     before = whitener.normal.copy(), whitener.P.copy(), whitener.X.copy(), whitener.rows
     Y[:, 0] = 30.0
-    bad = whitener.update(0, Y, L, np.eye(3), gate=gate, gate_scale=1.0)
-    assert good < GATE < bad
+    bad, normalised = whitener.update(0, Y, np.eye(3), gate=gate, gate_scale=1.0)
+    assert good < GATE < bad and np.allclose(np.sum(normalised ** 2), bad, rtol=0.3)
     assert whitener.rejected == [1, 0] and whitener.rows == before[3]
     assert all(np.array_equal(a, b) for a, b in zip(
         before, (whitener.normal, whitener.P, whitener.X)))
     Y[:, 0] = np.nan
-    whitener.update(0, Y, L, np.eye(3), gate=gate, gate_scale=1.0)
+    whitener.update(0, Y, np.eye(3), gate=gate, gate_scale=1.0)
     assert whitener.rejected == [2, 0] and np.all(np.isfinite(whitener.normal))

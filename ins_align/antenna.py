@@ -1,0 +1,133 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Where the GNSS antenna is: GNSS messages put together to the epochs that a method takes."""
+
+from collections import Counter
+import math
+
+from ins_align.buffers import GnssEpoch
+from ins_align.config import Config
+from ins_align.earth import SEMI_MAJOR_AXIS
+from ins_align.messages import Fix, Velocity
+from ins_align.methods import Epoch
+from ins_align.plausibility import VelocityCheck
+from ins_align.rotation import Array
+import numpy as np
+
+# A fix this far (m) from where the last one and the velocity lead is not believed at first.
+MAX_FIX_JUMP = 300.0
+FIX_JUMPS_BELIEVED = 5
+# A place this old (s) is not carried on with the velocity.
+MAX_CARRIED = 60.0
+_UNKNOWN_VERTICAL_STD = 1e3
+
+Place = tuple[float, float, float]            # latitude, longitude (radians), altitude (m)
+
+
+class Antenna:
+    """
+    Follows the antenna from epoch to epoch, with or without a fix in each.
+
+    Parameters
+    ----------
+    config : Config
+    counts : Counter
+        Where fixes that jump are counted: ``fix_jump``.
+
+    """
+
+    def __init__(self, config: Config, counts: Counter[str]) -> None:
+        """Start with no place known."""
+        self._config = config
+        self._counts = counts
+        self._place: Place | None = None
+        self._place_ns = 0
+        self._v_n: Array | None = None
+        self._jumps = 0
+        self._check = VelocityCheck()
+        self._velocity_covariance = np.diag([config.velocity_std ** 2, config.velocity_std ** 2,
+                                             config.velocity_std_vertical ** 2])
+        self._position_covariance = np.diag([config.position_std ** 2, config.position_std ** 2,
+                                             config.position_std_vertical ** 2])
+
+    @property
+    def jumped(self) -> bool:
+        """Whether fix after fix says that the antenna is somewhere else altogether."""
+        return self._jumps >= FIX_JUMPS_BELIEVED
+
+    @property
+    def fault(self) -> str:
+        """What is wrong with the velocities, in words; empty when nothing is known to be."""
+        return self._check.fault
+
+    def epoch(self, message: GnssEpoch) -> Epoch | None:
+        """Take what the receiver said at an epoch; None while the place is not known."""
+        config, velocity, fix = self._config, message.velocity, message.fix
+        v_n = None
+        if velocity is not None and config.use_velocity is not False:
+            v_n = np.asarray(velocity.velocity, float)
+        believed = self._locate(message.stamp_ns, fix, self._v_n if v_n is None else v_n)
+        if self._place is None or self.jumped:
+            return None
+        position_covariance = self._position_covariance
+        if fix is not None and believed and fix.covariance is not None:
+            position_covariance = fix.covariance
+        if v_n is not None:
+            self._v_n = v_n
+            if believed:
+                variances = position_covariance.diagonal().tolist()
+                self._check.add(message.stamp_ns * 1e-9, *self._place, v_n,
+                                math.sqrt(max(variances[:2])))
+        return Epoch(message.stamp_ns, *self._place, v_n, self._covariance_of(velocity),
+                     believed, position_covariance)
+
+    def _locate(self, stamp_ns: int, fix: Fix | None, v_n: Array | None) -> bool:
+        """Bring the place to an epoch; return whether there is a fix that is believed."""
+        dt = (stamp_ns - self._place_ns) * 1e-9
+        predicted = self._place
+        if predicted is not None and v_n is not None and dt < MAX_CARRIED:
+            latitude, longitude, altitude = predicted
+            east, north, up = v_n.tolist()
+            predicted = (latitude + north * dt / SEMI_MAJOR_AXIS,
+                         longitude + east * dt / (SEMI_MAJOR_AXIS
+                                                  * max(math.cos(latitude), 1e-3)),
+                         altitude + up * dt)
+        if fix is not None:
+            place = (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg),
+                     fix.altitude_m)
+            if predicted is None or _distance(place, predicted) <= MAX_FIX_JUMP * (1 + dt):
+                self._jumps = 0
+                self._place, self._place_ns = place, stamp_ns
+                return True
+            self._counts['fix_jump'] += 1
+            self._jumps += 1
+        if predicted is not None:
+            self._place, self._place_ns = predicted, stamp_ns
+        return False
+
+    def _covariance_of(self, velocity: Velocity | None) -> Array:
+        covariance = self._velocity_covariance
+        if velocity is not None and velocity.covariance is not None:
+            covariance = velocity.covariance
+        if self._config.velocity_vertical == 'absent':
+            covariance = covariance.copy()
+            covariance[2, :2] = covariance[:2, 2] = 0.0
+            covariance[2, 2] = _UNKNOWN_VERTICAL_STD ** 2
+        return covariance
+
+
+def _distance(a: Place, b: Place) -> float:
+    """Rough distance of two places, metres."""
+    east = math.remainder(a[1] - b[1], 2 * math.pi) * math.cos(a[0])
+    return math.hypot(SEMI_MAJOR_AXIS * (a[0] - b[0]), SEMI_MAJOR_AXIS * east, a[2] - b[2])

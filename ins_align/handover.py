@@ -1,0 +1,119 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Moving t0: what an estimator knows at its last epoch becomes the prior of the next one."""
+
+from dataclasses import replace
+
+from ins_align.earth import EARTH_RATE
+from ins_align.estimator import MapEstimator
+from ins_align.rotation import Array, exp_so3, skew
+from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, BODY_FIXED, GYRO, GYRO_BIAS, Prior, prior_of,
+                                SIZE, START_POSITION, START_VELOCITY, Unknowns)
+from ins_align.whitening import HEADING_RESOLVED_STD, START
+import numpy as np
+
+
+def prior_from_now(estimator: MapEstimator, C_n0n: Array, shift_v: Array, shift_p: Array,
+                   scale: float, wander: Array) -> Prior:
+    """
+    Return what is known now as the prior of an estimator whose t0 is the last epoch.
+
+    While the heading is not resolved, the linear picture of how it hangs together with the
+    rest is not good for long: then tilt, biases, lever arm and delay are kept, the heading
+    and the start are not.
+
+    Parameters
+    ----------
+    estimator : MapEstimator
+        With a solution.
+    C_n0n : ndarray, shape (3, 3)
+        How far the local level has turned since t0.
+    shift_v, shift_p : ndarray, shape (3,)
+        s_v and s_p of an antenna track that starts at the last epoch, minus those of this one,
+        in n0 axes.
+    scale : float
+        Factor on the covariance, for data that fit worse than stated.
+    wander : ndarray, shape (22,)
+        Variance by which the unknowns may have changed since t0.
+
+    Raises
+    ------
+    RuntimeError
+        Before the first solution.
+
+    """
+    columns = estimator.columns
+    heading_free = not estimator.heading_std < HEADING_RESOLVED_STD
+    now, joint = _now(estimator, heading_free)
+    T = np.eye(joint.shape[0])
+    for block in range(3):
+        T[3 * block:3 * block + 3, 3 * block:3 * block + 3] = C_n0n.T
+    joint = scale * T @ joint @ T.T
+    joint[9:, 9:] += np.diag(wander[columns])
+    if heading_free:
+        # The gyros cannot tell their biases from the Earth's rate seen under a heading that
+        # may be anything; the linear picture knows the tangent of that circle only.
+        gyro_bias = slice(9 + GYRO_BIAS.start, 9 + GYRO_BIAS.stop)
+        least = np.linalg.eigvalsh(joint[gyro_bias, gyro_bias])[0]
+        joint[gyro_bias, gyro_bias] += max(EARTH_RATE ** 2 - least, 0.0) * np.eye(3)
+    # Places of what is kept in the joint covariance, and in the vector of unknowns.
+    kept = np.flatnonzero(np.isin(columns, BODY_FIXED))
+    start = np.arange(2 if heading_free else estimator.size)
+    places = np.concatenate([start, 9 + kept])
+    unknowns = np.concatenate([START[start], columns[kept]])
+    mean = replace(now, C=C_n0n.T @ now.C, start_velocity=C_n0n.T @ (now.start_velocity + shift_v),
+                   start_position=C_n0n.T @ (now.start_position + shift_p))
+    return prior_of(mean, joint[np.ix_(places, places)], unknowns, heading_free)
+
+
+def _now(estimator: MapEstimator, heading_free: bool) -> tuple[Unknowns, Array]:
+    """
+    Return the unknowns as if the last epoch were t0, in the axes and origin of the present n0.
+
+    Their attitude, start velocity and start position are those of the IMU now. The second result
+    is the joint covariance of (attitude, velocity, position, unknowns), shape (9 + n, 9 + n). It
+    belongs to the heading of the linearisation point; with `heading_free` the attitude is told
+    with that heading too, since any is as good.
+    """
+    s = estimator.solution
+    if s is None:
+        raise RuntimeError('no solution yet')
+    x, step, time, chain = s.estimate, s.step(), estimator.time, s.chain
+    C = exp_so3([0.0, 0.0, -step[2]]) @ x.C if heading_free else x.C
+    error = np.zeros(9)
+    error[:estimator.size] = s.chain_errors()
+    # The stored chain holds the biases of the point: their step is still to be applied.
+    gyro, accel = step[GYRO], step[ACCEL_BIAS]
+    v = C @ (chain.v + chain.v_g @ gyro + chain.v_a @ accel)
+    p = C @ (chain.p + chain.p_g @ gyro + chain.p_a @ accel)
+    # Derivatives of what is now to the unknowns; to attitude and start they are those to the
+    # errors of the chain too.
+    J = np.zeros((9, SIZE))
+    J[:3, ATTITUDE] = J[3:6, START_VELOCITY] = J[6:, START_POSITION] = np.eye(3)
+    J[3:6, ATTITUDE], J[6:, ATTITUDE] = -skew(v), -skew(p)
+    J[6:, START_VELOCITY] = time * np.eye(3)
+    E = J[:, START]
+    J[:3, GYRO], J[3:6, GYRO], J[6:, GYRO] = C @ chain.R_g, C @ chain.v_g, C @ chain.p_g
+    J[3:6, ACCEL_BIAS], J[6:, ACCEL_BIAS] = C @ chain.v_a, C @ chain.p_a
+    moved = E @ error
+    now = replace(
+        x, C=exp_so3(error[:3]) @ C @ exp_so3(chain.R_g @ gyro) @ chain.R,
+        start_velocity=x.start_velocity + v + moved[3:6],
+        start_position=x.start_position + time * x.start_velocity + p + moved[6:])
+    E = E[:, :estimator.size]
+    total = np.vstack([J[:, estimator.columns] - E @ s.whitener.X[:, 1:],
+                       np.eye(estimator.columns.size)])
+    covariance = total @ s.P @ total.T
+    covariance[:9, :9] += E @ s.whitener.P @ E.T
+    return now, covariance
