@@ -36,7 +36,7 @@ from ins_align.plausibility import ForceCheck
 from ins_align.prediction import Prediction
 from ins_align.preintegration import Noise, split_at_epochs, white_noise
 from ins_align.results import Attitude, Epoch, Status
-from ins_align.rotation import Array, Index, orthonormalized
+from ins_align.rotation import Array, Index
 from ins_align.unknowns import Prior
 import numpy as np
 

@@ -47,7 +47,7 @@ class SignCheck:
 
     def doubt(self, estimator: MapEstimator) -> str:
         """Return why the data do not show yet that the signs are right, or nothing."""
-        if self._doubt and estimator.count >= self._next:
+        if self._doubt and estimator.count >= max(self._next, estimator.FIRST_FIT):
             self._next = estimator.count * (1 + GROWTH[estimator.count > SOON])
             chi2 = sign_evidence(estimator)
             right = chi2.pop(RIGHT)

@@ -20,7 +20,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ins_align.aligner import Aligner, Epoch
+from ins_align.aligner import Aligner
 from ins_align.bag_files import BagError
 from ins_align.bags import Bag
 from ins_align.config import Config
@@ -30,6 +30,7 @@ from ins_align.earth import ecef_from_lla, matrix_en
 from ins_align.experiments.common import Error, error_of
 from ins_align.messages import fix_from_msg, MessageError, velocity_from_msg
 from ins_align.replay import Reference
+from ins_align.results import Epoch
 from ins_align.rotation import Array
 import numpy as np
 
@@ -159,7 +160,6 @@ def run_window(path: Path, start_s: float, duration: float, **told: Any) -> Wind
     first, last = (int(np.searchsorted(stamps, recording.start_ns + round(t * 1e9)))
                    for t in (start_s, start_s + duration))
     chosen = np.flatnonzero((recording.imu_before > first) & (recording.imu_before <= last))
-    epochs: list[Epoch] = []
     place = first
     for m in chosen:
         end = int(recording.imu_before[m])
@@ -170,11 +170,8 @@ def run_window(path: Path, start_s: float, duration: float, **told: Any) -> Wind
             aligner.add_velocity(message)
         else:
             aligner.add_fix(message)
-        epochs.extend(aligner.update())
     _add_imu(aligner, recording.imu, place, last)
-    epochs.extend(aligner.update())
-    epochs.extend(aligner.flush())
-    return _judged(recording, start_s, duration, epochs,
+    return _judged(recording, start_s, duration, aligner.flush(),
                    [recording.messages[m] for m in chosen])
 
 
