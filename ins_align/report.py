@@ -35,7 +35,9 @@ STATE_COLOURS = {
     State.ALIGNING: '#E69F00', State.LEVELLED: '#56B4E9', State.ALIGNED: '#009E73',
     State.FAULT: '#D55E00'}
 ROLL, PITCH, HEADING = '#0072B2', '#CC79A7', '#D55E00'
-NO_STATE = '#999999'
+AXES_OF_ENU = (('east', ROLL), ('north', PITCH), ('up', HEADING))
+AXES_OF_IMU = (('x', ROLL), ('y', PITCH), ('z', HEADING))
+INNOVATION_LIMIT = 5.0  # sigmas shown at least
 DECLARED_GREEN = '#009E73'
 METRES_PER_DEGREE = 6_371_000.0 * math.pi / 180.0  # of latitude, mean sphere: good for a picture
 LOST_SIGMA_DEG = 60.0  # above this a heading is not worth drawing
@@ -112,7 +114,8 @@ def summary(result: ReplayResult) -> str:
     """Return the table that ``ins_align replay`` prints of a recording."""
     status = result.status
     after = '' if status.time_to_align_s is None else f' after {status.time_to_align_s:.1f} s'
-    lines = [result.bag, f'  {status.state.value}{after}: {status.reason}']
+    reason = status.reason.removeprefix('aligned: ')  # the state has just said so
+    lines = [result.bag, f'  {status.state.value}{after}: {reason}']
     attitudes = [('initial', status.initial), ('final', status.current)]
     rows = []
     for name, attitude in attitudes:
@@ -169,39 +172,50 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def plot(result: ReplayResult) -> Figure:
-    """Draw attitude, sigma, error and trajectory of a recording over time."""
-    figure = new_figure(14.0, 9.0)
+    """
+    Draw a recording over time.
+
+    Attitude with its sigma, where it was declared, the sigmas against their thresholds, normalised
+    innovations, biases, the error where there is a reference, and the track by state.
+    """
+    figure = new_figure(16.0, 11.0)
     status = result.status
     after = '' if status.time_to_align_s is None else f' after {status.time_to_align_s:.1f} s'
     name = Path(result.bag).name or result.bag
     figure.suptitle(f'{name}: {status.state.value}{after}', fontsize=13)
     columns = figure.add_gridspec(1, 2, width_ratios=(3, 2))
     left, right = figure.add_subfigure(columns[0]), figure.add_subfigure(columns[1])
-    tilt, heading, sigma = left.subplots(3, 1, sharex=True)
     series = _Series(result)
+    tilt, heading, sigma, innovation = left.subplots(4, 1, sharex=True)
     _plot_angles(tilt, series, ((0, 'roll', ROLL), (1, 'pitch', PITCH)))
     _plot_angles(heading, series, ((2, 'yaw', HEADING),))
     tilt.set_ylabel('roll, pitch (deg)')
     heading.set_ylabel('yaw (deg, counter-\nclockwise from east)')
     _plot_sigma(sigma, series, result)
-    sigma.set_xlabel('time since t0 (s)')
-    time_axes = [tilt, heading, sigma]
-    if series.errors is None:
-        track = right.subplots()
-    else:
-        error, track = right.subplots(2, 1, height_ratios=(1, 2))
-        _plot_errors(error, series, series.errors)
-        error.set_xlabel('time since t0 (s)')
-        time_axes.append(error)
+    _plot_innovations(innovation, series, result)
+    heights = [1.0] * (2 if series.errors is None else 3) + [2.2]
+    *upper, track = right.subplots(len(heights), 1, height_ratios=heights)
+    gyro, accel, *error = upper
+    _plot_bias(gyro, series.time, np.degrees(series.gyro_bias), np.degrees(status.gyro_bias_std))
+    _plot_bias(accel, series.time, series.accel_bias, status.accel_bias_std)
+    gyro.set_ylabel('gyro bias (deg/s)')
+    accel.set_ylabel('accelerometer\nbias (m/s$^2$)')
+    if series.errors is not None:
+        _plot_errors(error[0], series, series.errors)
+    for axes in upper[:-1]:
+        axes.sharex(upper[-1])
+        axes.tick_params(labelbottom=False)
+    for axes in (innovation, upper[-1]):
+        axes.set_xlabel('time since t0 (s)')
     _plot_track(track, result)
-    for axes in time_axes:
+    for axes in (tilt, heading, sigma, innovation, *upper):
         _mark_declaration(axes, series)
-    for axes in (*time_axes, track):
+    for axes in (tilt, heading, sigma, innovation, *upper, track):
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
             # Above the axes: nothing that is drawn can lie under it.
             axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), fontsize=8, frameon=False,
-                        ncols=7 if axes.figure is left else 4, borderpad=0.2,
+                        ncols=7 if axes.figure is left else 5, borderpad=0.2,
                         columnspacing=1.2, handletextpad=0.5)
     if not len(series.time):
         tilt.text(0.5, 0.5, 'no attitude', transform=tilt.transAxes, ha='center')
@@ -223,6 +237,10 @@ class _Series:
         # Roll and pitch turn about axes in the plane of level: the larger sigma holds for both.
         self.angle_sigma = np.stack([self.sigma[:, :2].max(axis=1, initial=0.0)] * 2
                                     + [self.sigma[:, 2]], axis=-1)
+        self.innovations, self.gyro_bias, self.accel_bias = (
+            np.array([getattr(epoch, name) for epoch, _, _ in pairs]).reshape(-1, 3)
+            for name in ('innovation', 'gyro_bias', 'accel_bias'))
+        self.aligned = np.array([epoch.state is State.ALIGNED for epoch, _, _ in pairs], bool)
         self.declared = [epoch.t_s for before, epoch in zip((None, *result.epochs), result.epochs)
                          if epoch.state is State.ALIGNED
                          and (before is None or before.state is not State.ALIGNED)]
@@ -282,8 +300,42 @@ def _plot_sigma(axes: Axes, series: _Series, result: ReplayResult) -> None:
                       fontsize=7, color=colour)
 
 
+def _plot_innovations(axes: Axes, series: _Series, result: ReplayResult) -> None:
+    kind = 'velocity' if result.topics.velocity is not None else 'position'
+    axes.set_ylabel(f'innovation of the\n{kind} (sigma)')
+    finite = np.isfinite(series.innovations).any(axis=1)
+    if not finite.any():
+        return
+    # Outliers may be anything: they are drawn at the edge.
+    limit = max(INNOVATION_LIMIT, 1.5 * float(np.nanquantile(np.abs(series.innovations), 0.99)))
+    for column, (name, colour) in enumerate(AXES_OF_ENU):
+        axes.plot(series.time[finite],
+                  np.clip(series.innovations[finite, column], -limit, limit), color=colour,
+                  linestyle='none', marker='.', markersize=3, label=name)
+    for level in (-3.0, 3.0):
+        axes.axhline(level, color='black', linewidth=0.8, linestyle=':',
+                     label='3 sigma' if level > 0.0 else None)
+    axes.set_ylim(-1.05 * limit, 1.05 * limit)
+
+
+def _plot_bias(axes: Axes, time: np.ndarray, biases: np.ndarray, std: np.ndarray) -> None:
+    """Draw three biases, and at the end how well they are known."""
+    if not len(time):
+        return
+    for column, (name, colour) in enumerate(AXES_OF_IMU):
+        axes.plot(time, biases[:, column], color=colour, linewidth=1.2, label=name)
+        axes.errorbar(time[-1:], biases[-1:, column], yerr=std[column], color=colour,
+                      capsize=3.0, linewidth=1.2,
+                      label='1 sigma at the end' if column == 2 else None)
+    # The first seconds tell nothing yet.
+    settled = biases[len(biases) // 10:]
+    low, high = settled.min() - std.max(), settled.max() + std.max()
+    margin = 0.1 * (high - low) or 1.0
+    axes.set_ylim(low - margin, high + margin)
+
+
 def _plot_errors(axes: Axes, series: _Series, errors: np.ndarray) -> None:
-    axes.set_ylabel('error against the reference (deg)')
+    axes.set_ylabel('error against\nreference (deg)')
     finite = np.isfinite(errors).all(axis=1)
     if not finite.any():
         axes.set_title('the reference does not cover these epochs', fontsize=10)
@@ -326,6 +378,10 @@ def _plot_track(axes: Axes, result: ReplayResult) -> None:
 
 
 def _mark_declaration(axes: Axes, series: _Series) -> None:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], series.aligned.view(np.int8), [0]])))
+    for start, end in zip(edges[::2], edges[1::2]):
+        axes.axvspan(series.time[start], series.time[end - 1], color=DECLARED_GREEN, alpha=0.07,
+                     linewidth=0)
     for number, time in enumerate(series.declared):
         axes.axvline(time, color=DECLARED_GREEN, linewidth=1.2,
                      label='declared aligned' if number == 0 else None)

@@ -15,6 +15,7 @@
 
 import dataclasses
 import math
+import re
 from types import SimpleNamespace
 
 from ins_align.config import Config
@@ -67,8 +68,8 @@ def test_file_is_written_whole_or_not_at_all(tmp_path):
 
 def test_summary_says_what_matters(result):
     text = summary(result)
-    assert result.status.state.value in text
-    assert result.status.reason in text
+    assert f'ALIGNED after {result.status.time_to_align_s:.1f} s: heading sigma ' in text
+    assert result.status.reason.removeprefix('aligned: ') in text
     assert f'{result.status.initial.yaw_deg:.3f}' in text
     assert 'error roll' in text
     assert 'imu 3001' in text
@@ -101,11 +102,16 @@ def drawn(figure):
 def test_figure_has_labels_with_units_and_no_overlap(result):
     figure = plot(result)
     axes = drawn(figure)
-    assert len(axes) == 5
+    assert len(axes) == 8
     for one in axes:
-        assert '(deg' in one.get_ylabel() or '(m)' in one.get_ylabel()
+        assert re.search(r'\((deg|m\)|m/s|sigma)', one.get_ylabel()), one.get_ylabel()
+    assert [one.get_xlabel() for one in axes if one.get_xlabel()] == [
+        'time since t0 (s)', 'time since t0 (s)', 'east (m)']
     renderer = figure.canvas.get_renderer()
     boxes = [one.get_window_extent(renderer) for one in axes]
+    texts = [one.yaxis.label.get_window_extent(renderer) for one in axes]
+    for index, text in enumerate(texts):
+        assert not any(text.overlaps(other) for other in texts[index + 1:] + boxes)
     legends = [one.get_legend().get_window_extent(renderer) for one in axes if one.get_legend()]
     for index, box in enumerate(boxes):
         assert not any(box.overlaps(other) for other in boxes[index + 1:])
@@ -121,9 +127,43 @@ def test_figure_marks_the_declaration(result):
     assert [line.get_xdata()[0] for line in marks] == [first]
 
 
+def lines_of(axes):
+    """Return the lines of an axes by their label."""
+    return {line.get_label(): line for line in axes.lines}
+
+
+def test_figure_shows_innovations_and_biases(result):
+    axes = {one.get_ylabel().replace('\n', ' '): one for one in plot(result).axes}
+    shown = [epoch for epoch in result.epochs if epoch.current is not None]
+    up = lines_of(axes['innovation of the velocity (sigma)'])['up']
+    tested = [epoch.innovation[2] for epoch in shown if np.isfinite(epoch.innovation).any()]
+    assert len(tested) > 100
+    assert np.clip(tested, -5.0, 5.0) == pytest.approx(np.clip(up.get_ydata(), -5.0, 5.0))
+    z = lines_of(axes['gyro bias (deg/s)'])['z']
+    assert z.get_ydata() == pytest.approx(np.degrees([epoch.gyro_bias[2] for epoch in shown]))
+    x = lines_of(axes['accelerometer bias (m/s$^2$)'])['x']
+    assert x.get_ydata() == pytest.approx([epoch.accel_bias[0] for epoch in shown])
+
+
+def test_outliers_are_drawn_at_the_edge(result):
+    epochs = list(result.epochs)
+    index = len(epochs) // 2
+    epochs[index] = dataclasses.replace(epochs[index], innovation=np.array([1e6, -1e6, 0.0]))
+    figure = plot(dataclasses.replace(result, epochs=tuple(epochs)))
+    axes = next(one for one in figure.axes if one.get_ylabel().startswith('innovation'))
+    low, high = axes.get_ylim()
+    assert high < 20.0
+    for name in ('east', 'north', 'up'):
+        values = lines_of(axes)[name].get_ydata()
+        assert low < values.min() and values.max() < high
+
+
 def test_figure_without_reference_or_epochs(result):
-    assert len(drawn(plot(dataclasses.replace(result, reference=None)))) == 4
+    assert len(drawn(plot(dataclasses.replace(result, reference=None)))) == 7
     empty = dataclasses.replace(result, epochs=(), track=np.zeros((0, 3)))
-    assert len(drawn(plot(empty))) == 5
+    assert len(drawn(plot(empty))) == 8
     unknown = SimpleNamespace(errors_deg=lambda attitude: None)
-    assert len(drawn(plot(dataclasses.replace(result, reference=unknown)))) == 5
+    assert len(drawn(plot(dataclasses.replace(result, reference=unknown)))) == 8
+    untested = [dataclasses.replace(epoch, innovation=np.full(3, np.nan))
+                for epoch in result.epochs]
+    assert len(drawn(plot(dataclasses.replace(result, epochs=tuple(untested))))) == 8
