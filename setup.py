@@ -19,10 +19,13 @@ from setuptools import find_packages, setup
 package_name = 'ins_align'
 
 # The robot needs numpy and PyYAML (parameter files of replay); ROS brings rclpy and messages.
+replay = ['rosbags>=0.10.11', 'backports.zstd; python_version < "3.14"', 'lz4', 'tqdm']
+simulation = ['python-ins>=1.0', 'rosbags>=0.10.11', 'scipy>=1.11']
 extras = {
-    'replay': ['rosbags>=0.10', 'tqdm'],
+    'replay': replay,
     'plot': ['matplotlib>=3.8'],
-    'simulation': ['python-ins>=1.0', 'rosbags>=0.10', 'scipy>=1.11'],
+    'simulation': simulation,
+    'experiments': [*replay, *simulation, 'matplotlib>=3.8', 'pillow'],
     'test': [
         'catkin-pkg', 'hypothesis', 'mypy', 'pytest', 'pytest-cov', 'ros-ament-flake8',
         'ros-ament-pep257', 'flake8', 'flake8-blind-except', 'flake8-builtins',

@@ -32,8 +32,8 @@ html_theme = 'sphinx_rtd_theme'
 
 # Documentation is built where there may be no ROS.
 autodoc_mock_imports = [
-    'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces',
-    'rclpy', 'sensor_msgs', 'std_srvs',
+    'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces', 'rclpy', 'sensor_msgs',
+    'std_srvs',
 ]
 autodoc_default_options = {'members': True, 'member-order': 'bysource', 'show-inheritance': True}
 autodoc_typehints = 'signature'

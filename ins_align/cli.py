@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 
 ALIGNED, NOT_ALIGNED, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
 
+# Where the package to install has another name than the module.
+PACKAGES = {'backports': 'backports.zstd', 'PIL': 'pillow', 'pyins': 'python-ins',
+            'yaml': 'pyyaml'}
+
 SCENARIOS = 'flight, car, straight, static, hover, launch, reverse, swing'
 
 DESCRIPTION = """\
@@ -395,7 +399,8 @@ def _missing(error: ModuleNotFoundError) -> UsageError:
     """Say what to install; a module of our own that is missing is a bug."""
     if (error.name or 'ins_align').startswith('ins_align'):
         raise error
-    return UsageError(f'{error.name} is not installed: pip install rosbags python-ins')
+    name = (error.name or '').split('.')[0]
+    return UsageError(f'{error.name} is not installed: pip install {PACKAGES.get(name, name)}')
 
 
 def run_simulate(arguments: argparse.Namespace) -> int:

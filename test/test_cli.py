@@ -251,6 +251,14 @@ def test_simulate_refuses_in_a_sentence(tmp_path, capsys):
     assert 'mems' in one_sentence(capsys)
 
 
+@pytest.mark.parametrize('module, package', [('rosbags.rosbag2', 'rosbags'),
+                                             ('pyins.sim', 'python-ins')])
+def test_what_to_install(tmp_path, capsys, monkeypatch, module, package):
+    monkeypatch.setitem(sys.modules, module, None)
+    assert main(['simulate', str(tmp_path / 'a'), '--duration', '10']) == 2
+    assert f'{module} is not installed: pip install {package}\n' in one_sentence(capsys)
+
+
 def test_simulate_passes_its_options_on(tmp_path, capsys):
     from ins_align.bags import Bag
     assert main(['simulate', str(tmp_path / 'a'), '--duration', '10', '--imu-rate', '50',
