@@ -49,7 +49,6 @@ setup(
     python_requires='>=3.10',
     install_requires=['setuptools', 'numpy>=1.26', 'pyyaml'],
     extras_require=extras,
-    tests_require=['pytest'],
     zip_safe=True,
     author='The ins_align Authors',
     maintainer='The ins_align Authors',
