@@ -131,6 +131,8 @@ class _Survey:
         self._advise_imu(chosen['imu'])
         self._advise_gnss(chosen['fix'], velocity, velocities)
         self._advise_clocks(chosen, lateness)
+        for topics in (imus, fixes, velocities):
+            self._advise_choice(topics)
         command = self._command(chosen)
         end_ns = self._bag.end_ns
         return Info(
@@ -232,6 +234,12 @@ class _Survey:
             late.append((newest[before] - data.stamps_ns[data.usable])[before >= 0] * 1e-9)
         lateness = np.concatenate(late) if late else np.zeros(0)
         return float(np.quantile(lateness, 0.99)) if lateness.size else None
+
+    def _advise_choice(self, topics: list[TopicInfo]) -> None:
+        good = [topic.name for topic in topics if not topic.faults]
+        if len(good) > 1:
+            self._notes.append(f'{", ".join(good)}: each could be read, the command takes the one '
+                               'with the most messages; choose for yourself')
 
     def _advise_imu(self, imu: TopicInfo | None) -> None:
         if imu is None or imu.imu is None:

@@ -182,6 +182,18 @@ def test_two_imus_quoted_for_a_shell(changed):
     assert 'gravity is 9.8' in by_name(info, odd).faults[0]
 
 
+def test_two_good_imus_are_a_choice(changed):
+    def change(name, time, message):
+        if name == '/imu/data_raw' and time % 20_000_000 == 0:
+            return [(name, time, message), ('/imu/slow', time, message)]
+        return [(name, time, message)]
+
+    info = inspect(changed(change, topics={**TOPICS, '/imu/slow': IMU}))
+    assert info.chosen['imu'] == '/imu/data_raw'
+    assert 'choose for yourself' in info.notes[0] and '/imu/slow' in info.notes[0]
+    assert '--imu-topic /imu/data_raw' in info.command
+
+
 @pytest.mark.parametrize('factors, word', [((57.29578, 1.0), 'deg/s'), ((-1.0, 1.0), 'sign'),
                                            ((1.0, 0.10197), 'unit (g?)')])
 def test_units_and_signs_of_the_imu(changed, factors, word):
