@@ -21,8 +21,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 import dataclasses
-from operator import attrgetter
-from typing import Any
+from operator import itemgetter
+import time
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import QuaternionStamped, TwistStamped, TwistWithCovarianceStamped
@@ -31,11 +32,15 @@ from ins_align.config import (
     Config, config_from_mapping, ConfigError, NODE_NAME, Parameter as ParameterInfo, parameters)
 from ins_align.imu_bytes import ImuSample, read_imu, with_orientation
 from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
+from ins_align.prediction import Follower, Prediction
+from ins_align.worker import Worker
 from nav_msgs.msg import Odometry
 import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -51,9 +56,11 @@ VELOCITY_TYPES = {
     'TwistStamped': TwistStamped,
     'Odometry': Odometry,
 }
-IMU_DEPTH = 2000  # ten seconds at 200 Hz: the estimator may be busy, no sample may be lost
+IMU_DEPTH = 2000  # ten seconds at 200 Hz: the machine may be busy, no sample may be lost
 GNSS_DEPTH = 200
+IMU_BATCH = 100  # messages taken in a turn of the executor: more would hold up the others
 STATUS_PERIOD = 1.0  # s
+ACKNOWLEDGED_WITHIN = Duration(seconds=0.5)
 RCLPY_PARAMETERS = {'use_sim_time', 'start_type_description_service'}  # it declares them itself
 
 LEVELS = {
@@ -62,9 +69,52 @@ LEVELS = {
 }
 
 
+class Gate(CallbackGroup):
+    """
+    Keeps a subscription from its executor until it is opened.
+
+    A turn of the executor takes longer than all that is done with a message. Where nothing has
+    to be done at once, messages wait in the subscription's queue and are taken many at a time.
+    """
+
+    is_open = False
+
+    def can_execute(self, entity: Any) -> bool:
+        """Whether the executor may take messages."""
+        return self.is_open
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Allow it."""
+        return True
+
+    def ending_execution(self, entity: Any) -> None:
+        """Do nothing."""
+
+
+class _Reset(NamedTuple):
+    """The alignment starts over on request."""
+
+
+class _Outlook(NamedTuple):
+    """What ~/imu goes on from: after how many resets, for which IMU."""
+
+    starts: int
+    frame_id: str | None
+    prediction: Prediction | None
+
+
 class AlignmentNode(Node):
     """
     Feeds an `Aligner` from topics and publishes the attitude that it declares.
+
+    A thread of its own takes the messages and aligns, several times a second. If somebody listens
+    to `~/imu`, the executor takes the IMU's messages instead and answers each at once, with the
+    attitude that the thread knew last, carried on with the gyros since.
+
+    Attributes
+    ----------
+    failure : exception or None
+        What ended the thread, and with it the context.
 
     Raises
     ------
@@ -77,61 +127,126 @@ class AlignmentNode(Node):
         """Declare the parameters, then open the topics."""
         # Overrides are declared untyped first, so that [1, 1, 1] is as good as [1.0, 1.0, 1.0].
         super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True)
+        self.failure: BaseException | None = None
+        self._worker = Worker(self._work, self._on_failure)
         self._config = self._declare_parameters()
+        # The executor's thread:
+        self._follower = Follower()
+        self._adopted: _Outlook | None = None
+        self._starts = 0  # how often it was told to start over
+        # The worker's:
         self._aligner = Aligner(self._config)
         self._declared: Attitude | None = None
         self._imu_frame: str | None = None
+        self._started = 0  # how often it has started over
+        self._next_status = 0.0
+        # From the worker to the executor, replaced as a whole:
+        self._outlook = _Outlook(0, None, None)
 
         self._attitude_publisher = self._open_attitude_topic()
         self._imu_publisher = self._publish_on(Imu, '~/imu', QoSProfile(depth=100))
         self._status_publishers = [
             self._publish_on(DiagnosticArray, topic, QoSProfile(depth=10))
             for topic in ('~/status', '/diagnostics')]
+        self._imu_gate = Gate()
         self._imu_subscription = self._subscribe_to(
-            Imu, 'imu/data_raw', self._on_imu, IMU_DEPTH, raw=True)
-        self._fix_subscription = self._subscribe_to(NavSatFix, 'fix', self._on_fix, GNSS_DEPTH)
+            Imu, 'imu/data_raw', self._on_imu, IMU_DEPTH, self._imu_gate)
+        self._fix_subscription = self._subscribe_to(
+            NavSatFix, 'fix', _nothing, GNSS_DEPTH, Gate())
         self._velocity_subscription = self._subscribe_to(
-            VELOCITY_TYPES[self._config.velocity_type], 'fix_velocity', self._on_velocity,
-            GNSS_DEPTH)
+            VELOCITY_TYPES[self._config.velocity_type], 'fix_velocity', _nothing, GNSS_DEPTH,
+            Gate())
         self.create_service(Trigger, '~/reset', self._on_reset)
-        # Status goes on when simulated time stands still.
-        self.create_timer(STATUS_PERIOD, self._on_timer,
-                          clock=Clock(clock_type=ClockType.STEADY_TIME))
+        # A signal between two waits of the executor wakes it from neither: it has to look.
+        self.create_timer(1.0, _nothing, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._worker.start()
 
-    # Input
+    def destroy_node(self) -> None:
+        """Let the worker end its round first."""
+        self._worker.stop()
+        super().destroy_node()
 
-    def _on_imu(self, data: bytes) -> None:
-        # The executor takes one message a turn, and a turn costs many times what is done with the
-        # message. What has queued up while the estimator was busy therefore comes along, in the
-        # order of the stamps: nothing shall be late, or early, only because it waited here.
-        queue = queued(self._imu_subscription)
-        gnss: list[Fix | Velocity] = []
-        if queue:
-            gnss += map(fix_from_msg, queued(self._fix_subscription))
-            gnss += filter(None, map(self._velocity, queued(self._velocity_subscription)))
-            gnss.sort(key=attrgetter('stamp_ns'))
-        for message in (data, *queue):
+    # Callbacks: in the executor's thread, which never waits for the aligner
+
+    def _on_imu(self, data: bytes, info: dict[str, int]) -> None:
+        # A turn of the executor costs many times what is done with a message: what has queued up
+        # comes along.
+        for message, received_ns in ((data, info['received_timestamp']),
+                                     *queued(self._imu_subscription, IMU_BATCH)):
             sample = read_imu(message)
-            while gnss and gnss[0].stamp_ns <= sample.stamp_ns:
-                self._take_gnss(gnss.pop(0))
-            self._take_imu(sample, message)
-        for measurement in gnss:
-            self._take_gnss(measurement)
+            self._worker.put((received_ns, sample))
+            self._publish_imu(sample, message)
 
-    def _take_imu(self, sample: ImuSample, data: bytes) -> None:
-        if sample.frame_id != self._imu_frame:
-            self._change_imu_frame(sample.frame_id)
-        self._aligner.add_imu(sample.stamp_ns, sample.gyro, sample.accel)
-        if self._imu_publisher.get_subscription_count():
-            self._publish_imu(data, sample.stamp_ns)
+    def _publish_imu(self, sample: ImuSample, data: bytes) -> None:
+        outlook = self._outlook
+        if outlook is not self._adopted:
+            self._adopted = outlook
+            self._follower.adopt(
+                outlook.prediction if outlook.starts == self._starts else None)
+        now = self._follower.follow(sample.stamp_ns, sample.gyro)
+        # What was learnt is about the axes of another IMU when the frame is another one.
+        self._imu_publisher.publish(
+            with_orientation(data) if now is None or sample.frame_id != outlook.frame_id else
+            with_orientation(data, now.quaternion_xyzw, now.covariance))
 
-    def _on_fix(self, msg: NavSatFix) -> None:
-        self._take_gnss(fix_from_msg(msg))
+    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._starts += 1  # from here on, what the worker knew before does not hold
+        self._follower.adopt(None)
+        self._worker.put((self._now_ns(), _Reset()))
+        self._worker.wake()
+        response.success = True
+        response.message = 'alignment starts over'
+        return response
 
-    def _on_velocity(self, msg: Any) -> None:
-        velocity = self._velocity(msg)
-        if velocity is not None:
-            self._take_gnss(velocity)
+    # Alignment and what comes of it: in the worker's thread, the aligner's only one
+
+    def _work(self, items: list[tuple[int, Any]]) -> None:
+        """Take in what has come, align and publish what has changed."""
+        for subscription, convert in (
+                *([] if self._imu_gate.is_open else [(self._imu_subscription, read_imu)]),
+                (self._fix_subscription, fix_from_msg),
+                (self._velocity_subscription, self._velocity)):
+            items += [(received_ns, convert(message)) for message, received_ns
+                      in queued(subscription, subscription.qos_profile.depth)]
+        # Each topic is a queue by itself: nothing shall be late, or early, for having waited.
+        items.sort(key=itemgetter(0))
+        for _, item in items:
+            self._feed(item)
+        self._align()
+        self._look_out()
+        events = self._aligner.take_events()
+        for event in events:
+            self.get_logger().info(event)
+        # By a clock that goes on when simulated time stands still.
+        if events or time.monotonic() >= self._next_status:
+            self._publish_status()
+
+    def _feed(self, item: Any) -> None:
+        aligner = self._aligner
+        if isinstance(item, ImuSample):
+            if item.frame_id != self._imu_frame:
+                self._change_imu_frame(item.frame_id)
+            aligner.add_imu(item.stamp_ns, item.gyro, item.accel)
+        elif isinstance(item, Fix):
+            aligner.add_fix(item)
+        elif isinstance(item, Velocity):
+            aligner.add_velocity(item)
+        elif isinstance(item, Config):
+            aligner.reconfigure(item)
+        elif isinstance(item, _Reset):
+            self._started += 1
+            self._start_over('requested by service')
+
+    def _align(self) -> None:
+        """Process what can be processed."""
+        for epoch in self._aligner.update():
+            self._declare(epoch.initial if epoch.state is State.ALIGNED else None)
+        if self._aligner.declared is None:
+            self._declare(None)
+
+    def _start_over(self, why: str) -> None:
+        self._align()  # what came before counts, whenever it was taken in
+        self._aligner.reset(why)
 
     def _velocity(self, msg: Any) -> Velocity | None:
         try:
@@ -140,71 +255,52 @@ class AlignmentNode(Node):
             self._aligner.reject('velocity_body_frame')
             return None
 
-    def _take_gnss(self, measurement: Fix | Velocity) -> None:
-        if isinstance(measurement, Fix):
-            self._aligner.add_fix(measurement)
-        else:
-            self._aligner.add_velocity(measurement)
-        self._update()
-
     def _change_imu_frame(self, frame_id: str) -> None:
         """Start over: what was learnt is about axes that are no longer the IMU's."""
         if self._imu_frame is not None:
             self._aligner.reject('imu_frame_changed')
-            self._aligner.reset(
+            self._start_over(
                 f'frame_id of the IMU changed from {self._imu_frame!r} to {frame_id!r}')
-            self._update()
         self._imu_frame = frame_id
 
-    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._aligner.reset('requested by service')
-        self._update()
-        response.success = True
-        response.message = 'alignment starts over'
-        return response
+    def _look_out(self) -> None:
+        """Tell the executor what to go on from, if somebody listens."""
+        listened = self._imu_publisher.get_subscription_count() > 0
+        prediction = self._aligner.prediction() if listened and self._declared else None
+        if prediction is not None or self._outlook.prediction is not None:
+            self._outlook = _Outlook(self._started, self._imu_frame, prediction)
+        if listened != self._imu_gate.is_open:
+            self._imu_gate.is_open = listened
+            if self.executor is not None:
+                self.executor.wake()
 
-    def _on_timer(self) -> None:
-        self._update()
-        self._publish_status()
+    def _on_failure(self, error: BaseException) -> None:
+        # An interruption in the middle of rcl's work is no failure.
+        if self.context.ok():
+            self.failure = error
+            self.context.try_shutdown()
 
-    # Output
-
-    def _update(self) -> None:
-        """Process what can be processed and publish what has changed."""
-        self._aligner.update()
-        declared = self._aligner.declared
-        if declared is not self._declared:
-            self._declared = declared
-            self._publish_declared()
-        events = self._aligner.take_events()
-        for event in events:
-            self.get_logger().info(event)
-        if events:
-            self._publish_status()
-
-    def _publish_declared(self) -> None:
-        if self._declared is None:
-            # Whoever joins from now on must not get an attitude that no longer holds.
+    def _declare(self, attitude: Attitude | None) -> None:
+        """Publish the initial attitude once, or withdraw it."""
+        if (attitude is None) == (self._declared is None):
+            return
+        self._declared = attitude
+        if attitude is None:
+            # Whoever joins from now on must not get an attitude that no longer holds; who was
+            # there before shall have got it.
+            self._attitude_publisher.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
             self.destroy_publisher(self._attitude_publisher)
             self._attitude_publisher = self._open_attitude_topic()
             return
         msg = QuaternionStamped()
-        msg.header.stamp = Time(nanoseconds=self._declared.stamp_ns).to_msg()
+        msg.header.stamp = Time(nanoseconds=attitude.stamp_ns).to_msg()
         msg.header.frame_id = self._config.world_frame_id
         turn = msg.quaternion
-        turn.x, turn.y, turn.z, turn.w = self._declared.quaternion_xyzw.tolist()
+        turn.x, turn.y, turn.z, turn.w = attitude.quaternion_xyzw.tolist()
         self._attitude_publisher.publish(msg)
 
-    def _publish_imu(self, data: bytes, stamp_ns: int) -> None:
-        attitude = None if self._declared is None else self._aligner.attitude_now()
-        # A sample that comes out of order belongs to another instant than the attitude.
-        if attitude is None or attitude.stamp_ns != stamp_ns:
-            self._imu_publisher.publish(with_orientation(data))
-        else:
-            self._imu_publisher.publish(
-                with_orientation(data, attitude.quaternion_xyzw, attitude.covariance))
-
     def _publish_status(self) -> None:
+        self._next_status = time.monotonic() + STATUS_PERIOD
         status = self._aligner.status()
         msg = DiagnosticArray()
         msg.header.stamp = self.get_clock().now().to_msg()
@@ -230,13 +326,21 @@ class AlignmentNode(Node):
         return self._publish_on(QuaternionStamped, '~/initial_attitude', QoSProfile(
             depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
 
-    def _subscribe_to(self, msg_type: type, topic: str, callback: Callable[[Any], None],
-                      depth: int, *, raw: bool = False) -> Subscription:
-        # Best effort matches every publisher.
+    def _subscribe_to(self, msg_type: type, topic: str, callback: Callable[..., None],
+                      depth: int, gate: Gate) -> Subscription:
+        # Best effort matches every publisher, so that no event can tell of one that does not.
         return self.create_subscription(
             msg_type, topic, callback,
             QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(), raw=raw)
+            callback_group=gate,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            raw=msg_type is Imu)
+
+    @staticmethod
+    def _now_ns() -> int:
+        """Return the time by the clock of received messages."""
+        return time.time_ns()
 
     def _declare_parameters(self) -> Config:
         """Check the values given at start and declare all parameters with their description."""
@@ -272,19 +376,23 @@ class AlignmentNode(Node):
 
     def _change_parameters(self, changes: list[Parameter]) -> None:
         self._config = self._changed_config(changes)
-        self._aligner.reconfigure(self._config)
+        self._worker.put((self._now_ns(), self._config))
 
 
-def queued(subscription: Subscription) -> list[Any]:
-    """Take the messages that wait in a subscription's queue."""
+def queued(subscription: Subscription, most: int) -> list[tuple[Any, int]]:
+    """Take up to so many waiting messages, each with the time at which it was received, ns."""
     messages = []
     with subscription.handle:
-        for _ in range(IMU_DEPTH):
+        for _ in range(most):
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
             if taken is None:
                 break
-            messages.append(taken[0])
+            messages.append((taken[0], taken[1]['received_timestamp']))
     return messages
+
+
+def _nothing(*_: Any) -> None:
+    """Be a callback where nothing is to be done."""
 
 
 def parameter_descriptor(parameter: ParameterInfo) -> ParameterDescriptor:

@@ -18,12 +18,12 @@ Turning every sample into a Python message and back costs several times what the
 does with it, so the node takes the bytes as they arrive and changes them in place.
 """
 
+from collections.abc import Sequence
 import struct
 from typing import NamedTuple
 
 from ins_align.decoding import body_start
 from ins_align.messages import imu_from_msg
-import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu
 
@@ -63,8 +63,8 @@ def read_imu(data: bytes) -> ImuSample:
                      frame.decode(errors='replace'))
 
 
-def with_orientation(data: bytes, quaternion_xyzw: np.ndarray | None = None,
-                     covariance: np.ndarray | None = None) -> bytes:
+def with_orientation(data: bytes, quaternion_xyzw: Sequence[float] | None = None,
+                     covariance: Sequence[float] | None = None) -> bytes:
     """
     Return a serialised sensor_msgs/Imu with another orientation.
 
@@ -72,15 +72,15 @@ def with_orientation(data: bytes, quaternion_xyzw: np.ndarray | None = None,
     ----------
     data : bytes
         The message.
-    quaternion_xyzw : ndarray, shape (4,), optional
+    quaternion_xyzw : four floats, optional
         None marks the orientation as not known: covariance[0] = -1.
-    covariance : ndarray, shape (3, 3), optional
-        rad^2.
+    covariance : nine floats, optional
+        rad^2, row by row.
 
     """
-    orientation = _NO_ORIENTATION
+    orientation: tuple[float, ...] = _NO_ORIENTATION
     if quaternion_xyzw is not None and covariance is not None:
-        orientation = (*quaternion_xyzw.tolist(), *covariance.ravel().tolist())
+        orientation = (*quaternion_xyzw, *covariance)
     start = body_start(data, 'cdr')
     if start is None:
         msg = deserialize_message(data, Imu)

@@ -73,6 +73,8 @@ def main(args: Sequence[str] | None = None) -> int:
     except RuntimeError as error:  # all of rcl's
         return _refused(f'the ROS arguments are wrong: {error}')
     ros_handles_signals = True
+    # The estimator's thread must not keep a callback waiting for the interpreter (s).
+    sys.setswitchinterval(0.001)
     node = None
     try:
         node = AlignmentNode()
@@ -89,6 +91,8 @@ def main(args: Sequence[str] | None = None) -> int:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+    if node is not None and node.failure is not None:
+        raise node.failure
     return 0
 
 

@@ -23,12 +23,11 @@ from collections.abc import Sequence
 import copy
 import math
 
+from ins_align.buffers import MAX_RATE
 from ins_align.rotation import Array, matrix_from_quaternion, quaternion_from_matrix
 import numpy as np
 
-# Faster than this (rad/s) nothing turns, and an attitude is lost when samples are missing for
-# longer (ns).
-MAX_RATE = 200.0
+# An attitude is lost when samples are missing for longer (ns).
 MAX_GAP_NS = 2_000_000_000
 # So many samples are kept until it is known from which of them on to carry.
 HISTORY = 2000
