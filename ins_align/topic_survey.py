@@ -33,6 +33,7 @@ import numpy as np
 KINDS = ('imu', 'fix', 'velocity')
 WIDTHS = {'imu': 6, 'fix': 3, 'velocity': 3}
 MAX_ASTRAY = 60.0  # s: a stamp further off the recorded time than the others is not used
+MAX_ALTITUDE = 100_000.0  # m
 GAP_INTERVALS = 3.5  # times the usual interval without a message is a gap
 
 
@@ -138,10 +139,10 @@ class Recorded:
 
     @property
     def age_ns(self) -> int:
-        """Median of recorded time less stamp."""
-        if not self.stamps_ns.size:
-            return 0
-        return int(np.median(self.recorded_ns - self.stamps_ns))
+        """Median of recorded time less stamp: one of the ages, no mean of two clocks."""
+        ages = self.recorded_ns - self.stamps_ns
+        middle = ages.size // 2
+        return int(np.partition(ages, middle)[middle]) if ages.size else 0
 
     def timing(self, start_ns: int) -> Timing:
         """Return when messages came."""
@@ -193,7 +194,8 @@ class Recorded:
         if isinstance(message, Fix):
             values = (message.latitude_deg, message.longitude_deg, message.altitude_m)
             has_fix = message.status != NO_FIX
-            usable = has_fix and abs(values[0]) <= 90.0 and abs(values[1]) <= 360.0
+            usable = (has_fix and abs(values[0]) <= 90.0 and abs(values[1]) <= 360.0
+                      and abs(values[2]) < MAX_ALTITUDE)
             self.no_fix += not has_fix
         else:
             values = tuple(message.velocity.tolist())

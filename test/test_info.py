@@ -244,6 +244,18 @@ def test_stamps_gone_astray(changed):
     assert by_name(info, '/fix_velocity').frame.frame == 'enu'
 
 
+def test_half_of_the_stamps_of_another_clock(changed):
+    """The median of two clocks is neither."""
+    def change(name, time, message):
+        if name == '/fix' and message.header.stamp.sec % 2 == 0:
+            message.header.stamp.sec -= 1_000_000
+        return [(name, time, message)]
+
+    info = inspect(changed(change))
+    assert by_name(info, '/fix').timing.astray == 150
+    json.dumps(info.to_json(), allow_nan=False)
+
+
 def test_gaps_and_no_fix(changed, drive):
     start = drive[1][0][1]
 
