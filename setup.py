@@ -23,6 +23,7 @@ replay = ['rosbags>=0.10.11', 'backports.zstd; python_version < "3.14"', 'lz4', 
 simulation = ['python-ins>=1.0', 'rosbags>=0.10.11', 'scipy>=1.11']
 extras = {
     'replay': replay,
+    'dask': ['distributed>=2024.1'],
     'plot': ['matplotlib>=3.8'],
     'simulation': simulation,
     'experiments': [*replay, *simulation, 'matplotlib>=3.8', 'pillow'],

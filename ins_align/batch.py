@@ -11,16 +11,21 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Replay of many recordings: one function a recording, here or in other processes, in order."""
+"""
+Replay of many recordings: one function a recording, in order.
+
+Here, in other processes of this machine, or on the machines of a Dask cluster.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 import multiprocessing
+import os
 from pathlib import Path
 import signal
 from typing import Any
@@ -29,6 +34,12 @@ from ins_align.bag_files import BagError
 from ins_align.config import Config
 from ins_align.replay import replay
 from ins_align.report import plot, save_figure, summary, write_whole
+
+CONNECT_TIMEOUT = 10.0  # s, to the scheduler of a Dask cluster
+
+
+class ClusterError(RuntimeError):
+    """A Dask cluster that cannot be used; the text says why in one sentence."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +127,76 @@ def process_all(tasks: Sequence[Task], jobs: int, progress: Callable[[float], No
             for child in multiprocessing.active_children():
                 child.terminate()
             raise
+
+
+def process_on_cluster(tasks: Sequence[Task], address: str, progress: Callable[[float], None],
+                       ) -> Iterator[Outcome]:
+    """
+    Process tasks on a Dask cluster and yield their outcomes in the order of the tasks.
+
+    The workers read and write the files: they need the same folders as this machine. What a
+    worker that dies had in hand, another one does again; files are replaced as a whole.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+        One a recording.
+    address : str
+        Of the scheduler, ``tcp://host:8786``.
+    progress : callable
+        Called with the number of recordings done.
+
+    Raises
+    ------
+    ClusterError
+        If Dask is not installed or there is no cluster at this address.
+
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise ClusterError("--dask needs Dask, which is not installed: "
+                           "pip install 'ins_align[dask]'") from None
+    try:
+        client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        reason = str(error).partition('\n')[0] or type(error).__name__
+        raise ClusterError(f'no Dask scheduler answers at {address}: {reason}') from None
+    with client:
+        # Not pure: the same recording twice among the arguments is two tasks.
+        futures = client.map(_process_there, [_absolute(task) for task in tasks], pure=False)
+        try:
+            for index, (task, future) in enumerate(zip(tasks, futures)):
+                try:
+                    outcome = _as_asked(future.result(), task)
+                except Exception as error:  # whatever the cluster has run into
+                    outcome = _failed(task, f'{task.bag}: the Dask cluster gave up on it: '
+                                            f'{type(error).__name__}')
+                yield outcome
+                progress(index + 1.0)
+        finally:
+            client.cancel(futures)
+
+
+def _process_there(task: Task) -> Outcome:
+    """Be the function that Dask calls, which knows of no progress."""
+    return process(task)
+
+
+def _absolute(task: Task) -> Task:
+    """Name files as they are named from any folder."""
+    return replace(task, bag=os.path.abspath(task.bag),
+                   csv=task.csv and os.path.abspath(task.csv),
+                   plot=task.plot and os.path.abspath(task.plot))
+
+
+def _as_asked(outcome: Outcome, task: Task) -> Outcome:
+    """Name the recording as the user has named it."""
+    path = os.path.abspath(task.bag)
+    if outcome.error:
+        return _failed(task, outcome.error.replace(path, task.bag))
+    return replace(outcome, json={**outcome.json, 'bag': task.bag},
+                   summary=outcome.summary.replace(path, task.bag))
 
 
 def _advance(progress: Callable[[float], None], done: int, part: float) -> None:

@@ -25,6 +25,7 @@ import sys
 from typing import Any, IO, NoReturn, TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from ins_align.batch import Outcome, Task
     from ins_align.config import Config
 
 # Everything else is imported where it is used: --help must not wait for numpy.
@@ -200,6 +201,8 @@ def _add_replay(commands: Any) -> None:
     group.add_argument('--duration', type=_seconds, metavar='S', help='read this many seconds')
     group.add_argument('--jobs', type=_count, metavar='N',
                        help='recordings at a time, each in a process (default: one a processor)')
+    group.add_argument('--dask', metavar='ADDRESS',
+                       help='process the recordings on the Dask cluster with this scheduler')
     group = command.add_argument_group('output')
     group.add_argument('--json', metavar='FILE', help='write the result')
     group.add_argument('--csv', metavar='FILE', help='write a row for every GNSS epoch')
@@ -306,7 +309,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
     config = _config(arguments)
     if arguments.plot:
         _check_plot(arguments.plot)
-    from ins_align.batch import process_all, Task
+    from ins_align.batch import Task
 
     several = len(arguments.bags) > 1
     labels = _labels(arguments.bags) if several else ['']
@@ -317,8 +320,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
     objects = []
     statuses = []
     with _progress(len(tasks)) as progress:
-        for outcome in process_all(tasks, arguments.jobs or os.cpu_count() or 1,
-                                   progress.advance):
+        for outcome in _outcomes(tasks, arguments, progress):
             if outcome.error:
                 if not several:
                     raise UsageError(outcome.error)
@@ -333,6 +335,20 @@ def run_replay(arguments: argparse.Namespace) -> int:
     if arguments.json:
         _write_json(arguments.json, objects if several else objects[0])
     return max(statuses)
+
+
+def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace, progress: Progress,
+              ) -> Iterator[Outcome]:
+    """Process recordings where the arguments say."""
+    from ins_align.batch import ClusterError, process_all, process_on_cluster
+
+    if not arguments.dask:
+        yield from process_all(tasks, arguments.jobs or os.cpu_count() or 1, progress.advance)
+        return
+    try:
+        yield from process_on_cluster(tasks, arguments.dask, progress.advance)
+    except ClusterError as error:
+        raise UsageError(error) from None
 
 
 def _write_json(path: str, content: Any) -> None:
