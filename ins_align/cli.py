@@ -17,16 +17,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 import json
 import os
 from pathlib import Path
 import sys
-from typing import Any, IO, NoReturn, TYPE_CHECKING
+from typing import Any, NoReturn, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ins_align.batch import Outcome, Task
     from ins_align.config import Config
+    from ins_align.progress import Progress
 
 # Everything else is imported where it is used: --help must not wait for numpy.
 
@@ -310,6 +310,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
     if arguments.plot:
         _check_plot(arguments.plot)
     from ins_align.batch import Task
+    from ins_align.progress import progress_bar
 
     several = len(arguments.bags) > 1
     labels = _labels(arguments.bags) if several else ['']
@@ -319,7 +320,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
              for bag, label in zip(arguments.bags, labels)]
     objects = []
     statuses = []
-    with _progress(len(tasks)) as progress:
+    with progress_bar(len(tasks)) as progress:
         for outcome in _outcomes(tasks, arguments, progress):
             if outcome.error:
                 if not several:
@@ -448,57 +449,6 @@ def run_experiment(arguments: argparse.Namespace) -> int:
     except experiments.ExperimentError as error:
         raise UsageError(error) from None
     return 0
-
-
-class Progress:
-    """
-    One bar over all recordings, on a terminal and with tqdm; otherwise nothing.
-
-    Parameters
-    ----------
-    bar : tqdm or None
-        Counts recordings.
-
-    """
-
-    def __init__(self, bar: Any) -> None:
-        self._bar = bar
-
-    def say(self, text: str) -> None:
-        """Write to standard output without tearing the bar."""
-        self._write(text, sys.stdout)
-
-    def note(self, text: str) -> None:
-        """Write to standard error without tearing the bar."""
-        self._write(text, sys.stderr)
-
-    def advance(self, position: float) -> None:
-        """Say how many recordings have been read, whole ones and parts."""
-        if self._bar is not None and position > self._bar.n:
-            self._bar.update(position - self._bar.n)
-
-    def _write(self, text: str, file: IO[str]) -> None:
-        if self._bar is None:
-            print(text, file=file)
-        else:
-            self._bar.write(text, file=file)
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[Progress]:
-    bar = None
-    if sys.stderr.isatty():
-        try:
-            from tqdm import tqdm
-            bar = tqdm(total=total, file=sys.stderr, leave=False,
-                       bar_format='{percentage:3.0f}% |{bar}| {elapsed}, {remaining} left')
-        except ImportError:
-            pass
-    try:
-        yield Progress(bar)
-    finally:
-        if bar is not None:
-            bar.close()
 
 
 if __name__ == '__main__':
