@@ -207,7 +207,8 @@ def _add_replay(commands: Any) -> None:
     group.add_argument('--json', metavar='FILE', help='write the result')
     group.add_argument('--csv', metavar='FILE', help='write a row for every GNSS epoch')
     group.add_argument('--plot', metavar='FILE',
-                       help='draw attitude, sigma, error and trajectory (.png, .pdf, .svg)')
+                       help='draw attitude, sigma, innovations, biases, error and track '
+                            '(.png, .pdf, .svg)')
 
 
 def _add_simulate(commands: Any) -> None:
