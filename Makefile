@@ -60,9 +60,10 @@ docs: $(VENV)/ready
 	@$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs
 	@echo 'Documentation: build/docs/index.html'
 
-#: make bench                  time and memory of the estimator
+#: make bench                  speed of replay, node, estimator and start, as ratios; QUICK=1: with
+#:                             10 minutes of data instead of an hour
 bench: $(VENV)/ready
-	@$(BIN)/ins_align experiment cost --out docs/experiments
+	@$(BIN)/ins_align experiment bench --out docs/experiments $(if $(QUICK),--runs 10)
 
 #: make experiments            renews the figures and tables in docs/experiments; those of real
 #:                             recordings with DATA=folder

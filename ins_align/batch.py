@@ -155,8 +155,8 @@ def process_on_cluster(tasks: Sequence[Task], address: str, progress: Callable[[
     try:
         from distributed import Client
     except ImportError:
-        raise ClusterError("--dask needs Dask, which is not installed: "
-                           "pip install 'ins_align[dask]'") from None
+        raise ClusterError('--dask needs Dask, which is not installed: '
+                           'pip install distributed') from None
     try:
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:

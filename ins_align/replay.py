@@ -25,13 +25,13 @@ import os
 from typing import Any
 
 from ins_align.aligner import Aligner
-from ins_align.results import Attitude, Epoch, Status
 from ins_align.bag_files import BagError, Topic
 from ins_align.bags import Bag, Block, Topics
 from ins_align.config import Config
 from ins_align.declaration import State
 from ins_align.decoding import decode_imu, decode_orientations, deserialize, Orientations
 from ins_align.messages import fix_from_msg, MessageError, velocity_from_msg
+from ins_align.results import Attitude, Epoch, Status
 from ins_align.rotation import (
     Array, exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw)
 import numpy as np

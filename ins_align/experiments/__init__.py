@@ -25,6 +25,8 @@ from pathlib import Path
 # In the order in which `all` runs them.
 NAMES = ('note', 'bound', 'declare', 'cost', 'compare', 'recordings')
 NEED_DATA = ('recordings',)
+# Only by name: they measure the machine too, and need ROS.
+MEASUREMENTS = ('bench',)
 
 
 class ExperimentError(ValueError):
@@ -39,7 +41,7 @@ def run(name: str, out_dir: str | Path, data_dir: str | Path | None = None,
     Parameters
     ----------
     name : str
-        One of `NAMES`, or 'all'.
+        One of `NAMES` or `MEASUREMENTS`, or 'all': those of `NAMES`.
     out_dir : path
         Made if it is not there.
     data_dir : path, optional
@@ -55,8 +57,9 @@ def run(name: str, out_dir: str | Path, data_dir: str | Path | None = None,
         If there is no such experiment or it lacks its input.
 
     """
-    if name not in (*NAMES, 'all'):
-        raise ExperimentError(f'no experiment {name!r}: there are {", ".join(NAMES)}, all')
+    known = (*NAMES, 'all', *MEASUREMENTS)
+    if name not in known:
+        raise ExperimentError(f'no experiment {name!r}: there are {", ".join(known)}')
     if runs is not None and runs < 1 or jobs is not None and jobs < 1:
         raise ExperimentError('runs and jobs must be at least 1')
     if name in NEED_DATA and data_dir is None:

@@ -1,0 +1,48 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The bench: that its pieces run and compare what they say they compare."""
+
+import sys
+
+from ins_align.experiments import bench
+import pytest
+
+pytest.importorskip('pyins')
+
+
+def test_medians_of_processes():
+    short, long = bench.medians([sys.executable, '-c', 'pass'],
+                                [sys.executable, '-c', 'import time; time.sleep(0.5)'])
+    assert long > short + 0.3
+    with pytest.raises(RuntimeError, match='no such thing'):
+        bench.elapsed([sys.executable, '-c',
+                       'import sys; sys.stderr.write("no such thing"); sys.exit(2)'])
+
+
+def test_rows_have_ratios():
+    assert bench.row_of('x', 1.5, 3.0, 's', '1') == ['x', '1.5 s', '3 s', '0.50', '1']
+
+
+def test_filter_runs_on_our_data(monkeypatch):
+    monkeypatch.setattr(bench, 'FILTER_SECONDS', 6.0)
+    name, ours, other, ratio, _ = bench.filter_row()
+    assert 'python-ins' in name
+    assert float(ratio) == pytest.approx(float(ours.split()[0]) / float(other.split()[0]), rel=0.1)
+
+
+def test_bare_pass_counts_the_recording(tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, 'REPEATS', 1)
+    row = bench.replay_against_bare_pass(tmp_path, 'mcap', 1)
+    assert row[0] == 'replay of 1 min, mcap; bare pass'
+    assert all(float(cell.split()[0]) > 0.0 for cell in row[1:4])
