@@ -316,7 +316,7 @@ class Aligner:
         self._imu.used_ns = self._steps_ns
         return ImuSteps(steps, noise), forces
 
-    def _noise(self, stamps: Array, samples: Array, first: Index, last: Index,
+    def _noise(self, stamps: Index, samples: Array, first: Index, last: Index,
                dt: Array) -> Noise:
         """White noise of each step: stated, measured, and what motion can do in a gap."""
         stated = self._stated_noise
@@ -360,8 +360,10 @@ class Aligner:
                                               'needed')
         else:
             if measured:
-                verdict = self._declaration.update(time_s, (initial[1], current[1]), fit,
+                verdict = self._declaration.update(time_s, initial[1], current[1], fit,
                                                    method.unconfirmed)
+                if self._declaration.later_start:
+                    method.renew()
             scale = fit.factor ** 2 if math.isfinite(fit.factor) else 1.0
             self._initial = Attitude(method.t0_ns, initial[0], initial[1] * scale)
             self._current = Attitude(stamp_ns, current[0], current[1] * scale)

@@ -68,7 +68,7 @@ class Antenna:
 
     @property
     def fault(self) -> str:
-        """What is wrong with the velocities, in words; empty when nothing is known to be."""
+        """Fault of the velocities in words; empty when nothing is known to be wrong."""
         return self._check.fault
 
     def epoch(self, message: GnssEpoch) -> Epoch | None:

@@ -59,7 +59,7 @@ def _imu_noise(arw: float, vrw: float, gyro_bias: float, accel_bias: float,
 PRESETS = {
     'navigation': _imu_noise(0.002, 0.003, 0.01 / 3600.0, 50e-6 * STANDARD_GRAVITY),
     'tactical': _imu_noise(0.05, 0.03, 1.0 / 3600.0, 1e-3 * STANDARD_GRAVITY),
-    'mems': _imu_noise(0.3, 0.09, 0.1, 0.05),
+    'mems': _imu_noise(0.3, 0.09, 0.1, 0.05, 0.01),
 }
 
 
@@ -130,8 +130,8 @@ class Config:
         0.0, "accelerometer bias, 1 sigma per axis; 0: the preset's", 'm/s^2',
         minimum=0.0, maximum=10.0)
     gyro_scale_std: float = _parameter(
-        0.0, 'scale factor error of the gyroscopes, 1 sigma per axis, 0.01 is one percent; above '
-        '0 it is estimated too', '1', minimum=0.0, maximum=0.5)
+        0.0, 'scale factor error of the gyroscopes, 1 sigma per axis, 0.01 is one percent; 0: the '
+        "preset's; where that is above 0 it is estimated too", '1', minimum=0.0, maximum=0.5)
     velocity_std: float = _parameter(
         0.2, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none', 'm/s',
         minimum=1e-4, maximum=100.0)

@@ -75,10 +75,11 @@ class Declaration:
         self._heading_since_s: float | None = None
         self.levelled = False
         self.aligned = False
+        self.later_start = False
         self._recent_nis = 1.0
         self._rejected = 0
 
-    def update(self, time_s: float, covariances: tuple[Array, ...], fit: Fit,
+    def update(self, time_s: float, initial: Array, current: Array, fit: Fit,
                unconfirmed: Callable[[], str]) -> Verdict:
         """
         Judge an epoch.
@@ -87,8 +88,9 @@ class Declaration:
         ----------
         time_s : float
             Seconds since the first t0.
-        covariances : tuple of ndarray, shape (3, 3)
-            Of the attitudes that must be good enough, in ENU.
+        initial, current : ndarray, shape (3, 3)
+            Covariances of the attitude at t0 and of the one now, in ENU. Both must be good enough;
+            where only the present one is, `later_start` says that t0 had better move.
         fit : Fit
             How well the data fit the model.
         unconfirmed : callable
@@ -104,16 +106,19 @@ class Declaration:
             self._recent_nis += (min(nis, 10.0) - self._recent_nis) / RECENT
         contradiction = self._contradiction(fit)
         factor = fit.factor
-        tilt = math.degrees(max(_largest_std(P) for P in covariances)) * factor
-        heading = math.degrees(max(math.sqrt(P[2, 2]) for P in covariances)) * factor
+        tilt, tilt_now = (math.degrees(_largest_std(P)) * factor for P in (initial, current))
+        heading, heading_now = (math.degrees(math.sqrt(P[2, 2])) * factor
+                                for P in (initial, current))
+        tilt, heading = max(tilt, tilt_now), max(heading, heading_now)
         rejected = fit.rejected_velocity + fit.rejected_position
         just_rejected, self._rejected = rejected > self._rejected, rejected
         good = (not contradiction and not just_rejected and fit.converged
                 and fit.dof >= MIN_DOF)
-        tilt_good = good and tilt <= self.config.tilt_std_threshold
-        heading_good = tilt_good and heading <= self.config.heading_std_threshold
-        self._level_since_s = _since(self._level_since_s, time_s, tilt_good)
-        self._heading_since_s = _since(self._heading_since_s, time_s, heading_good)
+        max_tilt, max_heading = self.config.tilt_std_threshold, self.config.heading_std_threshold
+        self._level_since_s = _since(self._level_since_s, time_s, good and tilt <= max_tilt)
+        self._heading_since_s = _since(self._heading_since_s, time_s, good
+                                       and tilt_now <= max_tilt and heading_now <= max_heading)
+        self.later_start = False
         if contradiction:
             self.levelled = self.aligned = False
             return Verdict(State.ALIGNING, contradiction)
@@ -121,13 +126,14 @@ class Declaration:
         doubt = ''
         if not self.aligned and self._held(self._heading_since_s, time_s):
             doubt = unconfirmed()
-            self.aligned = not doubt
+            self.aligned = not doubt and tilt <= max_tilt and heading <= max_heading
+            self.later_start = not doubt and not self.aligned
         if self.aligned:
             # What was declared stays declared until the data contradict it or its sigma has
             # clearly grown.
-            self.aligned = heading <= 2 * self.config.heading_std_threshold
+            self.aligned = heading <= 2 * max_heading
         if self.levelled:
-            self.levelled = tilt <= 2 * self.config.tilt_std_threshold
+            self.levelled = tilt <= 2 * max_tilt
         if doubt:
             return Verdict(State.LEVELLED if self.levelled else State.ALIGNING, doubt)
         return self._verdict(tilt, heading, fit)
@@ -135,7 +141,7 @@ class Declaration:
     def _verdict(self, tilt: float, heading: float, fit: Fit) -> Verdict:
         config = self.config
         if self.aligned:
-            return Verdict(State.ALIGNED, f'aligned: heading sigma {heading:.2g} deg, '
+            return Verdict(State.ALIGNED, f'heading sigma {heading:.2g} deg, '
                                           f'tilt sigma {tilt:.2g} deg')
         if fit.dof < MIN_DOF:
             return Verdict(State.ALIGNING, f'{fit.offered} GNSS epochs so far: more are needed')

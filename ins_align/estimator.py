@@ -28,81 +28,20 @@ import math
 from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals
 from ins_align.rotation import Array, cross, exp_so3
+from ins_align.solution import Rows, Solution
 from ins_align.unknowns import (ATTITUDE, BODY_FIXED, DELAY, GYRO, GYRO_BIAS, GYRO_SCALE,
-                                inverse_spd, LEVER_ARM, Prior, prior_of, SIZE, START_POSITION,
-                                START_VELOCITY, UNIFORM_ANGLE_STD, Unknowns)
-from ins_align.whitening import (Chain, chain_noise, HEADING_RESOLVED_STD, Measurements, POSITION,
-                                 sensitivities, VELOCITY, Whitener)
+                                LEVER_ARM, Prior, prior_of, SIZE, START_POSITION, START_VELOCITY,
+                                Unknowns)
+from ins_align.whitening import (Chain, HEADING_RESOLVED_STD, Measurements, POSITION, VELOCITY)
 import numpy as np
 
-# What is always known: an angle lies on the circle, a velocity and a position are on the Earth.
-WEAK_INFORMATION = np.zeros(SIZE)
-WEAK_INFORMATION[ATTITUDE] = UNIFORM_ANGLE_STD ** -2
-WEAK_INFORMATION[START_VELOCITY] = 1e4 ** -2
-WEAK_INFORMATION[START_POSITION] = 1e7 ** -2
-# The motion that the fit attributes to the vehicle has the noise of what was fitted to it, one
-# unit of information for each: horizontal slope (tilt) and curvature (gyro bias) of the velocity.
-FITTED_DIRECTIONS = 4
 # Median of chi-square with three degrees of freedom.
 MEDIAN_CHI2_3 = 2.366
 
 
+# Share of the measured excess noise that counts until the data say that it is more.
+FIRST_EXCESS = 1 / 27
 SensorErrors = tuple[Array, Array, Array]       # gyro bias, accelerometer bias, gyro scale factor
-
-
-@dataclass
-class Solution:
-    """
-    The normal equations at one linearisation point, and what follows from them.
-
-    Attributes
-    ----------
-    point : Unknowns
-    chain : Chain
-        At the last epoch, with the biases of `point`.
-    whitener : Whitener
-    dx : ndarray, shape (n,)
-        Step from the point to the estimate, of the unknowns that are estimated.
-    P : ndarray, shape (n, n)
-        Covariance of the estimate.
-    estimate : Unknowns
-    chi2 : float
-        Sum of squares of the whitened residuals at the estimate, prior included.
-    dof : int
-
-    """
-
-    point: Unknowns
-    information: Array
-    mean_step: Array
-    chain: Chain
-    whitener: Whitener
-    dx: Array
-    P: Array
-    estimate: Unknowns
-    chi2: float = math.nan
-    dof: int = 0
-
-    def step(self) -> Array:
-        """Step from the point to the estimate, of all unknowns, shape (22,)."""
-        dx = np.zeros(SIZE)
-        dx[self.whitener.columns[1:] - 1] = self.dx
-        return dx
-
-    def chain_errors(self) -> Array:
-        """Estimated errors of the chain at the last epoch, as seen at t0, shape (6,) or (9,)."""
-        return self.whitener.X[:, 0] - self.whitener.X[:, 1:] @ self.dx
-
-
-@dataclass
-class Rows:
-    """What a linearisation point makes of stored epochs; K of them."""
-
-    chain: Chain
-    noise: Array            # of the chain over each interval, (K, size, size)
-    Y: Array                # residual and columns of the unknowns, (K, 6, 1 + n)
-    covariance: Array       # of velocity and position, (K, 2, 3, 3)
-    present: list[list[bool]]
 
 
 @dataclass(frozen=True)
@@ -156,8 +95,8 @@ class MapEstimator:
     MAX_ITERATIONS = 8
     # The share of the excess noise is judged when the store has grown by this share, tried at
     # steps of this factor, and moved when the log likelihood gains this much.
-    TUNE_FROM, TUNE_GROWTH, TUNE_STEP, TUNE_GAIN = 12, 0.5, 3.0, 1.0
-    MIN_EXCESS, MAX_EXCESS = 0.01, 9.0
+    TUNE_FROM, TUNE_GROWTH, TUNE_STEP, TUNE_GAIN = 12, 0.5, 9.0, 3.0
+    MAX_EXCESS = 3.0
     MAX_REJECTED = 0.3
     # Ages (s) at which t0 moves on: when no heading is known to within this (rad), though the
     # velocity is (m/s); when neither is; when both are. The first two only once the gyros' biases
@@ -172,7 +111,7 @@ class MapEstimator:
     def __init__(self, prior: Prior, *, use_position: bool = False,
                  estimate_lever_arm: bool = False, estimate_delay: bool = False,
                  estimate_gyro_scale: bool = False, capacity: int = 1000,
-                 excess: float = 1.0) -> None:
+                 excess: float = FIRST_EXCESS) -> None:
         """Start at t0."""
         wanted = np.ones(SIZE, bool)
         wanted[START_POSITION] = use_position
@@ -180,7 +119,6 @@ class MapEstimator:
         wanted[DELAY] = estimate_delay
         wanted[GYRO_SCALE] = estimate_gyro_scale
         self.columns = np.flatnonzero(wanted)
-        self._weak = np.diag(WEAK_INFORMATION[self.columns])
         self.size = 9 if use_position else 6
         self.prior = prior
         self._capacity = capacity
@@ -238,7 +176,8 @@ class MapEstimator:
         self._sensor_errors[places] = self.sensor_errors
         self._gnss.put(places, gnss.take(slice(0, count)))
         s = self.solution
-        rows = None if s is None else self._rows(s, places)
+        rows = None if s is None else s.rows(self._gnss.take(places),
+                                             self._corrected(places, s.point))
         for k in range(count):
             self.count += 1
             if s is None or rows is None:
@@ -254,17 +193,17 @@ class MapEstimator:
         """Take an epoch into the solution; move the linearisation point where that is due."""
         # Far from the linearisation point an innovation says nothing about its measurement.
         gate = (s.dx, s.P) if self._nonlinearity <= self.FAR else None
-        innovations = self._whiten(s, rows, k, gate)
+        innovations = s.add(rows, k, gate, self._gate_scale)
         for nis, _ in innovations:
             if math.isfinite(nis):
                 self._recent.append(nis)
         if len(self._recent) == self.GATE_WINDOW:
             self._gate_scale = max(1.0, float(np.median(self._recent)) / MEDIAN_CHI2_3)
         s.chain = rows.chain.at(k)
-        self._solve(s)
+        s.solve()
         if self.count >= max(self.TUNE_FROM, self._last_tuned * (1 + self.TUNE_GROWTH)):
             self._tune()
-        self._nonlinearity = self.nonlinearity()
+        self._nonlinearity = s.nonlinearity()
         growth = self.GROWTH_FAR if self._nonlinearity > self.FAR else self.GROWTH
         if (self._nonlinearity > self.NONLINEARITY
                 and self.count >= self._last_fit * (1 + growth)):
@@ -302,29 +241,12 @@ class MapEstimator:
         still = start[0] + start[1] < 2 * self.IDLE_VELOCITY_STD ** 2
         return bool(age >= (self.IDLE_TIME if still else self.MAX_IDLE_TIME))
 
-    def _rows(self, s: Solution, epochs: slice) -> Rows:
-        """Linearise stored epochs that follow the chain of a solution."""
-        gnss = self._gnss.take(epochs)
-        interval = self._corrected(epochs, s.point)
-        chain = s.chain.extended(interval)
-        return Rows(chain,
-                    chain_noise(s.point.C, gnss.time, chain, interval, self.size, self.excess),
-                    sensitivities(s.point, chain, gnss, interval)[:, :, s.whitener.columns],
-                    gnss.covariance, gnss.present.tolist())
-
-    def _whiten(self, s: Solution, rows: Rows, k: int,
-                gate: 'tuple[Array, Array] | None') -> list[tuple[float, Array]]:
-        """Take one epoch into the normal equations; return the innovations of what is there."""
-        s.whitener.P += rows.noise[k]
-        return [s.whitener.update(kind, rows.Y[k, block], rows.covariance[k, kind], gate,
-                                  self._gate_scale)
-                for kind, block in enumerate((VELOCITY, POSITION)) if rows.present[k][kind]]
-
     def _run(self, s: Solution, gate: 'tuple[Array, Array] | None') -> None:
         """Take all stored epochs into an empty solution."""
-        rows = self._rows(s, slice(0, self.count))
+        epochs = slice(0, self.count)
+        rows = s.rows(self._gnss.take(epochs), self._corrected(epochs, s.point))
         for k in range(self.count):
-            self._whiten(s, rows, k, gate)
+            s.add(rows, k, gate, self._gate_scale)
         s.chain = rows.chain.at(-1)
 
     def _corrected(self, epochs: slice, point: Unknowns) -> Intervals:
@@ -338,28 +260,9 @@ class MapEstimator:
 
     # Solution
 
-    def _solve(self, s: Solution) -> None:
-        """Solve the normal equations and judge the fit."""
-        prior = s.information @ s.mean_step
-        right = s.whitener.normal[1:, 0] + prior
-        s.P = inverse_spd(s.information + s.whitener.normal[1:, 1:] + self._weak)
-        s.dx = s.P @ right
-        column = s.P[:, 2]
-        feigned = min(s.whitener.spurious + FITTED_DIRECTIONS,
-                      1 / column[2] - 1 / UNIFORM_ANGLE_STD ** 2)
-        s.P += np.outer(column, column) * (feigned / (1 - feigned * column[2]))
-        s.chi2 = float(s.whitener.normal[0, 0] + s.mean_step @ prior - right @ s.dx)
-        s.dof = (s.whitener.rows - self.columns.size
-                 + int(np.count_nonzero(s.information.diagonal())))
-        s.estimate = s.point.moved(s.step())
-
     def _start(self, point: Unknowns) -> Solution:
         """Return an empty solution at a linearisation point."""
-        information, step = self.prior.at(point)
-        n = self.columns.size
-        return Solution(point, information[np.ix_(self.columns, self.columns)],
-                        step[self.columns], Chain.start(), Whitener(self.columns, self.size),
-                        np.zeros(n), np.zeros((n, n)), point)
+        return Solution(point, self.prior, self.columns, self.size, self.excess)
 
     def _converge(self, point: Unknowns, P: 'Array | None') -> Solution:
         """Gauss-Newton over the store from a starting point."""
@@ -370,8 +273,8 @@ class MapEstimator:
                 # Not a few outliers but a wrong picture: look at everything again.
                 s, P = self._start(point), None
                 self._run(s, None)
-            self._solve(s)
-            if self.nonlinearity(s) <= self.NONLINEARITY:
+            s.solve()
+            if s.nonlinearity() <= self.NONLINEARITY:
                 break
             point = s.estimate
         return s
@@ -389,7 +292,7 @@ class MapEstimator:
             starts.append(replace(here, C=self._rough_attitude(here)))
         solutions = [self._converge(start, gate) for start in starts]
         self.solution = min(solutions, key=lambda s: s.chi2)
-        self._nonlinearity = self.nonlinearity()
+        self._nonlinearity = self.solution.nonlinearity()
 
     def _tune(self) -> None:
         """
@@ -402,25 +305,20 @@ class MapEstimator:
         old = self.solution
         if old is None or not np.any(self._intervals.Q_excess[:self.count]):
             return
-        excess, best, gain = self.excess, self._likelihood(old), self.TUNE_GAIN
-        for trial in (excess / self.TUNE_STEP, excess * self.TUNE_STEP):
-            if not self.MIN_EXCESS <= trial <= self.MAX_EXCESS:
+        before = excess = self.excess
+        best, gain = old.log_likelihood, self.TUNE_GAIN
+        for trial in (before / self.TUNE_STEP, before * self.TUNE_STEP):
+            if not 0.99 * FIRST_EXCESS <= trial <= self.MAX_EXCESS:
                 continue
             self.excess = trial
             solution = self._start(old.estimate)
             self._run(solution, None)
-            self._solve(solution)
-            likelihood = self._likelihood(solution)
-            if likelihood > best + gain:
-                excess, best, gain = trial, likelihood, 0.0
+            solution.solve()
+            if solution.log_likelihood > best + gain:
+                excess, best, gain = trial, solution.log_likelihood, 0.0
         self.excess = excess
-        self._fit()
-
-    @staticmethod
-    def _likelihood(s: Solution) -> float:
-        """Log likelihood at the best overall scale of all covariances, but for a constant."""
-        scale = max(s.chi2 / max(s.dof, 1), 1.0)
-        return -0.5 * (s.whitener.log_det + s.dof * math.log(scale) + s.chi2 / scale)
+        if excess != before:
+            self._fit()
 
     def _rough_attitude(self, point: Unknowns) -> Array:
         """Centred q-method over the store, with the biases and lever arm of `point`."""
@@ -445,19 +343,9 @@ class MapEstimator:
             total += float(np.sum(both * both))
         return attitude_from_moments(moments, total)[0]
 
-    def nonlinearity(self, solution: 'Solution | None' = None) -> float:
+    def nonlinearity(self) -> float:
         """Second-order error of the present linearisation, in sigmas of tilt or heading."""
-        s = self.solution if solution is None else solution
-        if s is None:
-            return math.inf
-        time = self.time
-        tilt_e, tilt_n, turn = s.dx[:3].tolist()
-        tilt = (math.hypot(tilt_e, tilt_n)
-                + time * math.hypot(*s.dx[GYRO_BIAS].tolist()))
-        turn = abs(turn)
-        variances = s.P.diagonal()[:3].tolist()
-        return max(tilt * (0.5 * tilt + turn) / math.sqrt(min(variances[:2])),
-                   0.5 * turn * turn / math.sqrt(variances[2]))
+        return math.inf if self.solution is None else self.solution.nonlinearity()
 
     def settle(self) -> None:
         """Move the linearisation point now if that is worth it at all, growth or hardly."""
@@ -474,6 +362,7 @@ class MapEstimator:
         Parameters
         ----------
         prior : Prior
+            Another one.
         intervals : Intervals
             Integrated with sensor errors of zero.
 

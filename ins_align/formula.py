@@ -24,7 +24,8 @@ from dataclasses import dataclass, replace
 from ins_align.earth import (earth_rate_n, gravitation_n, gravity_n, ground_velocity_n,
                              LocalLevel, position_n)
 from ins_align.preintegration import Intervals
-from ins_align.rotation import Array, cross, matrix_from_quaternion, orthonormalized, running_sum, skew
+from ins_align.rotation import (Array, cross, matrix_from_quaternion, orthonormalized,
+                                running_sum, skew)
 import numpy as np
 
 

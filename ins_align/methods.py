@@ -24,7 +24,7 @@ import math
 from typing import Protocol
 
 from ins_align.config import Config
-from ins_align.estimator import Innovation, MapEstimator, NOTHING_NEW
+from ins_align.estimator import FIRST_EXCESS, Innovation, MapEstimator, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
 from ins_align.handover import prior_from_now
 from ins_align.preintegration import Noise, preintegrate, Steps
@@ -145,6 +145,9 @@ class Method(Protocol):
     def settle(self) -> None:
         """Bring the estimate to its best before a decision."""
 
+    def renew(self) -> None:
+        """Move t0 to the last epoch before the next one is taken, where a method can."""
+
     def unconfirmed(self) -> str:
         """Return why the data do not show yet that the sensors' signs are right, or nothing."""
 
@@ -201,8 +204,9 @@ class MapMethod:
         self._start(epoch, prior)
         self._take_start(epoch, imu)
 
-    def _start(self, epoch: Epoch, prior: Prior, excess: float = 1.0) -> None:
+    def _start(self, epoch: Epoch, prior: Prior, excess: float = FIRST_EXCESS) -> None:
         self.t0_ns = epoch.stamp_ns
+        self._renewed = False
         self._track = InertialTrack.start(epoch.latitude, epoch.longitude, epoch.altitude)
         self._estimator = MapEstimator(
             prior, use_position=self._use_position,
@@ -219,16 +223,24 @@ class MapMethod:
         """Take epochs and the IMU steps before each; yield each when the results are its."""
         done, ahead = 0, 1
         while done < len(epochs):
-            if self._estimator.full or self._estimator.stale:
+            if self._due():
                 self._move_start()
             solution = self._estimator.solution
             part = slice(done, done + ahead)
             for epoch in self._take(epochs[part], imu.take(part)):
                 done += 1
                 yield epoch
-                if self._estimator.stale:
+                if self._due():
                     break
             ahead = min(2 * ahead, MAX_AHEAD) if self._estimator.solution is solution else 1
+
+    def _due(self) -> bool:
+        """Whether t0 is to move."""
+        return self._renewed or self._estimator.full or self._estimator.stale
+
+    def renew(self) -> None:
+        """Move t0 to the last epoch before the next one is taken."""
+        self._renewed = self._estimator.solution is not None
 
     def _take(self, epochs: Sequence[Epoch], imu: ImuSteps) -> Iterator[Epoch]:
         """Take epochs as long as the estimator stays where it is."""
@@ -446,6 +458,9 @@ class NoteMethod:
 
     def settle(self) -> None:
         """Nothing to bring: the estimate is closed form."""
+
+    def renew(self) -> None:
+        """Nothing to renew: t0 stays."""
 
     def unconfirmed(self) -> str:
         """Return nothing: there is no test of the signs."""

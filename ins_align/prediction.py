@@ -75,6 +75,7 @@ class Prediction:
         Parameters
         ----------
         stamp_ns : int
+            Of the sample.
         gyro : three floats
             As measured, rad/s.
 

@@ -155,7 +155,7 @@ class Noise:
     accel_excess: ArrayLike = 0.0
 
     def take(self, index: slice) -> 'Noise':
-        """Return the noise in the intervals of `index`, of fields that are all (K, n) or (K, 1)."""
+        """Return the noise in the intervals of `index`; all fields are (K, n) or (K, 1)."""
         return Noise(*(np.asarray(array)[index] for array in vars(self).values()))
 
 
@@ -185,8 +185,8 @@ class Steps:
         return Steps(*(array[index] for array in vars(self).values()))
 
 
-def split_at_epochs(stamps: Array, gyro: Array, accel: Array, epochs: Array,
-                    unit: float = 1.0) -> Steps:
+def split_at_epochs(stamps: 'Array | Index', gyro: Array, accel: Array,
+                    epochs: 'Array | Index', unit: float = 1.0) -> Steps:
     """
     Cut a run of samples into the intervals between epochs.
 
@@ -241,7 +241,7 @@ def _slopes(samples: Array, spacing: Array) -> Array:
     return np.concatenate([rise[:1], inner, rise[-1:]])
 
 
-def white_noise(stamps: Array, samples: Array, first: Index, last: Index,
+def white_noise(stamps: 'Array | Index', samples: Array, first: Index, last: Index,
                 unit: float = 1.0) -> Array:
     """
     White noise density of gyros and accelerometers, measured in K windows of the data.

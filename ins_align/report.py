@@ -114,8 +114,7 @@ def summary(result: ReplayResult) -> str:
     """Return the table that ``ins_align replay`` prints of a recording."""
     status = result.status
     after = '' if status.time_to_align_s is None else f' after {status.time_to_align_s:.1f} s'
-    reason = status.reason.removeprefix('aligned: ')  # the state has just said so
-    lines = [result.bag, f'  {status.state.value}{after}: {reason}']
+    lines = [result.bag, f'  {status.state.value}{after}: {status.reason}']
     attitudes = [('initial', status.initial), ('final', status.current)]
     rows = []
     for name, attitude in attitudes:

@@ -314,5 +314,5 @@ def cumulative_rotations(steps: Array) -> Array:
 
 
 def running_sum(start: Array, steps: Array) -> Array:
-    """Sums ``start + steps[0] + ... + steps[k]`` for every k, to the bit as one by one."""
+    """Return ``start + steps[0] + ... + steps[k]`` for every k, to the bit as one by one."""
     return np.cumsum(np.concatenate([start[None], steps]), axis=0)[1:]

@@ -263,7 +263,7 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
 
     """
     meta = dict(locals())
-    noise = checked_arguments(meta)
+    noise = checked_arguments(meta)._replace(gyro_scale_std=gyro_scale_std)
     if gyro_bias_std is not None:
         noise = noise._replace(gyro_bias_std=gyro_bias_std)
     if accel_bias_std is not None:
@@ -470,13 +470,14 @@ def _parameter_file(simulation: Simulation) -> str:
         'gnss_delay': float(meta['gnss_delay']),
         'velocity_frame': meta['velocity_frame'],
     }
-    if meta['imu_grade'] in PRESETS:
+    preset = PRESETS.get(meta['imu_grade'])
+    if preset is not None:
         values['imu_grade'] = meta['imu_grade']
     else:
         values['imu_grade'] = 'custom'
         values['angle_random_walk'] = math.degrees(noise.angle_random_walk) * 60
         values['velocity_random_walk'] = noise.velocity_random_walk * 60
-    if noise != PRESETS.get(meta['imu_grade']):
+    if preset is None or noise[:4] != preset[:4]:
         values['gyro_bias_std'] = math.degrees(noise.gyro_bias_std)
         values['accel_bias_std'] = float(noise.accel_bias_std)
     return ''.join(['ins_align:\n  ros__parameters:\n',

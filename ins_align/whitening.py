@@ -252,7 +252,7 @@ class Whitener:
 
     Parameters
     ----------
-    columns : ndarray of int
+    columns : ndarray of int, shape (n,)
         Unknowns that are estimated, out of the 22.
     size : int
         9 when positions are used, 6 when velocities alone are.
@@ -262,7 +262,7 @@ class Whitener:
     def __init__(self, columns: Index, size: int) -> None:
         """Start at t0, where the chain has no error."""
         self.columns = np.concatenate([[0], 1 + columns])
-        self.start_columns = np.searchsorted(columns, START[:size]) + 1
+        self._start_columns = 1 + np.searchsorted(columns, START[:size])
         self.P = np.zeros((size, size))
         self.X = np.zeros((size, self.columns.size))
         self.normal = np.zeros((self.columns.size, self.columns.size))
@@ -297,7 +297,7 @@ class Whitener:
             The innovation over its sigma, row by row.
 
         """
-        D = Y[:, self.start_columns]
+        D = Y[:, self._start_columns]
         innovation = Y - D @ self.X
         PD = self.P @ D.T
         own = D @ PD

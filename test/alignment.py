@@ -16,7 +16,7 @@
 from functools import lru_cache
 
 from ins_align.aligner import Aligner
-from ins_align.config import Config
+from ins_align.experiments.common import exact_config_for
 from ins_align.rotation import log_so3, matrix_from_quaternion
 from ins_align.simulation import feed, simulate
 import numpy as np
@@ -32,11 +32,8 @@ def simulated(scenario, **options):
 
 def config_for(simulation, **changes):
     """Return a configuration that states the truth about a simulation, lever arm and all."""
-    settings = {'imu_grade': simulation.meta['imu_grade'],
-                'lever_arm': tuple(simulation.lever_arm.tolist()),
-                'gnss_delay': float(simulation.meta['gnss_delay']),
-                'lever_arm_std': 0.0, 'gnss_delay_std': 0.0}
-    return Config(**{**settings, **changes})
+    settings = {'gnss_delay': float(simulation.meta['gnss_delay']), 'gnss_lateness': 1.0}
+    return exact_config_for(simulation, **{**settings, **changes})
 
 
 def aligned(simulation, *, fix=True, velocity=True, **changes):

@@ -69,7 +69,7 @@ def test_file_is_written_whole_or_not_at_all(tmp_path):
 def test_summary_says_what_matters(result):
     text = summary(result)
     assert f'ALIGNED after {result.status.time_to_align_s:.1f} s: heading sigma ' in text
-    assert result.status.reason.removeprefix('aligned: ') in text
+    assert result.status.reason in text
     assert f'{result.status.initial.yaw_deg:.3f}' in text
     assert 'error roll' in text
     assert 'imu 3001' in text

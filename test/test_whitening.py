@@ -76,7 +76,7 @@ def test_sensitivities_are_the_derivatives_of_the_residual(column, delay):
 
 @pytest.mark.parametrize('row', range(9))
 def test_noise_of_an_interval_looks_like_an_error_of_the_start(row):
-    """An error at the end of interval 1, seen at t0, acts on the later epochs as one of the start."""
+    """An error of interval 1, as seen at t0, acts on the later epochs as one of the start."""
     x, intervals, gnss = some_unknowns(), some_intervals(), some_measurements()
     x = replace(x, delay=0.0)
     corrected = intervals.corrected(x.gyro_bias, x.accel_bias, x.gyro_scale)

@@ -30,7 +30,7 @@ from ins_align.config import Config
 from ins_align.declaration import State
 from ins_align.report import format_table
 from ins_align.rotation import Array, log_so3
-from ins_align.simulation import Simulation
+from ins_align.simulation import FEED_BLOCK, Simulation
 import numpy as np
 
 # Of simulated data nothing comes late, but an unknown delay wants IMU samples beyond the stamp.
@@ -91,15 +91,16 @@ def _counted(results: Iterable[Any], total: int, name: str) -> Iterator[Any]:
 
 def epochs_of(aligner: Aligner, simulation: Simulation, *, fix: bool = True,
               velocity: bool = True) -> Iterator[Epoch]:
-    """Feed a simulation in the order of arrival and yield the epochs as they come."""
-    for kind, payload in simulation.messages():
+    """Feed a simulation in the order of arrival and yield the epochs as they come, in blocks."""
+    for count, (kind, payload) in enumerate(simulation.messages()):
         if kind == 'imu':
             aligner.add_imu(*payload)
-            yield from aligner.update()
         elif kind == 'fix' and fix:
             aligner.add_fix(payload)
         elif kind == 'velocity' and velocity:
             aligner.add_velocity(payload)
+        if count % FEED_BLOCK == 0:
+            yield from aligner.update()
     yield from aligner.flush()
 
 
@@ -113,13 +114,14 @@ def config_for(simulation: Simulation, **changes: Any) -> Config:
 
 
 def exact_config_for(simulation: Simulation, **changes: Any) -> Config:
-    """Return the very model of a simulation: lever arm, delay and scale factors are known."""
+    """Return the very model of a simulation; lever arm and delay are known."""
     noise = simulation.imu_noise
     values: dict[str, Any] = {
         'imu_grade': 'custom', 'angle_random_walk': 60 * math.degrees(noise.angle_random_walk),
         'velocity_random_walk': 60 * noise.velocity_random_walk,
         'gyro_bias_std': math.degrees(noise.gyro_bias_std),
-        'accel_bias_std': noise.accel_bias_std, 'lever_arm_std': 0.0, 'gnss_delay_std': 0.0}
+        'accel_bias_std': noise.accel_bias_std, 'gyro_scale_std': noise.gyro_scale_std,
+        'lever_arm_std': 0.0, 'gnss_delay_std': 0.0}
     values.update(changes)
     return config_for(simulation, **values)
 
