@@ -27,7 +27,8 @@ from ins_align.bag_files import BagError, MAX_MESSAGE_BYTES, Records, ros2_type,
 MAGIC = b'SQLite format 3\x00'
 BLOCK = 4096  # rows read at a time
 # Python decodes sqlite's messages, which quote what is damaged, as UTF-8.
-_ERRORS = (sqlite3.Error, UnicodeDecodeError)
+# What it has no memory for is a size that a damaged row claims.
+_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 
 class SqliteFile:

@@ -23,7 +23,7 @@ import struct
 import subprocess
 import sys
 
-from hypothesis import given, HealthCheck, settings, strategies as st
+from hypothesis import example, given, HealthCheck, settings, strategies as st
 from ins_align.bag_files import BagError, Topic
 from ins_align.bags import Bag
 from ins_align.config import Config, config_from_mapping, ConfigError, load_params
@@ -80,6 +80,7 @@ def recordings(tmp_path_factory):
 
 
 @FUZZ
+@example(suffix='.db3', damage=([(0.3633378835943648, b'\xff\xff\xff\xff^')], 1.0))
 @given(suffix=st.sampled_from(['.mcap', '.db3', '.bag']), damage=DAMAGE)
 def test_damaged_recordings(recordings, tmp_path_factory, suffix, damage):
     path = tmp_path_factory.getbasetemp() / f'fuzzed{suffix}'
