@@ -194,11 +194,11 @@ class MapEstimator:
         # Far from the linearisation point an innovation says nothing about its measurement.
         gate = (s.dx, s.P) if self._nonlinearity <= self.FAR else None
         innovations = s.add(rows, k, gate, self._gate_scale)
-        for nis, _ in innovations:
-            if math.isfinite(nis):
-                self._recent.append(nis)
+        tested = [nis for nis, _ in innovations if math.isfinite(nis)]
+        self._recent.extend(tested)
         if len(self._recent) == self.GATE_WINDOW:
-            self._gate_scale = max(1.0, float(np.median(self._recent)) / MEDIAN_CHI2_3)
+            median = sorted(self._recent)[self.GATE_WINDOW // 2]
+            self._gate_scale = max(1.0, median / MEDIAN_CHI2_3)
         s.chain = rows.chain.at(k)
         s.solve()
         if self.count >= max(self.TUNE_FROM, self._last_tuned * (1 + self.TUNE_GROWTH)):
@@ -208,7 +208,6 @@ class MapEstimator:
         if (self._nonlinearity > self.NONLINEARITY
                 and self.count >= self._last_fit * (1 + growth)):
             self._fit()
-        tested = [nis for nis, _ in innovations if math.isfinite(nis)]
         if not tested:
             return NOTHING_NEW
         return Innovation(sum(tested) / (3 * len(tested)), innovations[0][1])

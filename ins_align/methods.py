@@ -197,6 +197,7 @@ class MapMethod:
                                 np.array(config.lever_arm), config.lever_arm_std,
                                 0.0, config.gnss_delay_std, noise.gyro_scale_std)
         self._signs = SignCheck()
+        self._ahead = 1
         self._offered = 0
         self._rejected = [0, 0]
         self._past = 0.0, 0
@@ -221,18 +222,19 @@ class MapMethod:
 
     def advance(self, epochs: Sequence[Epoch], imu: ImuSteps) -> Iterator[Epoch]:
         """Take epochs and the IMU steps before each; yield each when the results are its."""
-        done, ahead = 0, 1
+        done = 0
         while done < len(epochs):
             if self._due():
                 self._move_start()
             solution = self._estimator.solution
-            part = slice(done, done + ahead)
+            part = slice(done, done + self._ahead)
             for epoch in self._take(epochs[part], imu.take(part)):
                 done += 1
                 yield epoch
                 if self._due():
                     break
-            ahead = min(2 * ahead, MAX_AHEAD) if self._estimator.solution is solution else 1
+            stayed = self._estimator.solution is solution
+            self._ahead = min(2 * self._ahead, MAX_AHEAD) if stayed else 1
 
     def _due(self) -> bool:
         """Whether t0 is to move."""
