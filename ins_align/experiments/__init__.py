@@ -26,7 +26,7 @@ from pathlib import Path
 NAMES = ('note', 'bound', 'declare', 'cost', 'compare', 'recordings')
 NEED_DATA = ('recordings',)
 # Only by name: they measure the machine too, and need ROS.
-MEASUREMENTS = ('bench',)
+MEASUREMENTS = ('bench', 'soak')
 
 
 class ExperimentError(ValueError):
