@@ -29,6 +29,10 @@ ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _BODY_FRAME = re.compile(r'(?:^|[_\-/.])(?:base|body|chassis|footprint|imu|ins|vehicle)\d*'
                          r'(?:$|[_\-/.])', re.IGNORECASE)
 
+# Variances that a receiver can mean (m^2 or m^2/s^2): below a micrometre there is nothing, and
+# what is far above the size of the Earth says nothing; both would overflow on the way.
+MIN_VARIANCE, MAX_VARIANCE = 1e-12, 1e16
+
 
 class MessageError(ValueError):
     """A message that cannot be used; the text says why."""
@@ -91,8 +95,8 @@ def velocity_from_msg(msg: Any, config: Config) -> Velocity:
     """
     Convert the velocity message that ``config.velocity_type`` names.
 
-    A variance that is 0, negative (-1 marks "unknown") or not finite takes the configured value;
-    where all three are like that, the covariance is None.
+    A variance that is 0 (or less than that of any sensor), negative (-1 marks "unknown") or not
+    finite takes the configured value; where all three are like that, the covariance is None.
 
     Raises
     ------
@@ -138,14 +142,14 @@ def _usable_covariance(covariance: np.ndarray,
 
     """
     variances = covariance.diagonal().tolist()
-    known = [0.0 < variance < math.inf for variance in variances]
+    known = [MIN_VARIANCE <= variance < math.inf for variance in variances]
     if not any(known) or (default_std is None and not all(known)):
         return None
     if default_std is not None and not all(known):
-        return np.diag([variance if given else std ** 2 for variance, given, std
+        return np.diag([min(variance, MAX_VARIANCE) if given else std ** 2 for variance, given, std
                         in zip(variances, known, default_std)])
-    diagonal = np.diag(variances)
-    if np.array_equal(covariance, diagonal):
+    diagonal = np.diag(np.minimum(variances, MAX_VARIANCE))
+    if max(variances) > MAX_VARIANCE or np.array_equal(covariance, diagonal):
         return diagonal
     symmetric = 0.5 * covariance + 0.5 * covariance.T
     # Correlations without sense must not turn into a negative variance in some direction.
