@@ -34,6 +34,8 @@ HEADING_RESOLVED_STD = 0.35
 # Chi-square gate of three rows of innovation: one in 60 000 of good ones fails.
 GATE = 25.0
 VELOCITY, POSITION = slice(0, 3), slice(3, 6)
+# Derivatives are taken for a delay of at most this (s).
+MAX_DELAY = 0.3
 # The unknowns that the errors of the chain look like.
 START = np.r_[ATTITUDE, START_VELOCITY, START_POSITION]
 
@@ -219,8 +221,10 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     Y[:, POSITION, 0] = (gnss.s[:, POSITION] - point.start_position
                          - gnss.time[:, None] * point.start_velocity - Ca_p
                          + delay * (ground_velocity - 0.5 * delay * acceleration))
-    # The measurement saw the chain as it was before the delay.
+    # The measurement saw the chain as it was before the delay. An absurd one, on the way to the
+    # solution, would lead the derivatives astray.
     H = Y[:, :, 1:]
+    delay = min(max(delay, -MAX_DELAY), MAX_DELAY)
     seen_v = Ca_v - delay * force
     seen_p = Ca_p - delay * (Ca_v - 0.5 * delay * force)
     lever_v_skew, lever_p_skew = skew(lever_v), skew(lever_p)
