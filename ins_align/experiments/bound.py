@@ -37,6 +37,8 @@ TIMES = (3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 30.0, 50.0, 70.0, 100.0)
 TABLE_TIMES = (10.0, 20.0, 50.0, 100.0)
 LARGE_GYRO_BIAS = np.radians(0.5)
 LEVER_STD, DELAY, DELAY_STD = 1.0, 0.12, 0.1
+UNKNOWN_STD: dict[str, dict[str, float]] = {
+    '': {}, 'lever arm': {'lever_arm_std': LEVER_STD}, 'delay': {'delay_std': DELAY_STD}}
 POSITIONS = {'RTK 2 cm, 5 Hz': ({'position_std': 0.02}, 0.5),
              'position 1 m white, 1 Hz': ({'position_std': 1.0, 'gnss_rate': 1.0}, 0.25)}
 # Targets.
@@ -105,6 +107,7 @@ def write(report: Report, runs: int, results: list[Numbers]) -> None:
     reached_text(report, results)
     main_table(report, results)
     unknown_table(report, results)
+    price_table(report, results)
     moved = [f"{result['title']}, {result['scenario']}, {result['grade']}: "
              f"{result['runs_with_moved_t0']}" for result in results
              if result['runs_with_moved_t0']]
@@ -125,18 +128,21 @@ def simulation_of(case: Case, seed: int) -> Simulation:
                     **arguments)
 
 
-def bounds_of(case: Case) -> tuple[Array, Array]:
+def bounds_of(case: Case) -> tuple[Array, Array, Array, Array]:
     """
     Bound of tilt (both axes) and heading at all times, degrees.
 
-    Of the unknowns of the case, lever arm and delay count as known.
+    First with lever arm and delay known, then with what is unknown in the case.
     """
     simulation = simulate(case.scenario, imu_grade=case.grade, duration=TIMES[-1] + 0.5,
                           **case.simulate)
-    bound = dense.bound(simulation, use_velocity=not case.position_only,
-                        use_position=case.position_only)
-    P = np.array([np.diag(bound.at(time)) for time in TIMES])
-    return np.degrees(np.sqrt(P[:, 0] + P[:, 1])), np.degrees(np.sqrt(P[:, 2]))
+    result = []
+    for nuisance in ({}, UNKNOWN_STD[case.unknown]):
+        bound = dense.bound(simulation, use_velocity=not case.position_only,
+                            use_position=case.position_only, **nuisance)
+        P = np.array([np.diag(bound.at(time)) for time in TIMES])
+        result += [np.degrees(np.sqrt(P[:, 0] + P[:, 1])), np.degrees(np.sqrt(P[:, 2]))]
+    return result[0], result[1], result[2], result[3]
 
 
 def crossing_time(task: tuple[str, str, float, float, dict[str, float]]) -> float | None:
@@ -188,7 +194,7 @@ def run_case(task: tuple[Case, int]) -> Numbers:
             'moved': status.counts.get('rebases', 0)}
 
 
-def summary(case: Case, bound: tuple[Array, Array], runs: list[Numbers]) -> Numbers:
+def summary(case: Case, bound: tuple[Array, Array, Array, Array], runs: list[Numbers]) -> Numbers:
     """Return the statistics of a case's runs over time."""
     error = np.array([each['error'] for each in runs])
     tilt = rms(np.hypot(error[..., 0], error[..., 1]), axis=0)
@@ -199,6 +205,7 @@ def summary(case: Case, bound: tuple[Array, Array], runs: list[Numbers]) -> Numb
               'tilt_deg': tilt, 'tilt_bound_deg': bound[0],
               'tilt_ratio': tilt / bound[0], 'heading_deg': heading,
               'heading_bound_deg': bound[1], 'heading_ratio': heading / bound[1], 'nees': nees,
+              'tilt_price': bound[2] / bound[0], 'heading_price': bound[3] / bound[1],
               'runs_with_moved_t0': sum(each['moved'] > 0 for each in runs)}
     if case.unknown:
         errors, stds = (np.array([each['nuisance'][place] for each in runs]) for place in (0, 1))
@@ -261,6 +268,24 @@ def unknown_table(report: Report, results: list[Numbers]) -> None:
         f'{DELAY_STD:g} s) as unknowns on `flight`, after {TIMES[-1]:g} s; above, the bound is '
         'that of the known case', ['case', 'IMU', 'rms error (m or s)', 'stated sigma',
                                    'rms of error/sigma'], rows)
+
+
+def price_table(report: Report, results: list[Numbers]) -> None:
+    """Print what not knowing lever arm or delay costs by the bound itself."""
+    rows = []
+    for result in results:
+        for time in TABLE_TIMES if result['unknown'] else ():
+            k = TIMES.index(time)
+            row = [result['title'], result['grade'], f'{time:g}']
+            for angle in ('tilt', 'heading'):
+                price = result[f'{angle}_price'][k]
+                row += [f'{price:.2f}', f"{result[f'{angle}_ratio'][k] / price:.2f}"]
+            rows.append(row)
+    report.table(
+        'What not knowing costs whoever estimates: the Cramer-Rao bound with the lever arm or the '
+        'delay unknown over the one with it known, and errors over the bound that knows no more '
+        'than the aligner', ['case', 'IMU', 't, s', 'tilt: bound', 'error', 'heading: bound',
+                             'error'], rows)
 
 
 def figure(results: list[Numbers]) -> Any:
