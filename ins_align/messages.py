@@ -29,9 +29,10 @@ ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _BODY_FRAME = re.compile(r'(?:^|[_\-/.])(?:base|body|chassis|footprint|imu|ins|vehicle)\d*'
                          r'(?:$|[_\-/.])', re.IGNORECASE)
 
-# Variances that a receiver can mean (m^2 or m^2/s^2): below a micrometre there is nothing, and
-# what is far above the size of the Earth says nothing; both would overflow on the way.
-MIN_VARIANCE, MAX_VARIANCE = 1e-12, 1e16
+# Variances (m^2 or m^2/s^2): below a micrometre a receiver means nothing. What it does mean is
+# brought between a tenth of a millimetre and a kilometre, or matrices of it have no inverse.
+SMALLEST_VARIANCE = 1e-12
+MIN_VARIANCE, MAX_VARIANCE = 1e-8, 1e6
 
 
 class MessageError(ValueError):
@@ -142,14 +143,15 @@ def _usable_covariance(covariance: np.ndarray,
 
     """
     variances = covariance.diagonal().tolist()
-    known = [MIN_VARIANCE <= variance < math.inf for variance in variances]
+    known = [SMALLEST_VARIANCE <= variance < math.inf for variance in variances]
     if not any(known) or (default_std is None and not all(known)):
         return None
     if default_std is not None and not all(known):
-        return np.diag([min(variance, MAX_VARIANCE) if given else std ** 2 for variance, given, std
+        return np.diag([_bounded(variance) if given else std ** 2 for variance, given, std
                         in zip(variances, known, default_std)])
-    diagonal = np.diag(np.minimum(variances, MAX_VARIANCE))
-    if max(variances) > MAX_VARIANCE or np.array_equal(covariance, diagonal):
+    bounded = list(map(_bounded, variances))
+    diagonal = np.diag(bounded)
+    if bounded != variances or np.array_equal(covariance, diagonal):
         return diagonal
     symmetric = 0.5 * covariance + 0.5 * covariance.T
     # Correlations without sense must not turn into a negative variance in some direction.
@@ -158,3 +160,7 @@ def _usable_covariance(covariance: np.ndarray,
         if np.linalg.eigvalsh(symmetric * scale * scale[:, None])[0] > 1e-9:
             return symmetric
     return diagonal
+
+
+def _bounded(variance: float) -> float:
+    return min(max(variance, MIN_VARIANCE), MAX_VARIANCE)

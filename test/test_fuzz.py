@@ -83,6 +83,7 @@ def recordings(tmp_path_factory):
 @example(suffix='.db3', damage=([(0.3633378835943648, b'\xff\xff\xff\xff^')], 1.0))
 @example(suffix='.mcap', damage=([(0.059434364845308625, bytes(7))], 1.0))
 @example(suffix='.mcap', damage=([(0.09765625, b'\0'), (0.059434364845308625, bytes(7))], 1.0))
+@example(suffix='.db3', damage=([(0.7889469472312373, b'\0C')], 1.0))
 @given(suffix=st.sampled_from(['.mcap', '.db3', '.bag']), damage=DAMAGE)
 def test_damaged_recordings(recordings, tmp_path_factory, suffix, damage):
     path = tmp_path_factory.getbasetemp() / f'fuzzed{suffix}'

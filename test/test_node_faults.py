@@ -183,6 +183,7 @@ def test_frame_of_the_imu_changes(tmp_path):
         if topic == IMU and time_ns >= half:
             msg.header.frame_id = 'imu_of_the_other_make'
     with Listener() as listener, running_node(PARAMETERS) as node:
+        listener.wait_for(lambda: listener.statuses)  # the two have found each other
         play(script_of(messages), tmp_path, RATE)
         wait_until_taken(listener, messages)
     assert listener.count('imu_frame_changed') == listener.count('resets') == 1
