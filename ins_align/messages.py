@@ -23,6 +23,8 @@ from ins_align.config import Config
 import numpy as np
 
 ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+# The same without products, in which one component that is not finite would spoil the others.
+NED_ORDER, NED_SIGNS = [1, 0, 2], np.array([1.0, 1.0, -1.0])
 
 # Names of the customary body frames (REP-105 and what drivers call the rest), as a whole word of
 # the frame_id. A GNSS driver puts "gps", "gnss", "antenna" or a world frame instead.
@@ -120,10 +122,10 @@ def velocity_from_msg(msg: Any, config: Config) -> Velocity:
             'world frame, east-north-up or north-east-down')
     velocity = np.array([linear.x, linear.y, linear.z], dtype=float)
     if config.velocity_frame == 'ned':
-        velocity = ENU_FROM_NED @ velocity
+        velocity = velocity[NED_ORDER] * NED_SIGNS
     if covariance is not None:
         if config.velocity_frame == 'ned':
-            covariance = ENU_FROM_NED @ covariance @ ENU_FROM_NED.T
+            covariance = covariance[NED_ORDER][:, NED_ORDER] * np.outer(NED_SIGNS, NED_SIGNS)
         covariance = _usable_covariance(
             covariance, (config.velocity_std, config.velocity_std, config.velocity_std_vertical))
     return Velocity(stamp_from_msg(msg), velocity, covariance)

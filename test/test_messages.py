@@ -101,6 +101,16 @@ def test_velocity_ned_turns_with_its_covariance():
         result.covariance, [[0.09, 0.01, -0.03], [0.01, 0.04, -0.02], [-0.03, -0.02, 0.25]])
 
 
+@pytest.mark.filterwarnings('error')
+def test_what_is_not_finite_in_ned_spoils_nothing_else():
+    block = np.diag([0.04, 0.09, np.inf])
+    config = Config(velocity_frame='ned')
+    result = velocity_from_msg(twist_with_covariance((1.0, np.inf, np.nan), block), config)
+    np.testing.assert_array_equal(result.velocity, [np.inf, 1.0, np.nan])
+    np.testing.assert_allclose(result.covariance,
+                               np.diag([0.09, 0.04, config.velocity_std_vertical ** 2]))
+
+
 @pytest.mark.parametrize('block', [
     np.zeros((3, 3)), np.diag([-1.0, 0.0, 0.0]), np.full((3, 3), np.nan), -np.eye(3)])
 def test_velocity_covariance_unknown(block):
