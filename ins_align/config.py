@@ -133,10 +133,10 @@ class Config:
         0.0, 'scale factor error of the gyroscopes, 1 sigma per axis, 0.01 is one percent; 0: the '
         "preset's; where that is above 0 it is estimated too", '1', minimum=0.0, maximum=0.5)
     velocity_std: float = _parameter(
-        0.2, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none', 'm/s',
+        0.3, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none', 'm/s',
         minimum=1e-4, maximum=100.0)
     velocity_std_vertical: float = _parameter(
-        0.4, 'vertical GNSS velocity, 1 sigma, where messages carry none', 'm/s',
+        0.6, 'vertical GNSS velocity, 1 sigma, where messages carry none', 'm/s',
         minimum=1e-4, maximum=100.0)
     position_std: float = _parameter(
         2.5, 'horizontal GNSS position, 1 sigma per axis, where messages carry none', 'm',
