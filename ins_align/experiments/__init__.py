@@ -23,7 +23,7 @@ import importlib
 from pathlib import Path
 
 # In the order in which `all` runs them.
-NAMES = ('note', 'bound', 'declare', 'cost', 'compare', 'recordings')
+NAMES = ('note', 'bound', 'declare', 'faults', 'cost', 'compare', 'recordings')
 NEED_DATA = ('recordings',)
 # Only by name: they measure the machine too, and need ROS.
 MEASUREMENTS = ('bench', 'soak')

@@ -1,0 +1,135 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The fault campaign: a run of every fault, and that it sees what it looks for."""
+
+import json
+
+from ins_align import experiments
+from ins_align.aligner import Aligner
+from ins_align.experiments import faults, spoilt
+from ins_align.simulation import simulate
+import numpy as np
+import pytest
+
+pytest.importorskip('pyins')
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Runs of seconds."""
+    monkeypatch.setattr(faults, 'DURATION', 16.0)
+
+
+def task_of(fault, scenario='flight', grade='navigation'):
+    return next(task for task in map(faults.trial, range(3000))
+                if (task['fault'], task['scenario']) == (fault, scenario)
+                and task['simulate']['imu_grade'] == grade)
+
+
+def test_trials_are_repeatable_and_cover_everything():
+    combinations = len(faults.FAULTS) * len(faults.SCENARIOS) * len(faults.GRADES)
+    trials = [faults.trial(index) for index in range(combinations)]
+    assert trials[5] == faults.trial(5)
+    assert combinations <= 1000
+    assert len({(t['fault'], t['scenario'], t['simulate']['imu_grade'])
+                for t in trials}) == combinations
+
+
+ALIGNED = ('none', 'status unknown', 'covariance 0, -1, nan', 'GNSS up to 1 s late', 'IMU twice',
+           'IMU out of order', 'vertical absent, told', 'clock loops', 'updates at random')
+NOT_ALIGNED = 'accelerations in g', 'rates in deg/s', 'GNSS clock far off'
+
+
+@pytest.mark.parametrize('fault', faults.FAULTS)
+def test_nothing_breaks_and_what_can_be_aligned_is(short, fault):
+    result = faults.run_trial(task_of(fault))
+    assert not result['exception']
+    assert not result['non_finite'] and not result['warnings']
+    assert result['miscounted'] == []
+    assert 0 < result['held'] < faults.MAX_HELD
+    if fault in ALIGNED:
+        assert result['final'] is not None
+        assert 0.0 < faults.worst(result) < 5.0
+        assert result['wrong_s'] == 0.0
+    if fault in NOT_ALIGNED:
+        assert result['declared'] == []
+
+
+@pytest.mark.parametrize('fault', ['clock back 1 h', 'clock forward 1 h'])
+def test_truth_follows_the_clock(monkeypatch, fault):
+    monkeypatch.setattr(faults, 'DURATION', 40.0)
+    result = faults.run_trial(task_of(fault))
+    assert len(result['declared']) == 2 and result['final'] is not None
+    assert faults.worst(result) < 5.0
+
+
+def spoil(monkeypatch, name, value):
+    """Let the aligner of a run have a bug."""
+    class Spoilt(Aligner):
+        pass
+    setattr(Spoilt, name, value)
+    monkeypatch.setattr(faults, 'Aligner', Spoilt)
+
+
+def test_an_exception_is_seen(short, monkeypatch):
+    def update(aligner):
+        raise ZeroDivisionError('seen')
+    spoil(monkeypatch, 'update', update)
+    result = faults.run_trial(task_of('none'))
+    assert 'ZeroDivisionError: seen' in result['exception']
+    assert faults.row('x', [result])[:3] == ['x', 1, 1]
+
+
+def test_a_number_that_is_not_finite_is_seen(short, monkeypatch):
+    def attitude_now(aligner):
+        attitude = Aligner.attitude_now(aligner)
+        if attitude is not None:
+            attitude.covariance[2, 2] = np.nan
+        return attitude
+    spoil(monkeypatch, 'attitude_now', attitude_now)
+    assert 'now: not finite' in faults.run_trial(task_of('none'))['non_finite']
+
+
+def test_a_message_that_is_not_counted_is_seen(short, monkeypatch):
+    def add_fix(aligner, fix):
+        if fix.stamp_ns % 3:
+            Aligner.add_fix(aligner, fix)
+    spoil(monkeypatch, 'add_fix', add_fix)
+    result = faults.run_trial(task_of('none'))
+    assert not result['exception']
+    assert any('fix is' in text for text in result['miscounted'])
+
+
+def test_a_wrong_declaration_is_seen(short):
+    task = task_of('none')
+    simulation = simulate(task['scenario'], **task['simulate'])
+    stream = spoilt.stream_of(simulation)
+    aligner = Aligner(faults.config_for(simulation))
+    watch = faults.Watch(aligner, stream)
+    faults.feed(watch, np.random.default_rng(0))
+    assert faults.worst(faults.judged(watch.epochs, stream, simulation)) < 5.0
+    # The truth of a second later is not that of the stamp.
+    stream.shift = (stream.first, stream.last, -1_000_000_000)
+    result = faults.judged(watch.epochs, stream, simulation)
+    assert faults.worst(result) > 5.0
+    assert result['wrong_s'] > 1.0
+
+
+def test_tables(short, tmp_path, capsys):
+    experiments.run('faults', tmp_path, runs=3, jobs=1)
+    text = (tmp_path / 'faults.md').read_text('utf-8')
+    assert '`ins_align experiment faults --out DIR --runs 3`' in text
+    assert 'What broke' not in text
+    assert len(json.loads((tmp_path / 'faults.json').read_text('utf-8'))['trials']) == 3
+    assert 'What became of it' in capsys.readouterr().out
