@@ -33,6 +33,9 @@ MAX_RATE, MAX_ACCELERATION, MAX_SPEED = 200.0, 2000.0, 2000.0
 MAX_AHEAD_NS = 10_000_000_000
 MAX_PENDING = 10_000
 NO_FIX, STATUS_UNKNOWN = -1, -2
+# So many IMU samples in a row that go in order, behind the newest one, through a time that others
+# have gone through before them: not late, but of a clock that was set back.
+SET_BACK_SAMPLES = 8
 
 
 class ImuBuffer:
@@ -61,6 +64,8 @@ class ImuBuffer:
         self.newest_ns: int | None = None
         self.used_ns = -(1 << 62)
         self._suspect_ns: int | None = None
+        # The samples in a row behind the newest one: that one, the first, the last, how many.
+        self._behind: tuple[int | None, int, int, int] = None, 0, 0, 0
         self.jumped_to_ns: int | None = None
 
     def add(self, stamp_ns: int, gyro: Array, accel: Array) -> None:
@@ -74,6 +79,9 @@ class ImuBuffer:
             self.newest_ns = stamp_ns
         elif stamp_ns < newest:
             self._counts['imu_out_of_order'] += 1
+            if self._set_back(stamp_ns):
+                self.jumped_to_ns = stamp_ns
+                return
         self._new_stamps.append(stamp_ns)
         self._new_samples.append((*gyro, *accel))
 
@@ -101,6 +109,20 @@ class ImuBuffer:
             return
         self._suspect_ns = stamp_ns
         self._counts['imu_late'] += 1
+
+    def _set_back(self, stamp_ns: int) -> bool:
+        """Whether samples behind the newest one are of a clock that was set back a little."""
+        newest, first, last, number = self._behind
+        if newest != self.newest_ns or stamp_ns <= last:
+            first, number = stamp_ns, 0
+        self._behind = self.newest_ns, first, stamp_ns, number + 1
+        if (number + 1) % SET_BACK_SAMPLES:
+            return False
+        # Samples that were only late fill a hole; others of their time would stand beside them.
+        # Those with the very stamps of others cannot be told from samples sent twice.
+        self.consolidate()
+        inside = np.searchsorted(self.stamps, stamp_ns) - np.searchsorted(self.stamps, first)
+        return bool(inside > 1.5 * number)
 
     def _flatten(self) -> None:
         """Turn single samples into an array."""

@@ -101,6 +101,28 @@ def test_sample_before_what_is_used_up_is_late():
     assert counts['imu_late'] == 1
 
 
+@pytest.mark.parametrize('step', [100, 300, 900])
+def test_clock_set_back_by_less_than_lateness_is_told(step):
+    buffer, _ = imu_buffer()
+    fill(buffer, np.arange(0, 2000, 10) * MS)
+    for stamp in np.arange(1993 - step, 2500, 10) * MS:
+        buffer.add(stamp, *sample_of(stamp))
+        if buffer.jumped_to_ns is not None:
+            break
+    assert 0 < buffer.jumped_to_ns - (1993 - step) * MS < 100 * MS
+
+
+@pytest.mark.parametrize('hole', [(1500, 1990), (1000, 1200)])
+def test_late_block_that_fills_a_hole_is_no_clock_set_back(hole):
+    stamps = np.arange(0, 2000, 10)
+    late = (stamps >= hole[0]) & (stamps < hole[1])
+    buffer, counts = imu_buffer()
+    fill(buffer, np.concatenate([stamps[~late], stamps[late], stamps[late]]) * MS)
+    assert buffer.jumped_to_ns is None
+    np.testing.assert_array_equal(buffer.stamps, stamps * MS)
+    assert counts['imu_duplicate'] == np.count_nonzero(late)
+
+
 def test_clock_set_back_is_told_from_a_single_late_sample():
     buffer, counts = imu_buffer()
     fill(buffer, [5000 * MS, 10 * MS])
