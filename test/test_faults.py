@@ -27,7 +27,7 @@ pytest.importorskip('pyins')
 
 @pytest.fixture
 def short(monkeypatch):
-    """Runs of seconds."""
+    """Make runs short."""
     monkeypatch.setattr(faults, 'DURATION', 16.0)
 
 

@@ -50,7 +50,8 @@ REFUSED = {'fix': ('no_fix', 'nan', 'late', 'ahead', 'duplicate'),
            'velocity': ('nan', 'late', 'ahead', 'duplicate')}
 HEADER = ('fault', 'runs', 'exceptions', 'non-finite', 'miscounted', 'declared', 'within 3',
           '3 to 5', 'beyond 5', 'worst, sigma', 'aligned beyond 5, s', 'held, MB')
-DRAWN = 'simulate', 'config', 'frame'  # `trial` draws them again from the index
+# `trial` draws the first three again from the index; the counts are only looked at.
+OMITTED = 'simulate', 'config', 'frame', 'counts'
 
 JsonDict = dict[str, Any]
 
@@ -377,7 +378,7 @@ def write(out: Path, trials: list[JsonDict]) -> None:
         f'never held more than {held * 1e-6:.2f} MB (pickled, every {WEIGH_EVERY} updates; '
         f'limit {MAX_HELD * 1e-6:g}); the resident memory of the process that ran them grew to '
         f"{max(t['resident_kb'] for t in trials) / 1024:.0f} MB, after the first tenth of the "
-        f"runs it was {_early_resident(trials) / 1024:.0f} MB.")
+        f'runs it was {_early_resident(trials) / 1024:.0f} MB.')
     report.text(
         f"{numbers['declared']} runs were declared ALIGNED at some time. The error is the "
         'largest, in stated sigmas, of tilt and heading, of the attitude at t0 and the current '
@@ -401,7 +402,7 @@ def write(out: Path, trials: list[JsonDict]) -> None:
     if broken:
         report.table('What broke', ['index', 'fault', 'scenario', 'IMU', 'what'], broken)
     report.write({'runs': len(trials), 'trials': [
-        {key: value for key, value in t.items() if key not in DRAWN} for t in trials]})
+        {key: value for key, value in t.items() if key not in OMITTED} for t in trials]})
 
 
 def _early_resident(trials: list[JsonDict]) -> float:
