@@ -30,7 +30,8 @@ from std_srvs.srv import Trigger
 RATE = 10.0  # times real time
 DURATION = 16.0  # s
 # A tactical IMU aligns within 8 s of this flight. GNSS may be late by as much as in real time.
-PARAMETERS = ['imu_grade:=tactical', 'lever_arm:=[1, 1, 1]', 'gnss_lateness:=5.0', *RELIABLE]
+PARAMETERS = ['imu_grade:=tactical', 'lever_arm:=[1, 1, 1]', 'velocity_std:=0.1',
+              'velocity_std_vertical:=0.1', 'gnss_lateness:=5.0', *RELIABLE]
 TOLERANCE_DEG = 2.0
 
 
