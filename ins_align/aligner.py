@@ -41,7 +41,7 @@ from ins_align.unknowns import Prior
 import numpy as np
 
 # The IMU may be silent for this long; then the attitude is lost and alignment starts over (ns).
-MAX_GAP_NS = 2_000_000_000
+MAX_GAP_NS = 500_000_000
 # A step this many times the usual one holds lost samples; what the motion can do meanwhile
 # (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
 GAP_STEPS = 2.5

@@ -55,6 +55,8 @@ class Antenna:
         self._place_ns = 0
         self._v_n: Array | None = None
         self._jumps = 0
+        self._vertical = config.velocity_vertical == 'measured'
+        self._vertical_seen = False
         self._check = VelocityCheck()
         self._velocity_covariance = np.diag([config.velocity_std ** 2, config.velocity_std ** 2,
                                              config.velocity_std_vertical ** 2])
@@ -85,12 +87,23 @@ class Antenna:
             position_covariance = fix.covariance
         if v_n is not None:
             self._v_n = v_n
+            self._look_for_vertical(v_n)
             if believed:
                 variances = position_covariance.diagonal().tolist()
                 self._check.add(message.stamp_ns * 1e-9, *self._place, v_n,
                                 math.sqrt(max(variances[:2])))
         return Epoch(message.stamp_ns, *self._place, v_n, self._covariance_of(velocity),
                      believed, position_covariance)
+
+    def _look_for_vertical(self, v_n: Array) -> None:
+        """Notice a receiver that moves and never says anything but 0 of the vertical."""
+        east, north, up = v_n.tolist()
+        if up != 0.0:
+            self._vertical_seen = True
+            self._vertical = self._config.velocity_vertical == 'measured'
+        elif not self._vertical_seen and (east != 0.0 or north != 0.0):
+            self._vertical = False
+            self._counts['velocity_no_vertical'] += 1
 
     def _locate(self, stamp_ns: int, fix: Fix | None, v_n: Array | None) -> bool:
         """Bring the place to an epoch; return whether there is a fix that is believed."""
@@ -120,7 +133,7 @@ class Antenna:
         covariance = self._velocity_covariance
         if velocity is not None and velocity.covariance is not None:
             covariance = velocity.covariance
-        if self._config.velocity_vertical == 'absent':
+        if not self._vertical:
             covariance = covariance.copy()
             covariance[2, :2] = covariance[:2, 2] = 0.0
             covariance[2, 2] = _UNKNOWN_VERTICAL_STD ** 2

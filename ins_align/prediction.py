@@ -28,7 +28,7 @@ from ins_align.rotation import Array, matrix_from_quaternion, quaternion_from_ma
 import numpy as np
 
 # An attitude is lost when samples are missing for longer (ns).
-MAX_GAP_NS = 2_000_000_000
+MAX_GAP_NS = 500_000_000
 # So many samples are kept until it is known from which of them on to carry.
 HISTORY = 2000
 _SMALL_ANGLE = 1e-6  # rad: sin(x / 2) / x is 1 / 2 to rounding

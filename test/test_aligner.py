@@ -420,3 +420,28 @@ def test_standing_first_neither_spoils_nor_delays():
         return next(e.t_s for e in epochs if e.state is State.ALIGNED)
 
     assert time_to_align(late) - 40.0 < 1.2 * time_to_align(once)
+
+
+def test_a_receiver_that_never_measures_the_vertical_is_noticed(flight):
+    """One that stands still says 0 as well: nothing is noticed before it moves."""
+    def run(vertical):
+        aligner = Aligner(config_for(flight))
+        for kind, payload in flight.messages():
+            if kind == 'imu':
+                aligner.add_imu(*payload)
+            elif kind == 'fix':
+                aligner.add_fix(payload)
+            else:
+                aligner.add_velocity(payload._replace(velocity=vertical(payload.velocity)))
+        aligner.flush()
+        return aligner
+
+    absent = run(lambda v: v * [1.0, 1.0, 0.0])
+    told = Aligner(config_for(flight, velocity_vertical='absent'))
+    feed(told, flight)
+    assert absent.counts['velocity_no_vertical'] == absent.counts['velocity']
+    assert np.allclose(absent.status().initial.sigma_deg, told.status().initial.sigma_deg,
+                       rtol=0.05)
+    assert normalised_error(absent.status().initial, flight) < chi2.ppf(0.9999, 3)
+    assert run(lambda v: v).counts['velocity_no_vertical'] == 0
+    assert run(lambda v: 0.0 * v).counts['velocity_no_vertical'] == 0
