@@ -28,7 +28,7 @@ MINUTE_NS = 60_000_000_000
 
 @pytest.fixture(scope='module')
 def flight():
-    return simulate('flight', imu_grade='mems', seed=0, duration=85.0)
+    return simulate('flight', imu_grade='mems', seed=0, duration=95.0)
 
 
 def test_flight(flight, tmp_path):
