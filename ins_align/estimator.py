@@ -27,20 +27,20 @@ import math
 
 from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals
-from ins_align.rotation import Array, cross, exp_so3
-from ins_align.solution import Rows, Solution
-from ins_align.unknowns import (ATTITUDE, BODY_FIXED, DELAY, GYRO, GYRO_BIAS, GYRO_SCALE,
-                                LEVER_ARM, Prior, prior_of, SIZE, START_POSITION, START_VELOCITY,
-                                Unknowns)
-from ins_align.whitening import (Chain, HEADING_RESOLVED_STD, Measurements, POSITION, VELOCITY)
+from ins_align.rotation import Array, cross
+from ins_align.solution import Course, Solution
+from ins_align.unknowns import (BODY_FIXED, DELAY, GYRO_BIAS, GYRO_SCALE, LEVER_ARM, Prior,
+                                prior_of, SIZE, START_POSITION, START_VELOCITY, Unknowns)
+from ins_align.whitening import (Chain, GATE, Gate, HEADING_RESOLVED_STD, Measurements, POSITION,
+                                 VELOCITY)
 import numpy as np
 
 # Median of chi-square with three degrees of freedom.
 MEDIAN_CHI2_3 = 2.366
-
-
 # Share of the measured excess noise that counts until the data say that it is more.
 FIRST_EXCESS = 1 / 27
+# Normalised innovation squared and normalised innovation by kind (velocity 0, position 1).
+Tests = dict[int, tuple[float, Array]]
 SensorErrors = tuple[Array, Array, Array]       # gyro bias, accelerometer bias, gyro scale factor
 
 
@@ -129,7 +129,6 @@ class MapEstimator:
         self.count = 0
         self.solution: Solution | None = None
         self._last_fit = self._last_tuned = 0
-        self._nonlinearity = 0.0
         self.excess = excess
         self.gated = True
         self._recent: deque[float] = deque(maxlen=self.GATE_WINDOW)
@@ -176,41 +175,70 @@ class MapEstimator:
         self._sensor_errors[places] = self.sensor_errors
         self._gnss.put(places, gnss.take(slice(0, count)))
         s = self.solution
-        rows = None if s is None else s.rows(self._gnss.take(places),
-                                             self._corrected(places, s.point))
-        for k in range(count):
+        if s is None:
+            yield from self._first(count)
+            return
+        rows = s.rows(self._gnss.take(places), self._corrected(places, s.point))
+        wanted = gnss.present[:count, :s.kinds].copy()
+        done, ahead = 0, count
+        refused: Tests = {}                       # of the next epoch
+        while done < count:
+            part = slice(done, done + ahead)
+            course = s.course(rows.take(part), wanted[part])
+            ahead = min(2 * ahead, count)
+            for k, tests in enumerate(self._tests(s, course)):
+                wild = [kind for kind, (nis, _) in tests.items()
+                        if not nis < GATE * self._gate_scale]
+                if wild:
+                    # Once more from here, without it; where there is one, there may be many.
+                    wanted[done, wild[0]] = False
+                    s.rejected[wild[0]] += 1
+                    refused[wild[0]] = tests[wild[0]]
+                    ahead = 1
+                    break
+                s.take(course, k)
+                self.count += 1
+                done += 1
+                yield self._taken(s, tests | refused)
+                if self.solution is not s:
+                    return
+                refused = {}
+
+    def _first(self, count: int) -> Iterator[Innovation]:
+        """Append epochs until there is a solution."""
+        for _ in range(count):
             self.count += 1
-            if s is None or rows is None:
-                if self.prior.information[0, 0] > 0 or self.count >= self.FIRST_FIT:
-                    self._fit()
-                yield NOTHING_NEW
-            else:
-                yield self._update(s, rows, k)
-            if self.solution is not s:
+            if self.prior.information[0, 0] > 0 or self.count >= self.FIRST_FIT:
+                self._fit()
+            yield NOTHING_NEW
+            if self.solution is not None:
                 return
 
-    def _update(self, s: Solution, rows: Rows, k: int) -> Innovation:
-        """Take an epoch into the solution; move the linearisation point where that is due."""
+    def _tests(self, s: Solution, course: Course) -> Iterator[Tests]:
+        """Yield the tests of each epoch's innovations, where they mean something."""
+        nis, normalised = s.tested(course)
         # Far from the linearisation point an innovation says nothing about its measurement.
-        gate = (s.dx, s.P) if self._nonlinearity <= self.FAR else None
-        innovations = s.add(rows, k, gate, self._gate_scale)
-        tested = [nis for nis, _ in innovations if math.isfinite(nis)]
+        near = np.concatenate([[s.nonlinearity], course.nonlinearity[:-1]]) <= self.FAR
+        look = (course.whitened.used & near[:, None]).tolist()
+        for k, values in enumerate(nis.tolist()):
+            yield {kind: (value, normalised[k, kind]) for kind, value in enumerate(values)
+                   if look[k][kind]}
+
+    def _taken(self, s: Solution, tests: Tests) -> Innovation:
+        """Do what is due after an epoch: tune, move the linearisation point."""
+        tested = [nis for nis, _ in tests.values() if math.isfinite(nis)]
         self._recent.extend(tested)
         if len(self._recent) == self.GATE_WINDOW:
             median = sorted(self._recent)[self.GATE_WINDOW // 2]
             self._gate_scale = max(1.0, median / MEDIAN_CHI2_3)
-        s.chain = rows.chain.at(k)
-        s.solve()
         if self.count >= max(self.TUNE_FROM, self._last_tuned * (1 + self.TUNE_GROWTH)):
             self._tune()
-        self._nonlinearity = s.nonlinearity()
-        growth = self.GROWTH_FAR if self._nonlinearity > self.FAR else self.GROWTH
-        if (self._nonlinearity > self.NONLINEARITY
-                and self.count >= self._last_fit * (1 + growth)):
+        growth = self.GROWTH_FAR if s.nonlinearity > self.FAR else self.GROWTH
+        if s.nonlinearity > self.NONLINEARITY and self.count >= self._last_fit * (1 + growth):
             self._fit()
         if not tested:
             return NOTHING_NEW
-        return Innovation(sum(tested) / (3 * len(tested)), innovations[0][1])
+        return Innovation(sum(tested) / (3 * len(tested)), tests[min(tests)][1])
 
     @property
     def full(self) -> bool:
@@ -240,13 +268,12 @@ class MapEstimator:
         still = start[0] + start[1] < 2 * self.IDLE_VELOCITY_STD ** 2
         return bool(age >= (self.IDLE_TIME if still else self.MAX_IDLE_TIME))
 
-    def _run(self, s: Solution, gate: 'tuple[Array, Array] | None') -> None:
+    def _run(self, s: Solution, gate: Gate | None) -> None:
         """Take all stored epochs into an empty solution."""
         epochs = slice(0, self.count)
-        rows = s.rows(self._gnss.take(epochs), self._corrected(epochs, s.point))
-        for k in range(self.count):
-            s.add(rows, k, gate, self._gate_scale)
-        s.chain = rows.chain.at(-1)
+        gnss = self._gnss.take(epochs)
+        s.run(s.rows(gnss, self._corrected(epochs, s.point)), gnss.present[:, :s.kinds], gate,
+              self._gate_scale)
 
     def _corrected(self, epochs: slice, point: Unknowns) -> Intervals:
         """Return stored intervals as they would be with the sensor errors of a point."""
@@ -267,13 +294,12 @@ class MapEstimator:
         """Gauss-Newton over the store from a starting point."""
         for _ in range(self.MAX_ITERATIONS):
             s = self._start(point)
-            self._run(s, None if P is None else (s.dx, P))
-            if sum(s.whitener.rejected) > self.MAX_REJECTED * self.count:
+            self._run(s, None if P is None else Gate(s.dx, P))
+            if sum(s.rejected) > self.MAX_REJECTED * self.count:
                 # Not a few outliers but a wrong picture: look at everything again.
                 s, P = self._start(point), None
                 self._run(s, None)
-            s.solve()
-            if s.nonlinearity() <= self.NONLINEARITY:
+            if s.nonlinearity <= self.NONLINEARITY:
                 break
             point = s.estimate
         return s
@@ -291,7 +317,6 @@ class MapEstimator:
             starts.append(replace(here, C=self._rough_attitude(here)))
         solutions = [self._converge(start, gate) for start in starts]
         self.solution = min(solutions, key=lambda s: s.chi2)
-        self._nonlinearity = self.solution.nonlinearity()
 
     def _tune(self) -> None:
         """
@@ -312,7 +337,6 @@ class MapEstimator:
             self.excess = trial
             solution = self._start(old.estimate)
             self._run(solution, None)
-            solution.solve()
             if solution.log_likelihood > best + gain:
                 excess, best, gain = trial, solution.log_likelihood, 0.0
         self.excess = excess
@@ -342,13 +366,9 @@ class MapEstimator:
             total += float(np.sum(both * both))
         return attitude_from_moments(moments, total)[0]
 
-    def nonlinearity(self) -> float:
-        """Second-order error of the present linearisation, in sigmas of tilt or heading."""
-        return math.inf if self.solution is None else self.solution.nonlinearity()
-
     def settle(self) -> None:
         """Move the linearisation point now if that is worth it at all, growth or hardly."""
-        if (self._nonlinearity > self.NONLINEARITY
+        if (not self.converged and self.solution is not None
                 and self.count > self._last_fit * (1 + self.GROWTH_FAR)):
             self._fit()
 
@@ -387,6 +407,11 @@ class MapEstimator:
                                        gyro_scale=zero))
 
     # Results
+
+    @property
+    def converged(self) -> bool:
+        """Whether the estimate is close to the linearisation point."""
+        return self.solution is not None and self.solution.nonlinearity <= self.NONLINEARITY
 
     @property
     def time(self) -> float:
@@ -437,13 +462,7 @@ class MapEstimator:
         s = self.solution
         if s is None:
             raise RuntimeError('no solution yet')
-        J = -s.whitener.X[:3, 1:]
-        J[:, ATTITUDE] += np.eye(3)
-        gyro = np.flatnonzero((self.columns >= GYRO.start) & (self.columns < GYRO.stop))
-        J[:, gyro] += (s.estimate.C @ s.chain.R_g)[:, self.columns[gyro] - GYRO.start]
-        turned = exp_so3(s.chain_errors()[:3]) @ s.estimate.C
-        return (turned @ exp_so3(s.chain.R_g @ s.step()[GYRO]) @ s.chain.R,
-                J @ s.P @ J.T + s.whitener.P[:3, :3])
+        return s.C, s.covariance
 
     def prior_without_attitude(self) -> Prior:
         """Return what is known of biases, lever arm and delay as the prior of a fresh start."""

@@ -307,10 +307,10 @@ class MapMethod:
         solution = self._estimator.solution
         if solution is None:
             return Fit(math.nan, 0, NOTHING_NEW, False, 0, 0, self._offered)
-        rejected = solution.whitener.rejected
+        rejected = solution.rejected
         past_chi2, past_dof = self._past
         return Fit(past_chi2 + solution.chi2, past_dof + solution.dof, self._innovation,
-                   self._estimator.nonlinearity() <= self._estimator.NONLINEARITY,
+                   self._estimator.converged,
                    self._rejected[0] + rejected[0], self._rejected[1] + rejected[1],
                    self._offered)
 
@@ -327,7 +327,7 @@ class MapMethod:
         x = self._estimator.estimate()
         std = np.sqrt(self._estimator.variances)
         return Nuisance(x.gyro_bias, std[GYRO_BIAS], x.accel_bias, std[ACCEL_BIAS],
-                        x.lever_b, std[LEVER_ARM], self._config.gnss_delay + x.delay,
+                        x.lever_b, std[LEVER_ARM], float(self._config.gnss_delay + x.delay),
                         float(std[DELAY][0]))
 
     def sensor_errors(self) -> tuple[Array, Array, Array]:

@@ -21,11 +21,11 @@ from dataclasses import dataclass
 import math
 
 from ins_align.preintegration import Intervals
-from ins_align.rotation import Array, Index
-from ins_align.unknowns import (ATTITUDE, GYRO_BIAS, inverse_spd, Prior, SIZE, START_POSITION,
-                                START_VELOCITY, UNIFORM_ANGLE_STD, Unknowns)
-from ins_align.whitening import (Chain, chain_noise, Measurements, POSITION, sensitivities,
-                                 VELOCITY, Whitener)
+from ins_align.rotation import Array, exp_so3, Index
+from ins_align.unknowns import (ATTITUDE, GYRO, GYRO_BIAS, inverse_spd, Prior, SIZE,
+                                START_POSITION, START_VELOCITY, UNIFORM_ANGLE_STD, Unknowns)
+from ins_align.whitening import (Chain, chain_noise, Gate, Measurements, Rows, sensitivities,
+                                 Whitened, Whitener)
 import numpy as np
 
 # What is always known: an angle lies on the circle, a velocity and a position are on the Earth.
@@ -36,19 +36,34 @@ WEAK_INFORMATION[START_POSITION] = 1e7 ** -2
 # The motion that the fit attributes to the vehicle has the noise of what was fitted to it, one
 # unit of information for each: horizontal slope (tilt) and curvature (gyro bias) of the velocity.
 FITTED_DIRECTIONS = 4
-Gate = tuple[Array, Array]               # step to the present estimate, and its covariance
 
 
 @dataclass
-class Rows:
-    """What a linearisation point makes of stored epochs; K of them."""
+class Course:
+    """
+    A solution after each of K epochs.
+
+    Attributes
+    ----------
+    chain : Chain
+    whitened : Whitened
+    time : ndarray, shape (K,)
+    dx, P, estimate, chi2, dof, nonlinearity, C, covariance
+        As in `Solution`, with a leading axis of K.
+
+    """
 
     chain: Chain
-    noise: Array            # of the chain over each interval, (K, size, size)
-    Y: Array                # residual and columns of the unknowns, (K, 6, 1 + n)
-    covariance: Array       # of velocity and position, (K, 2, 3, 3)
-    present: list[list[bool]]
-    time: list[float]
+    whitened: Whitened
+    time: Array
+    dx: Array
+    P: Array
+    estimate: Unknowns
+    chi2: Array
+    dof: Index
+    nonlinearity: Array
+    C: Array
+    covariance: Array
 
 
 class Solution:
@@ -71,6 +86,10 @@ class Solution:
     chain : Chain
         At the last epoch, with the biases of `point`.
     whitener : Whitener
+    rejected : list of int
+        Velocities and positions that were taken for outliers.
+    time : float
+        Of the last epoch, seconds since t0.
     dx : ndarray, shape (n,)
         Step from the point to the estimate, of the unknowns that are estimated.
     P : ndarray, shape (n, n)
@@ -79,6 +98,11 @@ class Solution:
     chi2 : float
         Sum of squares of the whitened residuals at the estimate, prior included.
     dof : int
+    nonlinearity : float
+        Second-order error of the linearisation, in sigmas of tilt or heading.
+    C, covariance : ndarray, shape (3, 3)
+        Attitude at the last epoch with respect to n0, ``C_n0b``, and the covariance of its left
+        error, rad^2.
 
     """
 
@@ -91,46 +115,90 @@ class Solution:
         self.information = information[np.ix_(columns, columns)]
         self._mean_step = step[columns]
         self._weak = np.diag(WEAK_INFORMATION[columns])
+        self._known = int(np.count_nonzero(self.information.diagonal()))
+        self._gyro = np.flatnonzero((columns >= GYRO.start) & (columns < GYRO.stop))
         self.chain = Chain.start()
         self.whitener = Whitener(columns, size)
+        self.rejected = [0, 0]
+        self.time = 0.0
         self.dx = np.zeros(columns.size)
         self.P = np.zeros((columns.size, columns.size))
-        self.chi2 = math.nan
+        self.chi2 = self.nonlinearity = math.nan
         self.dof = 0
-        self.time = 0.0                           # of the last epoch, seconds since t0
+        self.C, self.covariance = point.C, np.zeros((3, 3))
 
     def rows(self, gnss: Measurements, interval: Intervals) -> Rows:
         """Linearise K epochs that follow the chain; their intervals with the point's biases."""
         chain = self.chain.extended(interval)
-        Y = sensitivities(self.point, chain, gnss, interval)
+        Y = sensitivities(self.point, chain, gnss, interval)[:, :, self.whitener.columns]
         noise = chain_noise(self.point.C, gnss.time, chain, interval, self._size, self._excess)
-        return Rows(chain, noise, Y[:, :, self.whitener.columns], gnss.covariance,
-                    gnss.present.tolist(), gnss.time.tolist())
+        kinds = self.kinds
+        return Rows(chain, noise, Y.reshape(Y.shape[0], 2, 3, -1)[:, :kinds],
+                    gnss.covariance[:, :kinds], gnss.time)
 
-    def add(self, rows: Rows, k: int, gate: 'Gate | None',
-            gate_scale: float) -> list[tuple[float, Array]]:
-        """Take one epoch into the normal equations; return the innovations of what is there."""
-        self.time = rows.time[k]
-        self.whitener.P += rows.noise[k]
-        return [self.whitener.update(kind, rows.Y[k, block], rows.covariance[k, kind], gate,
-                                     gate_scale)
-                for kind, block in enumerate((VELOCITY, POSITION)) if rows.present[k][kind]]
+    @property
+    def kinds(self) -> int:
+        """Kinds of measurements: velocities, or velocities and positions."""
+        return 2 if self._size == 9 else 1
 
-    def solve(self) -> None:
-        """Solve the normal equations and judge the fit."""
-        whitener = self.whitener
+    def run(self, rows: Rows, present: np.ndarray, gate: Gate | None, gate_scale: float) -> None:
+        """Take epochs at one go; outliers by one gate for all."""
+        whitened = self.whitener.whitened(rows, present, gate, gate_scale)
+        for kind, count in enumerate(np.count_nonzero(present & ~whitened.used, axis=0).tolist()):
+            self.rejected[kind] += count
+        self.take(self._course(rows, whitened, slice(-1, None)), 0)
+
+    def course(self, rows: Rows, wanted: np.ndarray) -> Course:
+        """Return what the solution would be after each of K epochs if it took what is wanted."""
+        return self._course(rows, self.whitener.whitened(rows, wanted), slice(None))
+
+    def tested(self, course: Course) -> tuple[Array, Array]:
+        """Test the innovations of a course, each against the estimate before it; see `Gate`."""
+        before = Gate(np.concatenate([self.dx[None], course.dx[:-1]])[:, None],
+                      np.concatenate([self.P[None], course.P[:-1]])[:, None])
+        return before.test(course.whitened.innovation, course.whitened.S)
+
+    def take(self, course: Course, k: int) -> None:
+        """Go to where the solution is after one of the epochs."""
+        self.chain = course.chain.at(k)
+        self.whitener.take(course.whitened, k)
+        self.time = float(course.time[k])
+        self.dx, self.P, self.estimate = course.dx[k], course.P[k], course.estimate.at(k)
+        self.chi2, self.dof = float(course.chi2[k]), int(course.dof[k])
+        self.nonlinearity = float(course.nonlinearity[k])
+        self.C, self.covariance = course.C[k], course.covariance[k]
+
+    def _course(self, rows: Rows, whitened: Whitened, index: slice) -> Course:
+        """Solve the normal equations and judge the fit after each epoch of `index`."""
+        whitened = Whitened(*(array[index] for array in vars(whitened).values()))
+        chain, time = rows.chain.at(index), rows.time[index]
+        normal = whitened.normal
         prior = self.information @ self._mean_step
-        right = whitener.normal[1:, 0] + prior
-        self.P = inverse_spd(self.information + whitener.normal[1:, 1:] + self._weak)
-        self.dx = self.P @ right
-        column = self.P[:, 2]
-        feigned = min(whitener.spurious + FITTED_DIRECTIONS,
-                      1 / column[2] - 1 / UNIFORM_ANGLE_STD ** 2)
-        self.P += np.outer(column, column) * (feigned / (1 - feigned * column[2]))
-        self.chi2 = float(whitener.normal[0, 0] + self._mean_step @ prior - right @ self.dx)
-        self.dof = (whitener.rows - self.dx.size
-                    + int(np.count_nonzero(self.information.diagonal())))
-        self.estimate = self.point.moved(self.step())
+        right = normal[:, 1:, 0] + prior
+        P = inverse_spd(self.information + normal[:, 1:, 1:] + self._weak)
+        dx = _turned(P, right)
+        column = P[:, :, 2]
+        feigned = np.minimum(whitened.spurious + FITTED_DIRECTIONS,
+                             1 / column[:, 2] - 1 / UNIFORM_ANGLE_STD ** 2)
+        P += (column[:, :, None] * column[:, None, :]
+              * (feigned / (1 - feigned * column[:, 2]))[:, None, None])
+        step = np.zeros((dx.shape[0], SIZE))
+        step[:, self._columns] = dx
+        estimate = self.point.moved(step)
+        # The attitude now.
+        X = whitened.X
+        J = -X[:, :3, 1:]
+        J[:, :, ATTITUDE] += np.eye(3)
+        J[:, :, self._gyro] += (estimate.C @ chain.R_g)[
+            :, :, self._columns[self._gyro] - GYRO.start]
+        errors = X[:, :3, 0] - _turned(X[:, :3, 1:], dx)
+        C = (exp_so3(errors) @ estimate.C
+             @ exp_so3(_turned(chain.R_g, step[:, GYRO])) @ chain.R)
+        return Course(chain, whitened, time, dx, P, estimate,
+                      normal[:, 0, 0] + self._mean_step @ prior - np.sum(right * dx, axis=1),
+                      whitened.rows - dx.shape[1] + self._known,
+                      _nonlinearity(step, P, time), C,
+                      J @ P @ J.transpose(0, 2, 1) + whitened.P[:, :3, :3])
 
     def step(self) -> Array:
         """Step from the point to the estimate, of all unknowns, shape (22,)."""
@@ -142,18 +210,23 @@ class Solution:
         """Estimated errors of the chain at the last epoch, as seen at t0, shape (6,) or (9,)."""
         return self.whitener.X[:, 0] - self.whitener.X[:, 1:] @ self.dx
 
-    def nonlinearity(self) -> float:
-        """Second-order error of the linearisation, in sigmas of tilt or heading."""
-        tilt_e, tilt_n, turn = self.dx[ATTITUDE].tolist()
-        tilt = (math.hypot(tilt_e, tilt_n)
-                + self.time * math.hypot(*self.dx[GYRO_BIAS].tolist()))
-        turn = abs(turn)
-        variances = self.P.diagonal()[ATTITUDE].tolist()
-        return max(tilt * (0.5 * tilt + turn) / math.sqrt(min(variances[:2])),
-                   0.5 * turn * turn / math.sqrt(variances[2]))
-
     @property
     def log_likelihood(self) -> float:
         """Log likelihood at the best overall scale of all covariances, but for a constant."""
         scale = max(self.chi2 / max(self.dof, 1), 1.0)
         return -0.5 * (self.whitener.log_det + self.dof * math.log(scale) + self.chi2 / scale)
+
+
+def _turned(matrix: Array, vectors: Array) -> Array:
+    """Products of K matrices and K vectors, each on its own."""
+    return (matrix @ vectors[..., None])[..., 0]
+
+
+def _nonlinearity(step: Array, P: Array, time: Array) -> Array:
+    """Second-order error of a step, shape (K, 22), in sigmas of tilt or heading, shape (K,)."""
+    tilt_e, tilt_n, turn = np.abs(step[:, ATTITUDE].T)
+    tilt = np.hypot(tilt_e, tilt_n) + time * np.sqrt(np.sum(step[:, GYRO_BIAS] ** 2, axis=1))
+    variances = np.diagonal(P, axis1=1, axis2=2)
+    return np.maximum(
+        tilt * (0.5 * tilt + turn) / np.sqrt(np.minimum(variances[:, 0], variances[:, 1])),
+        0.5 * turn * turn / np.sqrt(variances[:, 2]))

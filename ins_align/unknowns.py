@@ -45,7 +45,7 @@ class Unknowns:
         Of the IMU at t0 in n0, relative to the antenna's track (c_v, c_p of method.md).
     lever_b : ndarray, shape (3,)
         Metres.
-    delay : float
+    delay : float or, in many at a time, ndarray
         Seconds by which a GNSS measurement is older than its stamp.
 
     """
@@ -57,7 +57,7 @@ class Unknowns:
     start_velocity: Array
     start_position: Array
     lever_b: Array
-    delay: float
+    delay: float | Array
 
     def vector(self) -> Array:
         """All but the attitude, which has three zeros, shape (22,)."""
@@ -66,12 +66,18 @@ class Unknowns:
                                [self.delay]])
 
     def moved(self, dx: Array) -> 'Unknowns':
-        """Return the point moved by `dx`, shape (22,)."""
-        return Unknowns(exp_so3(dx[ATTITUDE]) @ self.C, self.gyro_bias + dx[GYRO_BIAS],
-                        self.gyro_scale + dx[GYRO_SCALE], self.accel_bias + dx[ACCEL_BIAS],
-                        self.start_velocity + dx[START_VELOCITY],
-                        self.start_position + dx[START_POSITION],
-                        self.lever_b + dx[LEVER_ARM], float(self.delay + dx[DELAY.start]))
+        """Return the point moved by `dx`, shape (..., 22)."""
+        turned = exp_so3(dx[..., ATTITUDE]) @ self.C
+        return Unknowns(turned, self.gyro_bias + dx[..., GYRO_BIAS],
+                        self.gyro_scale + dx[..., GYRO_SCALE],
+                        self.accel_bias + dx[..., ACCEL_BIAS],
+                        self.start_velocity + dx[..., START_VELOCITY],
+                        self.start_position + dx[..., START_POSITION],
+                        self.lever_b + dx[..., LEVER_ARM], self.delay + dx[..., DELAY.start])
+
+    def at(self, index: int) -> 'Unknowns':
+        """Return one of many."""
+        return Unknowns(*(array[index] for array in vars(self).values()))
 
     def minus(self, other: 'Unknowns') -> Array:
         """Return the step from `other` to this point, shape (22,)."""
@@ -173,7 +179,16 @@ def prior_of(mean: Unknowns, covariance: Array, unknowns: Index, heading_free: b
 
 
 def inverse_spd(matrix: Array) -> Array:
-    """Inverse of a symmetric positive definite matrix whose rows differ widely in scale."""
-    scale = 1 / np.sqrt(np.diag(matrix))
-    inverse = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
-    return 0.5 * (inverse + inverse.T)
+    """
+    Inverse of a symmetric positive definite matrix whose rows differ widely in scale.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (..., n, n)
+        Each on its own.
+
+    """
+    scale = 1 / np.sqrt(np.diagonal(matrix, axis1=-2, axis2=-1))
+    scale = scale[..., :, None] * scale[..., None, :]
+    inverse = np.linalg.inv(matrix * scale) * scale
+    return 0.5 * (inverse + inverse.swapaxes(-1, -2))

@@ -21,7 +21,6 @@ those unknowns. Measurement rows: velocity first, then position; both in n0.
 """
 
 from dataclasses import dataclass
-import math
 
 from ins_align.preintegration import Intervals
 from ins_align.rotation import Array, cross, cumulative_rotations, Index, running_sum, skew
@@ -103,8 +102,8 @@ class Chain:
         gyro, accel = np.zeros((3, 6)), np.zeros((3, 3))
         return Chain(np.eye(3), np.zeros(3), np.zeros(3), gyro, gyro, accel, gyro, accel)
 
-    def at(self, index: int) -> 'Chain':
-        """Return one epoch of a chain over many."""
+    def at(self, index: int | slice) -> 'Chain':
+        """Return one or some epochs of a chain over many."""
         return Chain(*(array[index] for array in vars(self).values()))
 
     def extended(self, interval: Intervals) -> 'Chain':
@@ -250,6 +249,101 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     return Y
 
 
+@dataclass
+class Rows:
+    """What a linearisation point makes of K stored epochs, of 1 or 2 kinds of measurement."""
+
+    chain: Chain
+    noise: Array            # of the chain over each interval, (K, size, size)
+    Y: Array                # residual and columns of the unknowns, (K, kinds, 3, 1 + n)
+    covariance: Array       # of velocity and position, (K, kinds, 3, 3)
+    time: Array             # seconds since t0, (K,)
+
+    def take(self, index: slice) -> 'Rows':
+        """Return those of some epochs."""
+        return Rows(self.chain.at(index), self.noise[index], self.Y[index],
+                    self.covariance[index], self.time[index])
+
+
+@dataclass
+class Gate:
+    """
+    Present estimates, for the innovations to be tested against: leading axes as these have.
+
+    Attributes
+    ----------
+    dx : ndarray, shape (..., n)
+        Step from the linearisation point.
+    P : ndarray, shape (..., n, n)
+        Its covariance.
+
+    """
+
+    dx: Array
+    P: Array
+
+    def test(self, innovation: Array, S: Array) -> tuple[Array, Array]:
+        """
+        Return normalised innovations squared and, row by row, the innovations over their sigma.
+
+        Parameters
+        ----------
+        innovation : ndarray, shape (..., 3, 1 + n)
+            From `Whitened`.
+        S : ndarray, shape (..., 3, 3)
+            Its covariance for known unknowns.
+
+        Returns
+        -------
+        nis : ndarray, shape (...)
+        normalised : ndarray, shape (..., 3)
+
+        """
+        columns = innovation[..., 1:]
+        residual = innovation[..., 0] - (columns @ self.dx[..., None])[..., 0]
+        spread = columns @ self.P @ columns.swapaxes(-1, -2)
+        # A large error of heading shows along the motion too, not only across.
+        free = np.asarray(self.P[..., 2, 2] > HEADING_RESOLVED_STD ** 2)
+        if free.any():
+            level = spread[..., 0, 0] + spread[..., 1, 1]
+            spread[..., :2, :2] = np.where(free[..., None, None], level[..., None, None]
+                                           * np.eye(2), spread[..., :2, :2])
+        spread += S
+        weighted = np.linalg.solve(spread, residual[..., None])[..., 0]
+        return (np.sum(residual * weighted, axis=-1),
+                residual / np.sqrt(np.diagonal(spread, axis1=-2, axis2=-1)))
+
+
+@dataclass
+class Whitened:
+    """
+    The state of a `Whitener` after each of K epochs, and what it saw.
+
+    Attributes
+    ----------
+    P, X, normal, rows, spurious, log_det : ndarray
+        As in `Whitener`, with a leading axis of K.
+    used : ndarray of bool, shape (K, kinds)
+        Which measurements were taken.
+    innovation : ndarray, shape (K, kinds, 3, 1 + n)
+        Residual and columns, freed of what the errors of the chain are known to be; zero where
+        nothing was taken.
+    S : ndarray, shape (K, kinds, 3, 3)
+        Their covariance; the unit matrix where nothing was taken.
+
+    """
+
+    P: Array
+    X: Array
+    normal: Array
+    rows: Index
+    spurious: Array
+    log_det: Array
+    used: np.ndarray
+    innovation: Array
+    S: Array
+
+
 class Whitener:
     """
     The small Kalman filter over the chain's errors, and the normal equations that it feeds.
@@ -261,6 +355,21 @@ class Whitener:
     size : int
         9 when positions are used, 6 when velocities alone are.
 
+    Attributes
+    ----------
+    P : ndarray, shape (size, size)
+        Covariance of the chain's errors for known unknowns.
+    X : ndarray, shape (size, 1 + n)
+        What they are known to be: a constant and its derivatives to the unknowns.
+    normal : ndarray, shape (1 + n, 1 + n)
+        Sum of the whitened rows' squares and products, the residual's first.
+    rows : int
+        So many.
+    spurious : float
+        Information on the heading that the noise of the IMU feigns.
+    log_det : float
+        Of the covariance of all innovations.
+
     """
 
     def __init__(self, columns: Index, size: int) -> None:
@@ -271,69 +380,77 @@ class Whitener:
         self.X = np.zeros((size, self.columns.size))
         self.normal = np.zeros((self.columns.size, self.columns.size))
         self.rows = 0
-        self.rejected = [0, 0]
         self.spurious = 0.0
         self.log_det = 0.0
 
-    def update(self, kind: int, Y: Array, covariance: Array,
-               gate: 'tuple[Array, Array] | None', gate_scale: float) -> tuple[float, Array]:
+    def take(self, whitened: Whitened, k: int) -> None:
+        """Go to the state after one of the epochs."""
+        self.P, self.X, self.normal = whitened.P[k], whitened.X[k], whitened.normal[k]
+        self.rows = int(whitened.rows[k])
+        self.spurious, self.log_det = float(whitened.spurious[k]), float(whitened.log_det[k])
+
+    def whitened(self, rows: Rows, wanted: np.ndarray, gate: Gate | None = None,
+                 gate_scale: float = 1.0) -> Whitened:
         """
-        Take the three rows of a velocity (kind 0) or position (kind 1).
+        Filter K epochs that follow the present one; the whitener itself stays where it is.
 
         Parameters
         ----------
-        kind : int
-            0 or 1.
-        Y : ndarray, shape (3, 1 + n)
-            From `sensitivities`: the residual and the columns of the n unknowns.
-        covariance : ndarray, shape (3, 3)
-            Of the measurement.
-        gate : (dx, P) or None
-            Step to the present estimate and its covariance; the innovation is tested against it.
+        rows : Rows
+            Of these epochs.
+        wanted : ndarray of bool, shape (K, kinds)
+            The measurements to take.
+        gate : Gate, optional
+            One for all: a measurement that it does not let through is not taken.
         gate_scale : float
             Factor on the gate.
 
-        Returns
-        -------
-        nis : float
-            Normalised innovation squared, nan where it was not tested.
-        normalised : ndarray, shape (3,)
-            The innovation over its sigma, row by row.
-
         """
-        D = Y[:, self._start_columns]
-        innovation = Y - D @ self.X
-        PD = self.P @ D.T
-        own = D @ PD
-        S = own + covariance
-        nis, normalised = math.nan, _UNTESTED
-        if gate is not None:
-            residual = innovation[:, 0] - innovation[:, 1:] @ gate[0]
-            spread = innovation[:, 1:] @ gate[1] @ innovation[:, 1:].T
-            if gate[1][2, 2] > HEADING_RESOLVED_STD ** 2:
-                # A large error of heading shows along the motion too, not only across.
-                spread[:2, :2] = (spread[0, 0] + spread[1, 1]) * np.eye(2)
-            spread += S
-            nis = float(residual @ _inverse3(spread)[0] @ residual)
-            normalised = residual / np.sqrt(spread.diagonal())
-            if not nis < GATE * gate_scale:
-                self.rejected[kind] += 1
-                return nis, normalised
-        inverse, determinant = _inverse3(S)
-        self.normal += innovation.T @ (inverse @ innovation)
-        gain = PD @ inverse
-        self.X += gain @ innovation
-        P = self.P - gain @ PD.T
-        self.P = 0.5 * (P + P.T)                  # or rounding grows in the antisymmetric part
+        Y, covariance = rows.Y, rows.covariance
+        K, kinds = wanted.shape
+        D = Y[..., self._start_columns]
+        D_T = D.swapaxes(-1, -2)
+        used = wanted.copy()
+        P, X = self.P, self.X
+        P_after, X_after = np.empty((K,) + P.shape), np.empty((K,) + X.shape)
+        innovation = np.zeros(Y.shape)
+        own = np.zeros((K, kinds, 3, 3))
+        S_of = np.zeros((K, kinds, 3, 3)) + np.eye(3)
+        inverse_of = np.zeros((K, kinds, 3, 3))
+        determinant_of = np.ones((K, kinds))
+        for k, present in enumerate(wanted.tolist()):
+            P = P + rows.noise[k]
+            for kind in range(kinds):
+                if not present[kind]:
+                    continue
+                d = D[k, kind]
+                PD = P @ D_T[k, kind]
+                seen = d @ PD
+                S = seen + covariance[k, kind]
+                new = Y[k, kind] - d @ X
+                if gate is not None and not gate.test(new, S)[0] < GATE * gate_scale:
+                    used[k, kind] = False
+                    continue
+                inverse, determinant_of[k, kind] = _inverse3(S)
+                gain = PD @ inverse
+                X = X + gain @ new
+                P = P - gain @ PD.T
+                P = 0.5 * (P + P.T)              # or rounding grows in the antisymmetric part
+                innovation[k, kind], S_of[k, kind] = new, S
+                own[k, kind], inverse_of[k, kind] = seen, inverse
+            P_after[k], X_after[k] = P, X
+        squares = innovation.swapaxes(-1, -2) @ (inverse_of @ innovation)
         # The heading's column is made of integrated IMU data, whose own errors look like motion:
         # this is the information that they would feign, in expectation (errors in variables).
-        self.spurious += float(inverse[0] @ own[0] + inverse[1] @ own[1])
-        self.rows += 3
-        self.log_det += math.log(determinant)
-        return nis, normalised
+        feigned = np.sum(inverse_of[..., :2, :] * own[..., :2, :], axis=(-2, -1))
 
+        def total(start: float, steps: Array) -> Array:
+            return running_sum(np.array(start), np.sum(steps, axis=1))
 
-_UNTESTED = np.full(3, math.nan)
+        return Whitened(P_after, X_after, running_sum(self.normal, np.sum(squares, axis=1)),
+                        self.rows + np.cumsum(3 * np.count_nonzero(used, axis=1)),
+                        total(self.spurious, feigned),
+                        total(self.log_det, np.log(determinant_of)), used, innovation, S_of)
 
 
 def _inverse3(matrix: Array) -> tuple[Array, float]:

@@ -18,8 +18,8 @@ from dataclasses import replace
 from ins_align.preintegration import Noise, preintegrate, Steps
 from ins_align.rotation import exp_so3
 from ins_align.unknowns import SIZE, Unknowns
-from ins_align.whitening import (Chain, chain_noise, GATE, Measurements, sensitivities, START,
-                                 Whitener)
+from ins_align.whitening import (Chain, chain_noise, GATE, Gate, Measurements, Rows,
+                                 sensitivities, START, Whitener)
 import numpy as np
 import pytest
 
@@ -119,33 +119,40 @@ def test_chain_over_all_is_the_chain_one_by_one():
             assert np.allclose(array[k], getattr(chain, name), atol=1e-12), name
 
 
+def rows_of(Y, covariance, noise):
+    """Rows with the whitening's inputs alone."""
+    return Rows(None, np.array(noise), np.array(Y), np.array(covariance), np.arange(len(Y)))
+
+
 @pytest.mark.parametrize('size, kinds', [(6, (0,)), (9, (1,)), (9, (0, 1))])
 def test_whitener_is_dense_generalised_least_squares(size, kinds):
     r = np.random.default_rng(5)
     epochs, columns = 7, np.union1d(np.arange(0, SIZE, 2), START[:size])
-    whitener = Whitener(columns, size)
-    rows, maps, noises, times, steps = [], [], [], [], []
-    for epoch in range(epochs):
+    D, R, steps = [], [], []
+    for _ in range(epochs):
         root = r.standard_normal((size, size))
         steps.append(root @ root.T)
-        whitener.P += steps[-1]
-        for kind in kinds:
-            Y = r.standard_normal((3, 1 + columns.size))
-            root = r.standard_normal((3, 3))
-            R = root @ root.T + 0.1 * np.eye(3)
-            whitener.update(kind, Y, R, gate=None, gate_scale=1.0)
-            rows.append(Y)
-            maps.append(Y[:, 1 + np.searchsorted(columns, START[:size])])
-            noises.append(R)
-            times.append(epoch)
+        D.append(r.standard_normal((2, 3, 1 + columns.size)))
+        root = r.standard_normal((2, 3, 3))
+        R.append(root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3))
+    wanted = np.isin(np.arange(2), kinds) & np.ones((epochs, 1), bool)
+    whitener = Whitener(columns, size)
+    # In two goes: the second one starts where the first one ended.
+    for part in (slice(0, 3), slice(3, epochs)):
+        whitened = whitener.whitened(rows_of(D[part], R[part], steps[part]), wanted[part])
+        whitener.take(whitened, -1)
+    times = np.repeat(np.arange(epochs), len(kinds))
+    noises = [R[epoch][kind] for epoch in range(epochs) for kind in kinds]
+    D = [D[epoch][kind] for epoch in range(epochs) for kind in kinds]
+    maps = [Y[:, 1 + np.searchsorted(columns, START[:size])] for Y in D]
     walk = np.cumsum(steps, axis=0)
-    n = len(rows)
+    n = len(D)
     V = np.zeros((3 * n, 3 * n))
     for i in range(n):
         for j in range(n):
             block = maps[i] @ walk[min(times[i], times[j])] @ maps[j].T
             V[3 * i:3 * i + 3, 3 * j:3 * j + 3] = block + (noises[i] if i == j else 0.0)
-    D = np.vstack(rows)
+    D = np.vstack(D)
     assert np.allclose(whitener.normal, D.T @ np.linalg.solve(V, D), rtol=1e-8)
     # What the filter knows of the errors at the end is the conditional mean and covariance.
     cross = np.hstack([walk[times[i]] @ maps[i].T for i in range(n)])
@@ -157,19 +164,18 @@ def test_whitener_is_dense_generalised_least_squares(size, kinds):
 def test_an_outlier_is_counted_and_leaves_no_trace():
     r = np.random.default_rng(2)
     columns = np.arange(SIZE)
+    Y = r.standard_normal((1, 3, 1 + SIZE))
+    bad, broken = Y.copy(), Y.copy()
+    Y[..., 0], bad[..., 0], broken[..., 0] = [0.1, -0.1, 0.1], 30.0, np.nan
+    R, noise = np.eye(3)[None], 0.01 * np.eye(6)
+    gate = Gate(np.zeros(SIZE), 1e-6 * np.eye(SIZE))
     whitener = Whitener(columns, 6)
-    whitener.P += 0.01 * np.eye(6)
-    Y = r.standard_normal((3, 1 + SIZE))
-    gate = np.zeros(SIZE), 1e-6 * np.eye(SIZE)
-    Y[:, 0] = [0.1, -0.1, 0.1]
-    good, _ = whitener.update(0, Y, np.eye(3), gate=gate, gate_scale=1.0)
-    before = whitener.normal.copy(), whitener.P.copy(), whitener.X.copy(), whitener.rows
-    Y[:, 0] = 30.0
-    bad, normalised = whitener.update(0, Y, np.eye(3), gate=gate, gate_scale=1.0)
-    assert good < GATE < bad and np.allclose(np.sum(normalised ** 2), bad, rtol=0.3)
-    assert whitener.rejected == [1, 0] and whitener.rows == before[3]
-    assert all(np.array_equal(a, b) for a, b in zip(
-        before, (whitener.normal, whitener.P, whitener.X)))
-    Y[:, 0] = np.nan
-    whitener.update(0, Y, np.eye(3), gate=gate, gate_scale=1.0)
-    assert whitener.rejected == [2, 0] and np.all(np.isfinite(whitener.normal))
+    whitened = whitener.whitened(rows_of([Y, bad, broken], [R] * 3, [noise, 0 * noise, 0 * noise]),
+                                 np.ones((3, 1), bool), gate)
+    assert whitened.used[:, 0].tolist() == [True, False, False]
+    for array in (whitened.P, whitened.X, whitened.normal, whitened.rows, whitened.log_det):
+        assert np.array_equal(array[0], array[1]) and np.array_equal(array[0], array[2])
+    for new, fine in ((Y, True), (bad, False)):
+        nis, normalised = gate.test(new, R)
+        assert (nis[0] < GATE) == fine
+        assert np.allclose(np.sum(normalised ** 2), nis, rtol=0.3)
