@@ -24,7 +24,7 @@ from ins_align.preintegration import Intervals
 from ins_align.rotation import Array, exp_so3, Index
 from ins_align.unknowns import (ATTITUDE, GYRO, GYRO_BIAS, inverse_spd, Prior, SIZE,
                                 START_POSITION, START_VELOCITY, UNIFORM_ANGLE_STD, Unknowns)
-from ins_align.whitening import (Chain, chain_noise, Gate, Measurements, Rows, sensitivities,
+from ins_align.whitening import (Chain, chain_noise, GATE, Gate, Measurements, Rows, sensitivities,
                                  Whitened, Whitener)
 import numpy as np
 
@@ -143,7 +143,11 @@ class Solution:
 
     def run(self, rows: Rows, present: np.ndarray, gate: Gate | None, gate_scale: float) -> None:
         """Take epochs at one go; outliers by one gate for all."""
-        whitened = self.whitener.whitened(rows, present, gate, gate_scale)
+        whitened = self.whitener.whitened(rows, present)
+        if gate is not None:
+            nis, _ = gate.test(whitened.innovation, whitened.S)
+            if not np.all(nis < GATE * gate_scale):
+                whitened = self.whitener.whitened(rows, present, gate, gate_scale)
         for kind, count in enumerate(np.count_nonzero(present & ~whitened.used, axis=0).tolist()):
             self.rejected[kind] += count
         self.take(self._course(rows, whitened, slice(-1, None)), 0)
