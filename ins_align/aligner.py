@@ -32,7 +32,7 @@ from ins_align.earth import EARTH_RATE
 from ins_align.messages import Fix, Velocity
 from ins_align.methods import Epoch as MethodEpoch
 from ins_align.methods import ImuSteps, MapMethod, Method, NoteMethod, Nuisance
-from ins_align.plausibility import ForceCheck
+from ins_align.plausibility import ForceCheck, IMU_BEFORE, stuck, without_spikes
 from ins_align.prediction import Prediction
 from ins_align.preintegration import Noise, split_at_epochs, white_noise
 from ins_align.results import Attitude, Epoch, Status
@@ -56,6 +56,16 @@ DRY_INTERVAL_NS = 2_000_000_000
 NO_VELOCITY_NS = 2_000_000_000
 # The IMU samples of a run of epochs that are handled at one go.
 MAX_RUN_SAMPLES = 4096
+_NOTHING_YET = Verdict(State.WAITING_FOR_IMU, 'no IMU sample yet')
+
+
+class _Silence(NamedTuple):
+    """A time during which the IMU says nothing that could be used; stamps, what to count, why."""
+
+    start_ns: int
+    end_ns: int
+    counter: str
+    why: str
 
 
 class _Located(NamedTuple):
@@ -85,7 +95,7 @@ class Aligner:
         self._lateness_ns = (round(self.config.gnss_lateness * 1e9) + max(self._delay_ns, 0))
         self._stated_noise = np.array(self.config.imu_noise[:2])
         self._done: list[Epoch] = []
-        self._silences: list[tuple[int, int]] = []
+        self._silences: list[_Silence] = []
         self._start_over(None)
 
     def _start_over(self, prior: Prior | None) -> None:
@@ -101,7 +111,7 @@ class Aligner:
         self._declaration = Declaration(self.config)
         self._force_check = ForceCheck()
         self._antenna = Antenna(self.config, self.counts)
-        self._verdict = Verdict(State.WAITING_FOR_IMU, 'no IMU sample yet')
+        self._verdict = _NOTHING_YET
         self._first_t0_ns: int | None = None
         self._first_fix_ns: int | None = None
         self._last_ns: int | None = None            # the last epoch put into the run
@@ -203,10 +213,10 @@ class Aligner:
         stamps = self._imu.stamps
         if stamps.size < 4:
             return []
-        # Interpolation at an epoch wants two samples after it.
-        upto_ns = min(upto_ns, int(stamps[-2]))
-        silent = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
-        self._silences = list(zip(stamps[silent].tolist(), stamps[silent + 1].tolist()))
+        # Interpolation at an epoch wants two samples after it, and whether they are spikes shows
+        # in the next one.
+        upto_ns = min(upto_ns, int(stamps[-3]))
+        self._silences = self._find_silences()
         for message in self._gnss.release(upto_ns):
             self._dry_epochs(message.stamp_ns)
             self._take(message)
@@ -214,7 +224,7 @@ class Aligner:
         self._advance()
         if self._method is None:
             self._imu.forget_before(upto_ns - NOISE_WINDOW_NS)
-            if self._verdict.state is State.WAITING_FOR_IMU:
+            if self._verdict is _NOTHING_YET:
                 self._set_verdict(Verdict(State.WAITING_FOR_GNSS, 'no GNSS position yet'))
         done, self._done = self._done, []
         return done
@@ -238,19 +248,35 @@ class Aligner:
             return
         if self._method is None:
             self._start(epoch)
-        elif self._silent(epoch.stamp_ns):
-            self.counts['imu_gap'] += 1
-            self._lose(f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s')
+            return
+        assert self._last_ns is not None
+        if silence := self._silence(self._last_ns, epoch.stamp_ns):
+            self.counts[silence.counter] += 1
+            self._lose(silence.why)
         else:
             self._run.append(_Located(epoch, self._antenna.fault, dry))
             self._last_ns = epoch.stamp_ns
 
-    def _silent(self, stamp_ns: int) -> bool:
-        """Whether the IMU says too little between the last epoch and `stamp_ns`."""
-        start_ns = self._last_ns
-        assert start_ns is not None
-        return (bool(self._imu.stamps[0] > start_ns)
-                or any(start < stamp_ns and end > start_ns for start, end in self._silences))
+    def _find_silences(self) -> list[_Silence]:
+        """When the IMU says nothing, in what is buffered."""
+        stamps = self._imu.stamps
+        last = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
+        why = f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s'
+        silences = [_Silence(start, end, 'imu_gap', why) for start, end in
+                    zip(stamps[last].tolist(), stamps[last + 1].tolist())]
+        # An epoch is taken when the IMU is ahead by the lateness: what is known by then, not what
+        # is known when somebody looks.
+        silences += [_Silence(max(start, known - self._lateness_ns), end, 'imu_stuck',
+                              'the IMU sends the same values again and again')
+                     for start, end, known in stuck(stamps, self._imu.samples)]
+        return silences
+
+    def _silence(self, start_ns: int, end_ns: int) -> '_Silence | None':
+        """Return why the IMU says too little between two stamps, or at one."""
+        for silence in self._silences:
+            if silence.start_ns < end_ns and silence.end_ns > start_ns:
+                return silence
+        return None
 
     def _advance(self) -> None:
         """Let the method take the run of epochs, so many at a time that memory stays bounded."""
@@ -293,6 +319,9 @@ class Aligner:
             return
         if self._imu.stamps[0] > epoch.stamp_ns:
             return
+        if silence := self._silence(epoch.stamp_ns, epoch.stamp_ns):
+            self._set_verdict(Verdict(State.WAITING_FOR_IMU, silence.why))
+            return
         self._last_ns = self._first_t0_ns = self._steps_ns = epoch.stamp_ns
         imu, _ = self._imu_steps([epoch.stamp_ns])
         if self.config.method == 'map':
@@ -307,7 +336,10 @@ class Aligner:
         ends_ns = np.array([start_ns, *epochs_ns])
         ends = np.searchsorted(stamps, ends_ns, side='left') + 2
         windows = np.searchsorted(stamps, ends_ns[:-1] - NOISE_WINDOW_NS)
-        stamps, samples = stamps[:ends[-1]], self._imu.samples[:ends[-1]]
+        stamps = stamps[:ends[-1] + 1]
+        samples, spikes = without_spikes(stamps, self._imu.samples[:stamps.size])
+        self.counts['imu_spike'] += int(np.count_nonzero(spikes[ends[0] - 2:ends[-1] - 2]))
+        stamps, samples = stamps[:ends[-1]], samples[:ends[-1]]
         steps = split_at_epochs(stamps, samples[:, :3], samples[:, 3:], ends_ns, unit=1e-9)
         noise = self._noise(stamps, samples, windows, ends[1:], steps.dt)
         forces = [samples[first:last, 3:] for first, last in zip(ends[:-1] - 2, ends[1:] - 2)]
@@ -361,6 +393,7 @@ class Aligner:
         else:
             if measured:
                 verdict = self._declaration.update(time_s, initial[1], current[1], fit,
+                                                   method.nuisance().gnss_delay,
                                                    method.unconfirmed)
                 if self._declaration.later_start:
                     method.renew()
@@ -414,7 +447,9 @@ class Aligner:
                 self.config.imu_noise.angle_random_walk, bias_std ** 2 + EARTH_RATE ** 2)
         stamps = self._imu.stamps
         first = int(np.searchsorted(stamps, self._now.stamp_ns, side='right'))
-        self._now.carry_many(stamps[first:], self._imu.samples[first:, :3])
+        looked_at = max(first - IMU_BEFORE, 0)
+        samples, _ = without_spikes(stamps[looked_at:], self._imu.samples[looked_at:])
+        self._now.carry_many(stamps[first:], samples[first - looked_at:, :3])
         return copy(self._now)
 
     def status(self) -> Status:

@@ -13,7 +13,7 @@
 # limitations under the License.
 """Where the GNSS antenna is: GNSS messages put together to the epochs that a method takes."""
 
-from collections import Counter
+from collections import Counter, deque
 import math
 
 from ins_align.buffers import GnssEpoch
@@ -31,6 +31,10 @@ FIX_JUMPS_BELIEVED = 5
 # A place this old (s) is not carried on with the velocity.
 MAX_CARRIED = 60.0
 _UNKNOWN_VERTICAL_STD = 1e3
+# A variance this many times smaller than what the receiver usually states, the median of so many
+# epochs, is not believed: a receiver that is ten times better than it was will say so again. One
+# that was worse than the configuration expects need not.
+BETTER_THAN_USUAL, USUAL_EPOCHS = 100.0, 11
 
 Place = tuple[float, float, float]            # latitude, longitude (radians), altitude (m)
 
@@ -43,7 +47,8 @@ class Antenna:
     ----------
     config : Config
     counts : Counter
-        Where fixes that jump are counted: ``fix_jump``.
+        Where is counted what is not believed: ``fix_jump``, ``fix_covariance``,
+        ``velocity_covariance``.
 
     """
 
@@ -58,10 +63,8 @@ class Antenna:
         self._vertical = config.velocity_vertical == 'measured'
         self._vertical_seen = False
         self._check = VelocityCheck()
-        self._velocity_covariance = np.diag([config.velocity_std ** 2, config.velocity_std ** 2,
-                                             config.velocity_std_vertical ** 2])
-        self._position_covariance = np.diag([config.position_std ** 2, config.position_std ** 2,
-                                             config.position_std_vertical ** 2])
+        self._velocity_noise = StatedNoise(config.velocity_std, config.velocity_std_vertical)
+        self._position_noise = StatedNoise(config.position_std, config.position_std_vertical)
 
     @property
     def jumped(self) -> bool:
@@ -82,9 +85,10 @@ class Antenna:
         believed = self._locate(message.stamp_ns, fix, self._v_n if v_n is None else v_n)
         if self._place is None or self.jumped:
             return None
-        position_covariance = self._position_covariance
-        if fix is not None and believed and fix.covariance is not None:
-            position_covariance = fix.covariance
+        stated = fix.covariance if fix is not None and believed else None
+        position_covariance = self._position_noise.believed(stated)
+        if position_covariance is not stated and stated is not None:
+            self._counts['fix_covariance'] += 1
         if v_n is not None:
             self._v_n = v_n
             self._look_for_vertical(v_n)
@@ -130,14 +134,56 @@ class Antenna:
         return False
 
     def _covariance_of(self, velocity: Velocity | None) -> Array:
-        covariance = self._velocity_covariance
-        if velocity is not None and velocity.covariance is not None:
-            covariance = velocity.covariance
+        stated = None if velocity is None else velocity.covariance
+        covariance = self._velocity_noise.believed(stated)
+        if covariance is not stated and stated is not None:
+            self._counts['velocity_covariance'] += 1
         if not self._vertical:
             covariance = covariance.copy()
             covariance[2, :2] = covariance[:2, 2] = 0.0
             covariance[2, 2] = _UNKNOWN_VERTICAL_STD ** 2
         return covariance
+
+
+class StatedNoise:
+    """
+    What a receiver states about its noise, as far as it can be believed.
+
+    Parameters
+    ----------
+    std, std_vertical : float
+        Of a receiver that states nothing, 1 sigma.
+
+    """
+
+    def __init__(self, std: float, std_vertical: float) -> None:
+        """Expect what is configured."""
+        self._default = np.diag([std ** 2, std ** 2, std_vertical ** 2])
+        self._variances = self._default.diagonal().tolist()
+        self._recent = [deque([variance], USUAL_EPOCHS) for variance in self._variances]
+
+    def believed(self, covariance: Array | None) -> Array:
+        """
+        Return the covariance to work with, shape (3, 3), ENU.
+
+        Parameters
+        ----------
+        covariance : ndarray, shape (3, 3), or None
+            As stated; itself is returned where it can be believed.
+
+        """
+        if covariance is None:
+            return self._default
+        variances = covariance.diagonal().tolist()
+        factors = []
+        for variance, recent, default in zip(variances, self._recent, self._variances):
+            recent.append(variance)
+            usual = min(sorted(recent)[len(recent) // 2], default)
+            factors.append(usual / variance if usual > BETTER_THAN_USUAL * variance else 1.0)
+        if max(factors) == 1.0:
+            return covariance
+        scale = np.sqrt(factors)
+        return covariance * scale * scale[:, None]
 
 
 def _distance(a: Place, b: Place) -> float:

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 import math
 
 from ins_align.messages import Fix, Velocity
+from ins_align.plausibility import IMU_BEFORE
 from ins_align.rotation import Array
 import numpy as np
 
@@ -33,6 +34,8 @@ MAX_RATE, MAX_ACCELERATION, MAX_SPEED = 200.0, 2000.0, 2000.0
 MAX_AHEAD_NS = 10_000_000_000
 MAX_PENDING = 10_000
 NO_FIX, STATUS_UNKNOWN = -1, -2
+# IMU samples that are kept before those wanted: interpolation needs two, the checks the rest.
+KEPT_BEFORE = 2 + IMU_BEFORE
 # So many IMU samples in a row that go in order, behind the newest one, through a time that others
 # have gone through before them: not late, but of a clock that was set back.
 SET_BACK_SAMPLES = 8
@@ -158,8 +161,8 @@ class ImuBuffer:
         self.stamps, self.samples = stamps, samples
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Drop samples before `stamp_ns`, but for two that interpolation needs."""
-        first = max(int(np.searchsorted(self.stamps, stamp_ns, side='right')) - 2, 0)
+        """Drop samples before `stamp_ns`, but for those that are still looked at."""
+        first = max(int(np.searchsorted(self.stamps, stamp_ns, side='right')) - KEPT_BEFORE, 0)
         self.stamps, self.samples = self.stamps[first:], self.samples[first:]
 
 

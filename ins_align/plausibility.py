@@ -11,12 +11,12 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Checks that need no alignment: units of the IMU, velocity against position."""
+"""Checks that need no alignment: samples and units of the IMU, velocity against position."""
 
 import math
 
 from ins_align.earth import ecef_from_lla, matrix_en
-from ins_align.rotation import Array
+from ins_align.rotation import Array, Index
 import numpy as np
 
 # The specific force averages gravity unless the vehicle falls or its units are wrong (m/s^2).
@@ -28,6 +28,87 @@ DISTANCE_SIGMAS = 8.0
 # Mismatch, as a share of the distance, that no noise explains, and how many in a row convict.
 MAX_MISMATCH = 0.5
 CONVICTING = 4
+# A spike leaves the mean of its neighbours by at least this (rad/s, m/s^2), by this many times as
+# much as the neighbours differ, and as other samples do: of so many before it, this one in the
+# order of size, so that one more spike among them does no harm.
+SPIKE_RATE, SPIKE_FORCE = 0.5, 5.0
+SPIKE_RATIO = 12.0
+SPIKE_BEFORE, SPIKE_RANK = 12, 7
+# An IMU that has sent the same six values this often and for this long (ns) measures nothing.
+STUCK_SAMPLES, STUCK_NS = 8, 250_000_000
+# Samples that both checks want to see before those that they judge.
+IMU_BEFORE = SPIKE_BEFORE + 2
+
+
+def without_spikes(stamps: Index, samples: Array) -> tuple[Array, np.ndarray]:
+    """
+    Replace single samples that the motion cannot have made by what lies between their neighbours.
+
+    The gyros and the accelerometers are judged each on their own. A shock is no spike: what was
+    hit rings.
+
+    Parameters
+    ----------
+    stamps : ndarray of int, shape (N,)
+        Increasing.
+    samples : ndarray, shape (N, 6)
+        Angular rate, rad/s, and specific force, m/s^2. The first `SPIKE_BEFORE` + 1 and the last
+        one cannot be judged.
+
+    Returns
+    -------
+    samples : ndarray, shape (N, 6)
+        The same array where nothing was found.
+    spikes : ndarray of bool, shape (N,)
+        Which ones were replaced.
+
+    """
+    spikes = np.zeros((stamps.size, 2), bool)
+    if stamps.size < IMU_BEFORE + 1:
+        return samples, spikes[:, 0]
+    x = samples.reshape(-1, 2, 3)
+    away = np.linalg.norm(x[1:-1] - 0.5 * (x[:-2] + x[2:]), axis=2)
+    k, sensor = np.nonzero(away[SPIKE_BEFORE:] > [SPIKE_RATE, SPIKE_FORCE])
+    if not k.size:
+        return samples, spikes[:, 0]
+    k += SPIKE_BEFORE
+    # The one just before has the spike for a neighbour.
+    before = away[k[:, None] - np.arange(2, SPIKE_BEFORE + 1), sensor[:, None]]
+    usual = np.sort(before, axis=1)[:, SPIKE_RANK]
+    between = np.linalg.norm(x[k + 2, sensor] - x[k, sensor], axis=1)
+    spikes[k + 1, sensor] = away[k, sensor] > SPIKE_RATIO * np.maximum(usual, between)
+    if not spikes.any():
+        return samples, spikes[:, 0]
+    k, sensor = np.nonzero(spikes)
+    share = (stamps[k] - stamps[k - 1]) / (stamps[k + 1] - stamps[k - 1])
+    cleaned = x.copy()
+    cleaned[k, sensor] = x[k - 1, sensor] + share[:, None] * (x[k + 1, sensor] - x[k - 1, sensor])
+    return cleaned.reshape(-1, 6), spikes[:, 0] | spikes[:, 1]
+
+
+def stuck(stamps: Index, samples: Array) -> list[tuple[int, int, int]]:
+    """
+    Find where an IMU sends the same values again and again.
+
+    Parameters
+    ----------
+    stamps : ndarray of int, shape (N,)
+        Increasing, ns.
+    samples : ndarray, shape (N, 6)
+        Angular rate and specific force.
+
+    Returns
+    -------
+    list of (int, int, int)
+        First and last stamp with the same values, and the one from which on it is no chance.
+
+    """
+    new = np.flatnonzero(np.any(samples[1:] != samples[:-1], axis=1)) + 1
+    first = np.concatenate([[0], new])
+    last = np.concatenate([new, [stamps.size]]) - 1
+    long = (last - first >= STUCK_SAMPLES) & (stamps[last] - stamps[first] >= STUCK_NS)
+    return [(start, int(stamps[j]), max(start + STUCK_NS, int(stamps[i + STUCK_SAMPLES])))
+            for i, j in zip(first[long], last[long]) for start in [int(stamps[i])]]
 
 
 class ForceCheck:

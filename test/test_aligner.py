@@ -13,6 +13,8 @@
 # limitations under the License.
 """The aligner as a whole: states, faults of messages, outputs, wrong set-ups."""
 
+from dataclasses import replace
+
 from alignment import aligned, config_for, error_deg, error_of, normalised_error, simulated
 from ins_align.aligner import Aligner
 from ins_align.config import Config, ConfigError
@@ -215,6 +217,99 @@ def test_short_gaps_of_the_imu_are_survived_and_doubted(flight):
     assert status.counts['imu_gap'] >= 5 and status.counts.get('restarts', 0) == 0
     assert normalised_error(status.current, flight) < chi2.ppf(0.9999, 3)
     assert np.all(status.current.sigma_deg > whole.status().current.sigma_deg)
+
+
+def test_single_samples_that_no_motion_makes_are_counted_and_do_little(flight, result):
+    random = np.random.default_rng(7)
+    places = np.arange(150, 2950, 100) + random.integers(0, 50, 28)
+    gyro, accel = flight.gyro.copy(), flight.accel.copy()
+    gyro[places] += 5.0 * random.choice([-1.0, 1.0], (28, 3))
+    accel[places[::2]] += 200.0
+    aligner = Aligner(config_for(flight))
+    epochs = give_all(aligner, replace(flight, gyro=gyro, accel=accel))
+    assert aligner.status().counts['imu_spike'] == len(places)
+    clean = result[1]
+    assert epochs[-1].state is State.ALIGNED
+    assert normalised_error(epochs[-1].current, flight) < chi2.ppf(0.9999, 3)
+    assert np.allclose(epochs[-1].current.sigma_deg, clean[-1].current.sigma_deg, rtol=0.2)
+
+
+def test_attitude_now_steps_over_a_spike(flight):
+    spoilt = Aligner(config_for(flight))
+    gyro = flight.gyro.copy()
+    gyro[-20] += 100.0
+    for k in range(len(flight.gnss_stamps_ns)):
+        spoilt.add_fix(flight.fix(k))
+        spoilt.add_velocity(flight.velocity_measurement(k))
+    spoilt.add_imu(flight.imu_stamps_ns, gyro, flight.accel)
+    spoilt.update()
+    assert error_deg(spoilt.attitude_now(), flight) < 1.0
+
+
+def stick(flight, start, end):
+    """Let the IMU send the same values from one second to another."""
+    gyro, accel = flight.gyro.copy(), flight.accel.copy()
+    time = (flight.imu_stamps_ns - flight.imu_stamps_ns[0]) * 1e-9
+    same = np.flatnonzero((time >= start) & (time < end))
+    gyro[same], accel[same] = gyro[same[0]], accel[same[0]]
+    return replace(flight, gyro=gyro, accel=accel)
+
+
+def test_imu_that_sends_the_same_again_and_again_is_not_believed(flight):
+    s = stick(flight, 22.0, 24.0)
+    aligner = Aligner(config_for(s))
+    epochs = feed_part(aligner, s) + aligner.flush()
+    states = {}
+    for epoch in epochs:
+        states.setdefault(int((epoch.stamp_ns - s.imu_stamps_ns[0]) // (SECOND // 2)),
+                          set()).add(epoch.state)
+    assert states[43] == {State.ALIGNED}
+    assert not {45, 46, 47} & set(states)                       # no result while it is stuck
+    assert states[48] == {State.ALIGNING}
+    assert normalised_error(epochs[-1].current, flight) < chi2.ppf(0.9999, 3)
+    counts = aligner.status().counts
+    assert counts['imu_stuck'] == counts['restarts'] == 1
+
+
+def test_while_the_imu_is_stuck_that_is_the_reason(flight):
+    aligner = Aligner(config_for(flight))
+    feed_part(aligner, stick(flight, 12.0, 20.0), 0.0, 18.0)
+    status = aligner.status()
+    assert status.state is State.WAITING_FOR_IMU and 'same values' in status.reason
+    assert aligner.declared is None and aligner.attitude_now() is None
+
+
+@pytest.mark.parametrize('lateness', (0.0, 0.1, 1.0))
+def test_when_somebody_looks_does_not_matter_to_a_stuck_or_spiky_imu(flight, lateness):
+    s = stick(flight, 10.0, 10.8)
+    random = np.random.default_rng(2)
+    s.gyro[np.r_[100:900:80, 1200:2900:150]] += 3.0
+    told = []
+    for share in (1.0, 0.3, 0.01):
+        aligner, epochs = Aligner(config_for(s, gnss_lateness=lateness)), []
+        for k, stamp in enumerate(s.imu_stamps_ns.tolist()):
+            aligner.add_imu(stamp, s.gyro[k], s.accel[k])
+            if random.random() < share:
+                epochs += aligner.update()
+            for j in np.flatnonzero((s.gnss_stamps_ns > stamp) & (
+                    s.gnss_stamps_ns <= stamp + 10_000_000)):
+                aligner.add_fix(s.fix(j))
+                aligner.add_velocity(s.velocity_measurement(j))
+        epochs += aligner.flush()
+        told.append([(e.stamp_ns, e.state, None if e.current is None
+                      else e.current.quaternion_xyzw.tolist()) for e in epochs])
+        assert aligner.status().counts['imu_spike'] == 22
+        assert aligner.status().counts['imu_stuck'] == 1
+    assert told[0] == told[1] == told[2] and len(told[0]) > 100
+
+
+def test_gnss_clock_that_is_off_is_named_and_not_declared():
+    s = simulated('car', imu_grade='tactical', duration=50.0, seed=4)
+    s = replace(s, gnss_stamps_ns=s.gnss_stamps_ns + 670_000_000,
+                gnss_arrival_ns=s.gnss_arrival_ns + 670_000_000)
+    aligner = Aligner(config_for(s, gnss_delay_std=0.1))
+    assert not any(epoch.state is State.ALIGNED for epoch in feed(aligner, s)[-100:])
+    assert 'set gnss_delay' in aligner.status().reason
 
 
 def test_broken_messages_on_the_way_change_nothing_but_counts(flight, result):

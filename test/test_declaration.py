@@ -35,11 +35,12 @@ def covariance(tilt_deg, heading_deg):
 GOOD, LEVEL, OPEN = covariance(0.1, 0.5), covariance(0.1, 14.0), covariance(5.0, 90.0)
 
 
-def judge(declaration, start, seconds, P, the_fit=None, rate=5.0, doubt=''):
+def judge(declaration, start, seconds, P, the_fit=None, rate=5.0, doubt='', delay=0.0):
     """Judge a stretch of epochs; return the last verdict."""
     verdict = None
     for k in range(int(seconds * rate) + 1):
-        verdict = declaration.update(start + k / rate, P, P, the_fit or fit(), lambda: doubt)
+        verdict = declaration.update(start + k / rate, P, P, the_fit or fit(), delay,
+                                     lambda: doubt)
     return verdict
 
 
@@ -91,7 +92,7 @@ def test_thresholds_are_the_parameters():
 def test_the_worse_of_initial_and_current_counts():
     declaration = Declaration(Config(hold_time=2.0))
     for k in range(20):
-        verdict = declaration.update(0.2 * k, GOOD, LEVEL, fit(), str)
+        verdict = declaration.update(0.2 * k, GOOD, LEVEL, fit(), 0.0, str)
     assert verdict.state is State.LEVELLED and not declaration.later_start
 
 
@@ -99,18 +100,18 @@ def test_a_later_start_is_wanted_where_only_the_present_heading_is_good():
     declaration = Declaration(Config(hold_time=2.0))
     wanted = []
     for k in range(20):
-        verdict = declaration.update(0.2 * k, LEVEL, GOOD, fit(), str)
+        verdict = declaration.update(0.2 * k, LEVEL, GOOD, fit(), 0.0, str)
         wanted.append(declaration.later_start)
     assert verdict.state is State.LEVELLED
     assert wanted == [False] * 10 + [True] * 10
     # When t0 has moved, what has held before it counts.
-    assert declaration.update(4.0, GOOD, GOOD, fit(), str).state is State.ALIGNED
+    assert declaration.update(4.0, GOOD, GOOD, fit(), 0.0, str).state is State.ALIGNED
     assert not declaration.later_start
 
 
 def test_no_later_start_while_the_signs_are_in_doubt():
     declaration = Declaration(Config(hold_time=0.0))
-    declaration.update(0.0, LEVEL, GOOD, fit(), lambda: 'turn')
+    declaration.update(0.0, LEVEL, GOOD, fit(), 0.0, lambda: 'turn')
     assert not declaration.later_start
 
 
@@ -170,4 +171,19 @@ def test_doubt_is_not_asked_about_before_everything_else_holds():
 
     declaration = Declaration(Config(hold_time=2.0))
     for k in range(5):
-        declaration.update(0.2 * k, LEVEL, LEVEL, fit(), never)
+        declaration.update(0.2 * k, LEVEL, LEVEL, fit(), 0.0, never)
+
+
+@pytest.mark.parametrize('told, delay, believed', [
+    ({}, 0.29, True), ({}, -0.31, False), ({'gnss_delay': 0.5, 'gnss_delay_std': 0.05}, 0.6, True),
+    ({'gnss_delay': 0.5, 'gnss_delay_std': 0.05}, 0.7, False),
+    ({'gnss_delay_std': 1.0}, 0.4, False),
+    ({'gnss_delay': 0.5, 'gnss_delay_std': 0.0}, 0.5, True)])
+def test_delay_far_from_what_was_told_is_a_contradiction(told, delay, believed):
+    declaration = Declaration(Config(**told))
+    usual = declaration.config.gnss_delay
+    assert judge(declaration, 0.0, 2.0, GOOD, delay=usual).state is State.ALIGNED
+    verdict = judge(declaration, 2.2, 2.0, GOOD, delay=delay)
+    assert (verdict.state is State.ALIGNED) == believed
+    if not believed:
+        assert 'set gnss_delay' in verdict.reason and f'{delay:.2f}' in verdict.reason

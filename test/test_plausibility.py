@@ -14,7 +14,7 @@
 """Checks on units and frames that need no alignment."""
 
 from ins_align.earth import ecef_from_lla, matrix_en
-from ins_align.plausibility import ForceCheck, VelocityCheck
+from ins_align.plausibility import ForceCheck, stuck, VelocityCheck, without_spikes
 import numpy as np
 import pytest
 
@@ -117,3 +117,102 @@ def test_across_the_antimeridian():
         longitude = (longitude + np.pi) % (2 * np.pi) - np.pi
         check.add(0.2 * k, latitude, longitude, 0.0, np.array([10.0, 0.0, 0.0]), 0.1)
     assert not check.fault
+
+
+# Samples of the IMU
+
+MS = 1_000_000
+
+
+def shaken(count=400, seed=0):
+    """Turn and shake; return stamps at 100 Hz, samples, and the random numbers."""
+    random = np.random.default_rng(seed)
+    t = 0.01 * np.arange(count)
+    motion = np.stack([np.sin(3 * t), np.cos(2 * t), 0.5 * t, 2 * np.sin(5 * t), t, 9.8 + 0 * t],
+                      axis=1)
+    noise = np.repeat([0.05, 0.5], 3) * random.standard_normal((count, 6))
+    return 10 * MS * np.arange(count), motion + noise, random
+
+
+@pytest.mark.parametrize('sensor, size', [(0, 3.0), (0, 150.0), (1, 30.0), (1, 1500.0)])
+def test_single_samples_that_no_motion_makes_are_replaced(sensor, size):
+    stamps, true, random = shaken()
+    places = np.array([30, 34, 100, 111, 250, 390])
+    spoilt = true.copy()
+    axes = slice(3 * sensor, 3 * sensor + 3)
+    direction = random.standard_normal((places.size, 3))
+    spoilt[places, axes] += size * direction / np.linalg.norm(direction, axis=1)[:, None]
+    sent = spoilt.copy()
+    samples, spikes = without_spikes(stamps, spoilt)
+    assert np.flatnonzero(spikes).tolist() == places.tolist()
+    assert np.array_equal(spoilt, sent)
+    assert np.array_equal(samples[~spikes], true[~spikes])
+    assert np.max(np.abs(samples - true)) < 3.0
+    assert np.array_equal(np.delete(samples, np.r_[axes], axis=1),
+                          np.delete(true, np.r_[axes], axis=1))
+
+
+def test_a_spike_is_replaced_by_what_lies_at_its_stamp():
+    stamps, samples, _ = shaken()
+    samples[:] = 1e-6 * (stamps / MS)[:, None]
+    stamps[200] += 4 * MS
+    samples[200, 0] = 50.0
+    cleaned, _ = without_spikes(stamps, samples)
+    assert cleaned[200, 0] == pytest.approx(1e-6 * 2004)
+
+
+def test_shaking_steps_and_shocks_that_ring_are_left_alone():
+    stamps, samples, random = shaken()
+    samples *= 20.0
+    assert without_spikes(stamps, samples)[0] is samples
+    stamps, samples, random = shaken()
+    samples[200:, 2] += 3.0                                     # a turn begins at once
+    ringing = 80.0 * np.cos(2.5 * np.arange(40)) * np.exp(-0.1 * np.arange(40))
+    samples[300:340, 5] += ringing
+    samples[300:340, 0] += 0.1 * ringing
+    assert not np.any(without_spikes(stamps, samples)[1])
+
+
+def test_what_cannot_be_judged_is_left_alone():
+    for count in (0, 1, 2, 14):
+        stamps, samples, _ = shaken(count)
+        samples[-1:] += 100.0
+        cleaned, spikes = without_spikes(stamps, samples)
+        assert cleaned is samples and spikes.shape == (count,) and not spikes.any()
+
+
+@pytest.mark.parametrize('first', [100, 113, 126, 137])
+def test_a_spike_is_judged_the_same_wherever_the_array_begins(first):
+    stamps, samples, _ = shaken()
+    samples[[143, 150, 152, 160], 1] += [2.0, -40.0, 60.0, 0.7]
+    whole, part = (without_spikes(stamps[k:], samples[k:])[1] for k in (0, first))
+    judged = max(first + 13, 0)
+    assert np.array_equal(whole[judged:], part[judged - first:]) and whole.any()
+
+
+def test_an_imu_that_sends_the_same_again_and_again_is_stuck():
+    stamps, samples, _ = shaken()
+    samples[100:180] = samples[100]
+    samples[390:] = samples[390]                                # not for long yet
+    (first, last, known), = stuck(stamps, samples)
+    assert (first, last, known) == (1000 * MS, 1790 * MS, 1250 * MS)
+    assert stuck(stamps[:126], samples[:126]) == [(1000 * MS, 1250 * MS, 1250 * MS)]
+    assert stuck(stamps[:125], samples[:125]) == []
+
+
+def test_a_slow_imu_is_stuck_after_so_many_samples():
+    _, samples, _ = shaken(60)
+    samples[20:40] = samples[20]
+    (first, last, known), = stuck(100 * MS * np.arange(60), samples)
+    assert (first, last, known) == (2000 * MS, 3900 * MS, 2800 * MS)
+
+
+def test_an_imu_at_rest_that_repeats_some_values_is_not_stuck():
+    random = np.random.default_rng(3)
+    noise = 0.4 * random.standard_normal((20_000, 6))           # of the least step
+    samples = np.rint(noise) * np.repeat([1e-3, 0.02], 3)
+    same = np.all(samples[1:] == samples[:-1], axis=1)
+    assert np.mean(same) > 0.05
+    assert stuck(10 * MS * np.arange(20_000), samples) == []
+    _, samples, _ = shaken()
+    assert stuck(2 * MS * np.arange(1600), np.repeat(samples, 4, axis=0)) == []
