@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 from ins_align.aligner import Aligner, Attitude, Epoch
 from ins_align.config import Config
 from ins_align.declaration import State
-from ins_align.report import format_table
+from ins_align.report import format_table, write_whole
 from ins_align.rotation import Array, log_so3
 from ins_align.simulation import FEED_BLOCK, Simulation
 import numpy as np
@@ -233,15 +233,17 @@ class Report:
         drawn = io.BytesIO()
         figure.savefig(drawn, dpi=110)
         # A palette makes the files of the documentation a third as large.
-        Image.open(drawn).convert('RGB').quantize(COLOURS).save(self._out / file, optimize=True)
+        image = Image.open(drawn).convert('RGB').quantize(COLOURS)
+        write_whole(self._out / file, lambda png: image.save(png, 'PNG', optimize=True))
         self._parts.append(f'![{caption}]({file})\n\n{caption}')
         print(f'{self._out / file}: {caption}\n')
 
     def write(self, numbers: Any) -> None:
         """Write the text and the numbers."""
-        (self._out / f'{self._name}.md').write_text('\n\n'.join(self._parts) + '\n', 'utf-8')
-        (self._out / f'{self._name}.json').write_text(
-            json.dumps(_plain(numbers), indent=1) + '\n', 'utf-8')
+        for suffix, text in (('md', '\n\n'.join(self._parts)),
+                             ('json', json.dumps(_plain(numbers), indent=1))):
+            content = f'{text}\n'.encode()
+            write_whole(self._out / f'{self._name}.{suffix}', lambda file: file.write(content))
 
 
 def _plain(value: Any) -> Any:

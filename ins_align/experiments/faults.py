@@ -385,6 +385,19 @@ def write(out: Path, trials: list[JsonDict]) -> None:
         'one, at each declaration and at the end where that is still ALIGNED. The time is that '
         f'during which, within a run, the current attitude was beyond {BINS[1]:g} sigma and '
         'still called aligned, the longest.')
+    looks = [(where, [moment for t in trials for moment in moments(t)]) for where, moments in (
+        ('declarations', lambda t: t.get('declared', [])),
+        ('runs still aligned at the end', lambda t: list(filter(None, [t.get('final')]))))]
+    beyond = '; '.join(
+        f'of {len(found)} {where} {_beyond(found, 0)} in tilt and {_beyond(found, 1)} in heading'
+        for where, found in looks)
+    share = numbers['3 to 5'] + numbers['beyond 5']
+    report.text(
+        f"{share} of the {numbers['declared']} "
+        f"({share / max(numbers['declared'], 1):.1%}) were beyond {BINS[0]:g} sigma at any of "
+        f"these moments, {numbers['beyond 5']} beyond {BINS[1]:g} (target: at most 1 % and "
+        f'none). Beyond {BINS[0]:g}, {beyond}. Normal errors of just the stated sigmas would be '
+        'so at any one moment in 0.5 % in tilt, the worse of two axes, and in 0.3 % in heading.')
     report.table('What became of it, by fault', HEADER, [
         *(row(name, chosen) for name in FAULTS
           if (chosen := [t for t in trials if t['fault'] == name])), total])
@@ -403,6 +416,12 @@ def write(out: Path, trials: list[JsonDict]) -> None:
         report.table('What broke', ['index', 'fault', 'scenario', 'IMU', 'what'], broken)
     report.write({'runs': len(trials), 'trials': [
         {key: value for key, value in t.items() if key not in OMITTED} for t in trials]})
+
+
+def _beyond(moments: list[JsonDict], angle: int) -> int:
+    """Count the moments at which an angle, 0 tilt, 1 heading, is beyond the first of `BINS`."""
+    return sum(max(moment[name][angle] for name in ('initial', 'current')) > BINS[0]
+               for moment in moments)
 
 
 def _early_resident(trials: list[JsonDict]) -> float:

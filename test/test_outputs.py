@@ -1,0 +1,195 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Outputs are whole or not there; what a recording says ends up in none but those asked for."""
+
+import json
+from pathlib import Path
+import signal
+import subprocess
+import sys
+
+import pytest
+from recordings import (FIX, IMU, make_fix, make_imu, make_twist, START_NS, TWIST, typestore,
+                        write_messages, write_recording)
+
+pytest.importorskip('rosbags')
+
+# A process that is killed by the very call that makes an output durable, or gives it its name.
+KILLED = """
+import os, pathlib, signal, sys
+where, function = sys.argv[1].rsplit('.', 1)
+place = {'os': os, 'Path': pathlib.Path}[where]
+setattr(place, function, lambda *arguments: os.kill(os.getpid(), signal.SIGKILL))
+from ins_align.cli import main
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+def killed(call, *arguments):
+    """Run the command line until `call` kills it."""
+    done = subprocess.run([sys.executable, '-c', KILLED, call, *map(str, arguments)],
+                          cwd=Path(__file__).parents[1], capture_output=True, text=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+
+
+@pytest.fixture(scope='module')
+def standing(tmp_path_factory):
+    """Record a vehicle that stands still."""
+    return write_recording(tmp_path_factory.mktemp('outputs') / 'standing', 'sqlite3', 8.0)
+
+
+@pytest.mark.parametrize('call', ['os.fsync', 'os.replace'])
+@pytest.mark.parametrize('command, option, suffix', [
+    ('replay', '--json', '.json'), ('replay', '--csv', '.csv'), ('replay', '--plot', '.png'),
+    ('info', '--json', '.json')])
+def test_killed_on_the_way_leaves_the_old_file(standing, tmp_path, call, command, option, suffix):
+    if option == '--plot':
+        pytest.importorskip('matplotlib')
+    path = tmp_path / f'out{suffix}'
+    path.write_text('old')
+    killed(call, command, standing, option, path)
+    assert path.read_text() == 'old'
+
+
+@pytest.mark.parametrize('call', ['os.fsync', 'os.replace'])
+def test_killed_experiment_leaves_the_old_files(tmp_path, call):
+    pytest.importorskip('pyins')
+    for name in ('faults.md', 'faults.json'):
+        (tmp_path / name).write_text('old')
+    killed(call, 'experiment', 'faults', '--runs', '1', '--jobs', '1', '--out', tmp_path)
+    assert all((tmp_path / name).read_text() == 'old' for name in ('faults.md', 'faults.json'))
+
+
+@pytest.mark.parametrize('call', ['os.fsync', 'os.replace'])
+def test_killed_figure_leaves_the_old_one(tmp_path, call):
+    pytest.importorskip('matplotlib')
+    pytest.importorskip('PIL')
+    (tmp_path / 'x.png').write_text('old')
+    draw = """
+from ins_align.experiments.common import Report
+from ins_align.report import new_figure
+Report('x', 'X', pathlib.Path(sys.argv[2])).figure(new_figure(2, 2), '', 'x')
+"""
+    program = KILLED.partition('from ins_align')[0] + draw
+    done = subprocess.run([sys.executable, '-c', program, call, str(tmp_path)],
+                          cwd=Path(__file__).parents[1], capture_output=True, text=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert (tmp_path / 'x.png').read_text() == 'old'
+
+
+def test_killed_simulation_leaves_no_recording(tmp_path):
+    pytest.importorskip('pyins')
+    path = tmp_path / 'flight'
+    killed('Path.rename', 'simulate', path, '--duration', '2')
+    assert not path.exists()
+
+
+# What a recording says
+
+MARK = 'touch_me'
+NASTY = f'../../{MARK}; $(touch {MARK}) `touch {MARK}`; __import__("os").system("touch {MARK}")'
+# A process that notes every event of the interpreter that the mark reaches: files, processes,
+# code. It starts nothing, so that every process that is started is one too many.
+WATCHED = f"""
+import json, sys
+from ins_align.cli import main
+import ins_align.batch, ins_align.info, ins_align.report
+import matplotlib.figure, matplotlib.backends.backend_agg
+seen = []
+STARTED = 'os.system', 'os.exec', 'os.fork', 'os.posix_spawn', 'os.spawn', 'subprocess.Popen'
+def watch(event, arguments):
+    if event in STARTED or {MARK!r} in repr(arguments):
+        seen.append([event, repr(arguments)[:200]])
+sys.addaudithook(watch)
+status = main(sys.argv[1:])
+print(json.dumps([status, seen]), file=sys.stderr)
+"""
+
+
+def nasty_recording(path, kind):
+    """Write a recording with names of topics and frames that want to become commands or paths."""
+    store = typestore(kind.startswith('ros1'))
+    topics = {f'/{NASTY}/{name}': msgtype for name, msgtype in (
+        ('imu', IMU), ('fix', FIX), ('velocity', TWIST))}
+    imu, fix, velocity = topics
+    messages = []
+    for k in range(800):
+        stamp = START_NS + k * 10_000_000
+        messages.append((imu, stamp, make_imu(store, stamp, [0.001 * (k % 3), 0.0, 0.0],
+                                              [0.0, 0.01 * (k % 5), 9.81], NASTY, k)))
+        if k % 20 == 0:
+            messages.append((fix, stamp + 1, make_fix(store, stamp)))
+            messages[-1][2].header.frame_id = NASTY
+            messages.append((velocity, stamp + 2, make_twist(store, stamp, [0.0, 0.0, 0.01],
+                                                             NASTY)))
+    return write_messages(path, kind, messages, topics)
+
+
+def watched(folder, *arguments):
+    """Run the command line in a folder; return exit status and what the watch has seen."""
+    done = subprocess.run([sys.executable, '-c', WATCHED, *map(str, arguments)], cwd=folder,
+                          capture_output=True, text=True)
+    status, seen = json.loads(done.stderr.splitlines()[-1])
+    return status, seen, done.stdout
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
+def test_names_in_a_recording_reach_no_shell_file_or_code(tmp_path, kind):
+    pytest.importorskip('matplotlib')
+    nasty_recording(tmp_path / 'recording', kind)
+    folder = tmp_path / 'a' / 'b' / 'c'
+    folder.mkdir(parents=True)
+    outputs = [f'out.{name}' for name in ('json', 'csv', 'png')]
+    status, seen, _ = watched(folder, 'replay', tmp_path / 'recording', '--json', outputs[0],
+                              '--csv', outputs[1], '--plot', outputs[2])
+    assert status == 1 and seen == []
+    assert json.loads((folder / 'out.json').read_text())['counts']['imu'] == 800
+    assert sorted(path.name for path in folder.iterdir()) == sorted(outputs)
+    status, seen, out = watched(folder, 'info', tmp_path / 'recording')
+    assert status == 0 and seen == [] and MARK in out
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['a', 'recording']
+    assert not list(tmp_path.rglob(f'*{MARK}*'))
+
+
+def test_files_that_a_recording_names_elsewhere_are_not_read(standing, tmp_path):
+    import yaml
+    outside = tmp_path / f'{MARK}.db3'
+    outside.write_bytes(next(standing.glob('*.db3')).read_bytes())
+    inside = tmp_path / 'recording'
+    inside.mkdir()
+    metadata = yaml.safe_load((standing / 'metadata.yaml').read_text())
+    metadata['rosbag2_bagfile_information']['relative_file_paths'] = [
+        f'../{MARK}.db3', str(outside)]
+    (inside / 'metadata.yaml').write_text(yaml.safe_dump(metadata))
+    folder = tmp_path / 'here'
+    folder.mkdir()
+    status, seen, _ = watched(folder, 'replay', inside)
+    assert status == 2
+    assert not [event for event in seen if event[0] in ('open', 'sqlite3.connect')]
+
+
+@pytest.mark.parametrize('value', [
+    f"!!python/object/apply:os.system ['touch {MARK}']", f'!!python/name:{MARK}.x',
+    f'__import__("os").system("touch {MARK}")', f'$(touch {MARK})', f'../../{MARK}'])
+def test_parameters_reach_no_shell_file_or_code(standing, tmp_path, value):
+    params = tmp_path / 'params.yaml'
+    quoted = value if value.startswith('!!') else json.dumps(value)
+    params.write_text(f'ins_align:\n  ros__parameters:\n    world_frame_id: {quoted}\n')
+    folder = tmp_path / 'here'
+    folder.mkdir()
+    for arguments in (['--params', params], ['--set', f'world_frame_id={value}'],
+                      ['--set', f'lever_arm={value}']):
+        status, seen, _ = watched(folder, 'replay', standing, *arguments)
+        assert status in (1, 2) and seen == []
+    assert not list(tmp_path.rglob(f'*{MARK}*'))
