@@ -153,6 +153,9 @@ class Config:
     hold_time: float = _parameter(
         1.0, 'every condition must have held for this long before a declaration', 's',
         minimum=0.0, maximum=3600.0, runtime=True)
+    trust_imu_axes: bool = _parameter(
+        False, 'the axes and signs of the IMU are known to be right: declare a heading without '
+        'waiting for motion that shows it, also at rest', choices=(True, False))
     method: str = _parameter(
         'map', 'vif, pif: velocity and position integration formula as published; '
         "map: the estimator that also knows the IMU's errors", choices=('vif', 'pif', 'map'))

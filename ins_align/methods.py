@@ -320,7 +320,7 @@ class MapMethod:
 
     def unconfirmed(self) -> str:
         """Return why the data do not show yet that the sensors' signs are right, or nothing."""
-        return self._signs.doubt(self._estimator)
+        return '' if self._config.trust_imu_axes else self._signs.doubt(self._estimator)
 
     def nuisance(self) -> Nuisance:
         """Return biases, lever arm and delay."""

@@ -18,6 +18,7 @@ from functools import partial
 from alignment import (aligned, config_for, error_of, estimator_of, LEVER, normalised_error,
                        simulated)
 from ins_align.config import PRESETS
+from ins_align.declaration import State
 from ins_align.estimator import MapEstimator
 from ins_align.experiments.dense import bound, dense_solution
 from ins_align.methods import MapMethod
@@ -295,6 +296,17 @@ def test_static_navigation_grade_finds_north_by_the_turning_earth():
     assert sigma < 4.0
     assert sigma == pytest.approx(np.degrees(np.sqrt(limit.covariance[-1][2, 2])), rel=0.15)
     assert abs(error) < 3.5 * sigma
+
+
+def test_north_at_rest_is_declared_where_the_axes_are_known_to_be_right():
+    s = simulated('static', imu_grade='navigation', duration=150.0, seed=1, gnss_rate=1.0,
+                  imu_rate=50.0, heading_deg=70.0)
+    wanted = {'heading_std_threshold': 5.0}
+    # A reversed axis would fit as well: nothing has turned.
+    assert aligned(s, **wanted)[0].status().state is State.LEVELLED
+    status = aligned(s, trust_imu_axes=True, **wanted)[0].status()
+    assert status.state is State.ALIGNED
+    assert abs(np.degrees(error_of(status.initial, s)[2])) < 3 * status.initial.sigma_deg[2]
 
 
 @pytest.mark.parametrize('scenario', ('static', 'straight'))

@@ -48,6 +48,9 @@ HEADER = ('fault', 'runs', 'within 3 sigma', '3 to 5', 'beyond 5', 'not declared
 SILENT_SEED, TIME_SEED = 100_000, 200_000
 # A run of the second and the third part for so many of the first.
 SILENT_PART, TIME_PART = 80, 40
+# What the aligner of the third part is told beside the very model of the simulation; None: that
+# neither, but the defaults.
+TOLD: tuple[dict[str, Any] | None, ...] = ({}, {'trust_imu_axes': True}, None)
 DRAWN = 'simulate', 'config'        # `trial` draws them again from the index
 
 JsonDict = dict[str, Any]
@@ -292,16 +295,18 @@ def time_to_heading(runs: int, jobs: int | None) -> list[JsonDict]:
                         itertools.product(pairs, ((), unknown))], jobs, 'bounds')
     reachable = [(*pair, *times) for pair, times in
                  zip(pairs, zip(crossings[::2], crossings[1::2])) if times[0] is not None]
-    times = parallel(run_time, [(*reached[:2], TIME_SEED + seed, known)
-                                for reached, known, seed in itertools.product(
-                                    reachable, (True, False), range(runs))], jobs, 'times')
+    times = parallel(run_time, [(*reached[:2], TIME_SEED + seed, told) for reached, told, seed in
+                                itertools.product(reachable, TOLD, range(runs))], jobs, 'times')
     results = []
     for number, (scenario, grade, bound_s, unknown_s) in enumerate(reachable):
-        first = 2 * number * runs
-        declared, by_default = times[first:first + runs], times[first + runs:first + 2 * runs]
+        first = len(TOLD) * number * runs
+        declared, trusted, by_default = (times[start:start + runs] for start in range(
+            first, first + len(TOLD) * runs, runs))
         results.append({'scenario': scenario, 'grade': grade, 'bound_s': bound_s,
                         'bound_unknown_s': unknown_s, 'median_s': _median(declared),
                         'ratio': _median(declared) / bound_s, 'declared_s': declared,
+                        'trusted_median_s': _median(trusted), 'trusted_s': trusted,
+                        'trusted_ratio': _median(trusted) / bound_s,
                         'default_median_s': _median(by_default), 'default_declared_s': by_default})
     return results
 
@@ -311,13 +316,13 @@ def _median(times: list[float | None]) -> float:
     return float(np.median([np.inf if t is None else t for t in times]))
 
 
-def run_time(task: tuple[str, str, int, bool]) -> float | None:
+def run_time(task: tuple[str, str, int, JsonDict | None]) -> float | None:
     """Seconds until the heading is declared, None if it is not."""
-    scenario, grade, seed, known = task
+    scenario, grade, seed, told = task
     simulation = simulate(scenario, imu_grade=grade, seed=seed, duration=HORIZON)
     # The heading is to be what is waited for, not the tilt.
-    config = (exact_config_for(simulation, tilt_std_threshold=THRESHOLD_DEG) if known
-              else config_for(simulation))
+    config = (config_for(simulation) if told is None else
+              exact_config_for(simulation, tilt_std_threshold=THRESHOLD_DEG, **told))
     epoch = first_in(epochs_of(Aligner(config), simulation), State.ALIGNED)
     return None if epoch is None else epoch.t_s
 
@@ -331,22 +336,28 @@ def time_table(report: Report, waits: list[JsonDict]) -> None:
         unknown = wait['bound_unknown_s']
         rows.append([wait['scenario'], wait['grade'], f"{wait['bound_s']:.1f}",
                      f"{wait['median_s']:.1f}", f"{wait['ratio']:.2f}",
-                     f"{(wait['median_s'] - default.hold_time) / wait['bound_s']:.2f}",
                      sum(t is None for t in wait['declared_s']),
+                     f"{wait['trusted_median_s']:.1f}", f"{wait['trusted_ratio']:.2f}",
+                     sum(t is None for t in wait['trusted_s']),
                      None if unknown is None else f'{unknown:.1f}',
                      f"{wait['default_median_s']:.1f}",
                      None if unknown is None else f"{wait['default_median_s'] / unknown:.2f}",
                      sum(t is None for t in wait['default_declared_s'])])
-    met = sum(wait['ratio'] <= WAIT_LIMIT for wait in waits)
+    met, trusted = (sum(wait[ratio] <= WAIT_LIMIT for wait in waits)
+                    for ratio in ('ratio', 'trusted_ratio'))
     report.text(f'Time to a declared heading: the median is within {WAIT_LIMIT:g} times the '
                 f'bound in {met} of {len(waits)} cases in which the bound crosses '
-                f'{THRESHOLD_DEG:g} deg within {HORIZON:g} s (target: all).')
+                f'{THRESHOLD_DEG:g} deg within {HORIZON:g} s (target: all); in {trusted} where '
+                'the axes of the IMU are said to be right (`trust_imu_axes`). The bound knows '
+                'that they are. Without being told, the aligner waits for motion that shows it: '
+                'a throw lies in a plane, and at rest a reversed axis cannot be told at all.')
     report.table(
         f'Time to a declared heading of {THRESHOLD_DEG:g} deg: median of {runs} runs, and the '
         'time at which the Cramer-Rao bound crosses it. First with lever arm and delay known to '
-        'both and a threshold of 1 deg for the tilt too; then with all parameters at their '
+        'both and a threshold of 1 deg for the tilt too; then with `trust_imu_axes` besides; '
+        'then with all parameters at their '
         f'defaults, against the bound with lever arm and delay unknown ({default.lever_arm_std:g} '
         f'm, {default.gnss_delay_std:g} s). A declaration has to hold for {default.hold_time:g} s '
-        'before it is made; the second ratio leaves that out.', [
-            'scenario', 'IMU', 'bound, s', 'median, s', 'ratio', 'without hold', 'not declared',
-            'unknown, s', 'default, s', 'ratio', 'not declared'], rows)
+        'before it is made.', [
+            'scenario', 'IMU', 'bound, s', 'median, s', 'ratio', 'not declared', 'trusted, s',
+            'ratio', 'not declared', 'unknown, s', 'default, s', 'ratio', 'not declared'], rows)
