@@ -60,19 +60,19 @@ class Reference:
                 & ~(orientations.covariances[:, 0] < 0.0))
         stamps, first = np.unique(orientations.stamps_ns[good], return_index=True)
         self._stamps_ns = stamps
-        self._C_nb = matrix_from_quaternion(orientations.quaternions[good][first])
+        self._quaternions = orientations.quaternions[good][first]
 
     def attitude_at(self, stamp_ns: int) -> Array | None:
         """Return ``C_nb``, shape (3, 3), interpolated; None where there is none close by."""
         after = int(np.searchsorted(self._stamps_ns, stamp_ns))
         if after < len(self._stamps_ns) and self._stamps_ns[after] == stamp_ns:
-            return self._C_nb[after]
+            return matrix_from_quaternion(self._quaternions[after])
         if not 0 < after < len(self._stamps_ns):
             return None
         start, end = (int(stamp) for stamp in self._stamps_ns[after - 1:after + 1])
         if end - start > MAX_REFERENCE_GAP_NS:
             return None
-        C_before, C_after = self._C_nb[after - 1:after + 1]
+        C_before, C_after = matrix_from_quaternion(self._quaternions[after - 1:after + 1])
         return exp_so3((stamp_ns - start) / (end - start) * log_so3(C_after @ C_before.T)) \
             @ C_before
 
