@@ -196,8 +196,8 @@ class Solution:
         J[:, :, self._gyro] += (estimate.C @ chain.R_g)[
             :, :, self._columns[self._gyro] - GYRO.start]
         errors = X[:, :3, 0] - _turned(X[:, :3, 1:], dx)
-        C = (exp_so3(errors) @ estimate.C
-             @ exp_so3(_turned(chain.R_g, step[:, GYRO])) @ chain.R)
+        before, after = exp_so3(np.stack([errors, _turned(chain.R_g, step[:, GYRO])]))
+        C = before @ estimate.C @ after @ chain.R
         return Course(chain, whitened, time, dx, P, estimate,
                       normal[:, 0, 0] + self._mean_step @ prior - np.sum(right * dx, axis=1),
                       whitened.rows - dx.shape[1] + self._known,
