@@ -22,7 +22,7 @@ interpolation. All samples of an interval, and all intervals of a batch, are han
 from dataclasses import dataclass, fields
 
 from ins_align.rotation import (Array, cross, cumulative_rotations, exp_and_left_jacobian, exp_so3,
-                                Index, skew)
+                                Index, orthonormalized, skew)
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -376,7 +376,9 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
         _noise(dt * np.square(gyro), dt * np.square(accel), dt, remaining, v_rest, p_rest)
         for gyro, accel in ((noise.angle_random_walk, noise.velocity_random_walk),
                             (noise.gyro_excess, noise.accel_excess)))
-    return Intervals(duration, turned[:, -1], v, p, -A_sum[:, -1], v_g[:, -1], p_g, -p_a,
+    # Intervals are chained for hours.
+    R = orthonormalized(turned[:, -1])
+    return Intervals(duration, R, v, p, -A_sum[:, -1], v_g[:, -1], p_g, -p_a,
                      J_Rs, J_vs, J_ps, Q, Q_excess, omega[:, -1], f[:, -1])
 
 

@@ -279,15 +279,15 @@ def orthonormalized(matrix: Array) -> Array:
 
     Parameters
     ----------
-    matrix : ndarray, shape (3, 3)
+    matrix : ndarray, shape (..., 3, 3)
         A rotation matrix up to rounding.
 
     Returns
     -------
-    ndarray, shape (3, 3)
+    ndarray, shape (..., 3, 3)
 
     """
-    return 1.5 * matrix - 0.5 * matrix @ (matrix.T @ matrix)
+    return 1.5 * matrix - 0.5 * matrix @ (matrix.swapaxes(-1, -2) @ matrix)
 
 
 def cumulative_rotations(steps: Array) -> Array:

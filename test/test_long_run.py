@@ -15,7 +15,9 @@
 
 from ins_align.earth import EARTH_RATE, matrix_earth_turned
 from ins_align.prediction import Prediction
-from ins_align.rotation import exp_so3, orthonormalized
+from ins_align.preintegration import Noise, preintegrate, split_at_epochs
+from ins_align.rotation import exp_so3, orthonormalized, skew
+from ins_align.whitening import Chain
 import numpy as np
 import pytest
 
@@ -45,6 +47,34 @@ def test_chained_intervals_of_a_day():
         assert np.linalg.det(C) == pytest.approx(1.0, abs=2e-15)
     # Rounding wanders: 432000 steps of 1e-16 each come to 1e-13, what drifts to 1e-10.
     assert worst < 1e-12
+
+
+def test_preintegrated_intervals_chained_through_a_day():
+    """IMU samples of a rate and a force that stay, against their integrals in closed form."""
+    rate, force = np.array([0.3, -0.2, 0.5]), np.array([1.0, 9.0, -3.0])
+    hour_ns, epoch_ns, sample_ns = 3600 * 10 ** 9, 10 ** 9, 10 ** 8
+    zero, chain = np.zeros(3), Chain.start()
+    for hour in range(24):
+        # Samples between the epochs, not on them, and two before and after.
+        stamps = np.arange(-sample_ns * 3 // 2, hour_ns + 2 * sample_ns, sample_ns) + hour * hour_ns
+        epochs = np.arange(0, hour_ns + 1, epoch_ns) + hour * hour_ns
+        steps = split_at_epochs(stamps, np.tile(rate, (stamps.size, 1)),
+                                np.tile(force, (stamps.size, 1)), epochs, unit=1e-9)
+        nothing = np.zeros((epochs.size - 1, 1))
+        chain = chain.extended(preintegrate(steps, zero, zero, Noise(*[nothing] * 4))).at(-1)
+    size = np.linalg.norm(rate)
+    axis = rate / size
+    along, around = np.outer(axis, axis), skew(axis)
+    across = np.eye(3) - along
+    angle = np.remainder(size * DAY, 2 * np.pi)
+    sine, verse = np.sin(angle) / size, (1 - np.cos(angle)) / size
+    R = along + np.cos(angle) * across + np.sin(angle) * around
+    v = (DAY * along + sine * across + verse * around) @ force
+    p = (DAY ** 2 / 2 * along + verse / size * across + (DAY - sine) / size * around) @ force
+    assert np.abs(chain.R - R).max() < 1e-9         # the angle is known to 1e-11
+    assert np.abs(chain.R.T @ chain.R - np.eye(3)).max() < 1e-11
+    assert np.linalg.norm(chain.v - v) < 1e-10 * np.linalg.norm(v)
+    assert np.linalg.norm(chain.p - p) < 1e-10 * np.linalg.norm(p)
 
 
 def test_attitude_carried_through_a_day():
