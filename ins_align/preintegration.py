@@ -27,6 +27,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 
+FORCE_WINDOW = 0.3      # s, before an epoch: as long as delays are
+
+
 @dataclass(frozen=True)
 class Intervals:
     """
@@ -50,8 +53,12 @@ class Intervals:
         Covariance of the errors (rotation at the start, v, p) that the sensors' noise leaves.
     Q_excess : ndarray, shape (K, 9, 9)
         The same for the noise that was measured in excess of what is stated.
-    omega, f : ndarray, shape (K, 3)
-        Angular rate and specific force at the end of the interval.
+    omega : ndarray, shape (K, 3)
+        Angular rate at the end of the interval.
+    f, f_dot : ndarray, shape (K, 3)
+        Specific force at the end, in the body frame there, and its change per second as seen from
+        a frame that does not turn: of a line through the last `FORCE_WINDOW`, since a single
+        sample holds all of the vibration.
 
     """
 
@@ -70,23 +77,13 @@ class Intervals:
     Q_excess: Array
     omega: Array
     f: Array
-
-    @property
-    def f_dot(self) -> Array:
-        """
-        Change of the specific force per second, shape (K, 3), in the body frame at the end.
-
-        From its value at the end and its mean over the interval, which vibration hardly moves.
-        """
-        duration = np.maximum(self.duration, 1e-3)[:, None]
-        mean = (self.R.transpose(0, 2, 1) @ self.v[..., None])[..., 0] / duration
-        return np.where(self.duration[:, None] > 0, 2 * (self.f - mean) / duration, 0.0)
+    f_dot: Array
 
     @staticmethod
     def empty(capacity: int) -> 'Intervals':
         """Room for `capacity` intervals, to be filled by `put`."""
-        shapes = {'duration': (), 'v': (3,), 'p': (3,), 'omega': (3,), 'f': (3,), 'Q': (9, 9),
-                  'Q_excess': (9, 9)}
+        shapes = {'duration': (), 'v': (3,), 'p': (3,), 'omega': (3,), 'f': (3,), 'f_dot': (3,),
+                  'Q': (9, 9), 'Q_excess': (9, 9)}
         return Intervals(**{field.name: np.zeros((capacity,) + shapes.get(field.name, (3, 3)))
                             for field in fields(Intervals)})
 
@@ -114,7 +111,8 @@ class Intervals:
             'J_vg': accel_sign * self.J_vg, 'J_pg': accel_sign * self.J_pg,
             'J_Rs': gyro_sign * self.J_Rs, 'J_vs': gyro_sign * accel_sign * self.J_vs,
             'J_ps': gyro_sign * accel_sign * self.J_ps,
-            'omega': gyro_sign * self.omega, 'f': accel_sign * self.f})
+            'omega': gyro_sign * self.omega, 'f': accel_sign * self.f,
+            'f_dot': accel_sign * self.f_dot})
 
     def corrected(self, gyro_bias: Array, accel_bias: Array, gyro_scale: Array) -> 'Intervals':
         """
@@ -378,8 +376,27 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
                             (noise.gyro_excess, noise.accel_excess)))
     # Intervals are chained for hours.
     R = orthonormalized(turned[:, -1])
-    return Intervals(duration, R, v, p, -A_sum[:, -1], v_g[:, -1], p_g, -p_a,
-                     J_Rs, J_vs, J_ps, Q, Q_excess, omega[:, -1], f[:, -1])
+    # Mean forces of both halves of the window.
+    half = 0.5 * np.minimum(duration, FORCE_WINDOW)
+    v_half, v_whole = (_at_time(duration - back, passed, dt, v_start, u)
+                       for back in (half, 2 * half))
+    half = np.maximum(half, 1e-9)[:, None]
+    late, early = (v - v_half) / half, (v_half - v_whole) / half
+    ends = np.stack([1.5 * late - 0.5 * early, (late - early) / half], axis=-1)
+    f_end, f_dot = np.moveaxis(R.transpose(0, 2, 1) @ ends, -1, 0)
+    lasts = duration[:, None] > 0
+    return Intervals(duration, R, v, p, -A_sum[:, -1], v_g[:, -1], p_g, -p_a, J_Rs, J_vs, J_ps,
+                     Q, Q_excess, omega[:, -1], np.where(lasts, f_end, f[:, -1]),
+                     np.where(lasts, f_dot, 0.0))
+
+
+def _at_time(time: Array, passed: Array, dt: Array, v_start: Array, u: Array) -> Array:
+    """Velocities, shape (K, 3), at a time within each interval, linear within its steps."""
+    rows = np.arange(time.size)
+    step = np.argmax(passed >= time[:, None], axis=1)
+    dt_here = np.maximum(dt[rows, step], 1e-9)
+    share = 1.0 - (passed[rows, step] - time) / dt_here
+    return v_start[rows, step] + share[:, None] * u[rows, step]
 
 
 def _noise(gyro_variance: Array, accel_variance: Array, dt: Array, remaining: Array,

@@ -56,8 +56,9 @@ def test_preintegrated_intervals_chained_through_a_day():
     zero, chain = np.zeros(3), Chain.start()
     for hour in range(24):
         # Samples between the epochs, not on them, and two before and after.
-        stamps = np.arange(-sample_ns * 3 // 2, hour_ns + 2 * sample_ns, sample_ns) + hour * hour_ns
-        epochs = np.arange(0, hour_ns + 1, epoch_ns) + hour * hour_ns
+        start_ns = hour * hour_ns
+        stamps = start_ns + np.arange(-sample_ns * 3 // 2, hour_ns + 2 * sample_ns, sample_ns)
+        epochs = start_ns + np.arange(0, hour_ns + 1, epoch_ns)
         steps = split_at_epochs(stamps, np.tile(rate, (stamps.size, 1)),
                                 np.tile(force, (stamps.size, 1)), epochs, unit=1e-9)
         nothing = np.zeros((epochs.size - 1, 1))
