@@ -393,7 +393,6 @@ class Aligner:
         else:
             if measured:
                 verdict = self._declaration.update(time_s, initial[1], current[1], fit,
-                                                   method.nuisance().gnss_delay,
                                                    method.unconfirmed)
                 if self._declaration.later_start:
                     method.renew()

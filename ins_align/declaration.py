@@ -82,7 +82,7 @@ class Declaration:
         self._recent_nis = 1.0
         self._rejected = 0
 
-    def update(self, time_s: float, initial: Array, current: Array, fit: Fit, delay: float,
+    def update(self, time_s: float, initial: Array, current: Array, fit: Fit,
                unconfirmed: Callable[[], str]) -> Verdict:
         """
         Judge an epoch.
@@ -96,8 +96,6 @@ class Declaration:
             where only the present one is, `later_start` says that t0 had better move.
         fit : Fit
             How well the data fit the model.
-        delay : float
-            Seconds by which GNSS measurements are found to be older than their stamps.
         unconfirmed : callable
             Asked before a heading is declared: a reason against it in words, or ''.
 
@@ -109,7 +107,7 @@ class Declaration:
         nis = fit.innovation.nis
         if math.isfinite(nis):
             self._recent_nis += (min(nis, 10.0) - self._recent_nis) / RECENT
-        contradiction = self._contradiction(fit, delay)
+        contradiction = self._contradiction(fit)
         factor = fit.factor
         tilt, tilt_now = (math.degrees(_largest_std(P)) * factor for P in (initial, current))
         heading, heading_now = (math.degrees(math.sqrt(P[2, 2])) * factor
@@ -166,7 +164,7 @@ class Declaration:
     def _held(self, since_s: float | None, time_s: float) -> bool:
         return since_s is not None and time_s - since_s >= self.config.hold_time - 1e-6
 
-    def _contradiction(self, fit: Fit, delay: float) -> str:
+    def _contradiction(self, fit: Fit) -> str:
         """Return what in the data contradicts the model; empty when nothing does."""
         if fit.dof < MIN_DOF:
             return ''
@@ -175,9 +173,9 @@ class Declaration:
             return (f'{rejected} of {fit.offered} GNSS epochs do not fit the rest: check the '
                     'velocity frame, the IMU axes and signs, the lever arm, the GNSS delay')
         config = self.config
-        unexplained = abs(delay - config.gnss_delay)
+        unexplained = abs(fit.delay - config.gnss_delay)
         if unexplained > min(DELAY_SIGMAS * config.gnss_delay_std, MAX_DELAY) > 0:
-            return (f'the GNSS stamps seem to be {delay:.2f} s late, gnss_delay is '
+            return (f'the GNSS stamps seem to be {fit.delay:.2f} s late, gnss_delay is '
                     f'{config.gnss_delay:g} and gnss_delay_std {config.gnss_delay_std:g}: check '
                     'the clocks, or set gnss_delay')
         misfit = max(fit.chi2 / fit.dof, self._recent_nis)

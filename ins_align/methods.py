@@ -96,6 +96,7 @@ class Fit:
     rejected_velocity: int
     rejected_position: int
     offered: int                # epochs that were offered to the model, rejected ones included
+    delay: float                # of the GNSS, seconds; the told one where none is estimated
 
     @property
     def factor(self) -> float:
@@ -306,13 +307,14 @@ class MapMethod:
         """Return how well the data fit."""
         solution = self._estimator.solution
         if solution is None:
-            return Fit(math.nan, 0, NOTHING_NEW, False, 0, 0, self._offered)
+            return Fit(math.nan, 0, NOTHING_NEW, False, 0, 0, self._offered,
+                       self._config.gnss_delay)
         rejected = solution.rejected
         past_chi2, past_dof = self._past
         return Fit(past_chi2 + solution.chi2, past_dof + solution.dof, self._innovation,
                    self._estimator.converged,
                    self._rejected[0] + rejected[0], self._rejected[1] + rejected[1],
-                   self._offered)
+                   self._offered, self._config.gnss_delay + float(solution.estimate.delay))
 
     def settle(self) -> None:
         """Relinearise now if that is worth it at all."""
@@ -454,9 +456,11 @@ class NoteMethod:
         """Return how well the data fit."""
         dof = 3 * self._moments.count - 3 - 3 * self._nuisance
         if self._solution is None or dof <= 0:
-            return Fit(math.nan, 0, NOTHING_NEW, False, 0, 0, self._offered)
+            return Fit(math.nan, 0, NOTHING_NEW, False, 0, 0, self._offered,
+                       self._config.gnss_delay)
         variance = self._variance / self._offered
-        return Fit(self._residual / variance, dof, NOTHING_NEW, True, 0, 0, self._offered)
+        return Fit(self._residual / variance, dof, NOTHING_NEW, True, 0, 0, self._offered,
+                   self._config.gnss_delay)
 
     def settle(self) -> None:
         """Nothing to bring: the estimate is closed form."""

@@ -24,7 +24,7 @@ import pytest
 def fit(**changes):
     changes['innovation'] = Innovation(changes.pop('nis', 1.0), np.zeros(3))
     values = {'chi2': 300.0, 'dof': 300, 'converged': True, 'rejected_velocity': 0,
-              'rejected_position': 0, 'offered': 102}
+              'rejected_position': 0, 'offered': 102, 'delay': 0.0}
     return Fit(**{**values, **changes})
 
 
@@ -39,7 +39,7 @@ def judge(declaration, start, seconds, P, the_fit=None, rate=5.0, doubt='', dela
     """Judge a stretch of epochs; return the last verdict."""
     verdict = None
     for k in range(int(seconds * rate) + 1):
-        verdict = declaration.update(start + k / rate, P, P, the_fit or fit(), delay,
+        verdict = declaration.update(start + k / rate, P, P, the_fit or fit(delay=delay),
                                      lambda: doubt)
     return verdict
 
@@ -92,7 +92,7 @@ def test_thresholds_are_the_parameters():
 def test_the_worse_of_initial_and_current_counts():
     declaration = Declaration(Config(hold_time=2.0))
     for k in range(20):
-        verdict = declaration.update(0.2 * k, GOOD, LEVEL, fit(), 0.0, str)
+        verdict = declaration.update(0.2 * k, GOOD, LEVEL, fit(), str)
     assert verdict.state is State.LEVELLED and not declaration.later_start
 
 
@@ -100,18 +100,18 @@ def test_a_later_start_is_wanted_where_only_the_present_heading_is_good():
     declaration = Declaration(Config(hold_time=2.0))
     wanted = []
     for k in range(20):
-        verdict = declaration.update(0.2 * k, LEVEL, GOOD, fit(), 0.0, str)
+        verdict = declaration.update(0.2 * k, LEVEL, GOOD, fit(), str)
         wanted.append(declaration.later_start)
     assert verdict.state is State.LEVELLED
     assert wanted == [False] * 10 + [True] * 10
     # When t0 has moved, what has held before it counts.
-    assert declaration.update(4.0, GOOD, GOOD, fit(), 0.0, str).state is State.ALIGNED
+    assert declaration.update(4.0, GOOD, GOOD, fit(), str).state is State.ALIGNED
     assert not declaration.later_start
 
 
 def test_no_later_start_while_the_signs_are_in_doubt():
     declaration = Declaration(Config(hold_time=0.0))
-    declaration.update(0.0, LEVEL, GOOD, fit(), 0.0, lambda: 'turn')
+    declaration.update(0.0, LEVEL, GOOD, fit(), lambda: 'turn')
     assert not declaration.later_start
 
 
@@ -171,7 +171,7 @@ def test_doubt_is_not_asked_about_before_everything_else_holds():
 
     declaration = Declaration(Config(hold_time=2.0))
     for k in range(5):
-        declaration.update(0.2 * k, LEVEL, LEVEL, fit(), 0.0, never)
+        declaration.update(0.2 * k, LEVEL, LEVEL, fit(), never)
 
 
 @pytest.mark.parametrize('told, delay, believed', [

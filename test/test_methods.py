@@ -99,9 +99,9 @@ def test_what_the_note_does_not_estimate_it_says_to_be_as_configured():
 
 def test_a_posteriori_factor_only_widens():
     good = Fit(chi2=50.0, dof=100, innovation=NOTHING_NEW, converged=True, rejected_velocity=0,
-               rejected_position=0, offered=40)
+               rejected_position=0, offered=40, delay=0.0)
     bad = Fit(chi2=400.0, dof=100, innovation=NOTHING_NEW, converged=True, rejected_velocity=0,
-              rejected_position=0, offered=40)
+              rejected_position=0, offered=40, delay=0.0)
     empty = Fit(chi2=0.0, dof=0, innovation=NOTHING_NEW, converged=True, rejected_velocity=0,
-                rejected_position=0, offered=2)
+                rejected_position=0, offered=2, delay=0.0)
     assert good.factor == 1.0 and bad.factor == 2.0 and empty.factor == np.inf
