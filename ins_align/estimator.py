@@ -99,9 +99,11 @@ class MapEstimator:
     MAX_EXCESS = 3.0
     MAX_REJECTED = 0.3
     # Ages (s) at which t0 moves on: when no heading is known to within this (rad), though the
-    # velocity is (m/s); when neither is; when both are. The first two only once the gyros' biases
-    # may have turned the heading by so much (rad): a good IMU finds north at rest.
-    IDLE_TIME, IDLE_HEADING_STD, IDLE_VELOCITY_STD = 5.0, 1.2, 0.2
+    # velocity is (m/s) and the unknown turn is about the vertical to within this (rad: a vehicle
+    # that gathers speed soon shows its heading); when neither is; when both are. The first two
+    # only once the gyros' biases may have turned the heading by so much (rad): a good IMU finds
+    # north at rest.
+    IDLE_TIME, IDLE_HEADING_STD, IDLE_VELOCITY_STD, IDLE_AXIS_TILT = 5.0, 1.2, 0.2, 0.02
     MAX_IDLE_TIME, MAX_AGE = 60.0, 120.0
     IDLE_HEADING_LOSS = math.radians(0.4)
     # Innovations whose median scales the gate, so that noise beyond what is stated does not
@@ -265,7 +267,8 @@ class MapEstimator:
         if age * bias_std < self.IDLE_HEADING_LOSS:
             return False
         start = variances[START_VELOCITY]
-        still = start[0] + start[1] < 2 * self.IDLE_VELOCITY_STD ** 2
+        still = (start[0] + start[1] < 2 * self.IDLE_VELOCITY_STD ** 2
+                 and self.free_axis_tilt < self.IDLE_AXIS_TILT)
         return bool(age >= (self.IDLE_TIME if still else self.MAX_IDLE_TIME))
 
     def _run(self, s: Solution, gate: Gate | None) -> None:
@@ -437,6 +440,18 @@ class MapEstimator:
         if self.solution is not None:
             full[self.columns] = self.solution.P.diagonal()
         return full
+
+    @property
+    def free_axis_tilt(self) -> float:
+        """
+        Angle between the vertical and the axis about which the attitude is known least, rad.
+
+        Of a vehicle that gathers speed that axis is the specific force.
+        """
+        if self.solution is None:
+            return 0.0
+        east, north, up = self.solution.P[:3, 2].tolist()
+        return math.hypot(east, north) / up
 
     @property
     def heading_std(self) -> float:

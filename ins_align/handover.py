@@ -67,6 +67,9 @@ def prior_from_now(estimator: MapEstimator, C_n0n: Array, shift_v: Array, shift_
         gyro_bias = slice(9 + GYRO_BIAS.start, 9 + GYRO_BIAS.stop)
         least = np.linalg.eigvalsh(joint[gyro_bias, gyro_bias])[0]
         joint[gyro_bias, gyro_bias] += max(EARTH_RATE ** 2 - least, 0.0) * np.eye(3)
+        # So it is with the tilt of a vehicle that gathers speed: what may be anything is the turn
+        # about the specific force, which leads the vertical round a circle.
+        joint[:2, :2] += estimator.free_axis_tilt ** 2 * np.eye(2)
     # Places of what is kept in the joint covariance, and in the vector of unknowns.
     kept = np.flatnonzero(np.isin(columns, BODY_FIXED))
     start = np.arange(2 if heading_free else estimator.size)
