@@ -59,6 +59,8 @@ class Intervals:
         Specific force at the end, in the body frame there, and its change per second as seen from
         a frame that does not turn: of a line through the last `FORCE_WINDOW`, since a single
         sample holds all of the vibration.
+    rate, rate_dot : ndarray, shape (K, 3)
+        Angular rate at the end and its change per second, of such a line.
 
     """
 
@@ -78,12 +80,14 @@ class Intervals:
     omega: Array
     f: Array
     f_dot: Array
+    rate: Array
+    rate_dot: Array
 
     @staticmethod
     def empty(capacity: int) -> 'Intervals':
         """Room for `capacity` intervals, to be filled by `put`."""
         shapes = {'duration': (), 'v': (3,), 'p': (3,), 'omega': (3,), 'f': (3,), 'f_dot': (3,),
-                  'Q': (9, 9), 'Q_excess': (9, 9)}
+                  'rate': (3,), 'rate_dot': (3,), 'Q': (9, 9), 'Q_excess': (9, 9)}
         return Intervals(**{field.name: np.zeros((capacity,) + shapes.get(field.name, (3, 3)))
                             for field in fields(Intervals)})
 
@@ -112,7 +116,8 @@ class Intervals:
             'J_Rs': gyro_sign * self.J_Rs, 'J_vs': gyro_sign * accel_sign * self.J_vs,
             'J_ps': gyro_sign * accel_sign * self.J_ps,
             'omega': gyro_sign * self.omega, 'f': accel_sign * self.f,
-            'f_dot': accel_sign * self.f_dot})
+            'f_dot': accel_sign * self.f_dot, 'rate': gyro_sign * self.rate,
+            'rate_dot': gyro_sign * self.rate_dot})
 
     def corrected(self, gyro_bias: Array, accel_bias: Array, gyro_scale: Array) -> 'Intervals':
         """
@@ -130,7 +135,8 @@ class Intervals:
                   + product(self.J_vs, gyro_scale)),
             'p': (self.p + product(self.J_pg, gyro_bias) + product(self.J_pa, accel_bias)
                   + product(self.J_ps, gyro_scale)),
-            'omega': self.omega * (1 - gyro_scale) - gyro_bias, 'f': self.f - accel_bias})
+            'omega': self.omega * (1 - gyro_scale) - gyro_bias, 'f': self.f - accel_bias,
+            'rate': self.rate * (1 - gyro_scale) - gyro_bias})
 
 
 @dataclass(frozen=True)
@@ -376,27 +382,31 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
                             (noise.gyro_excess, noise.accel_excess)))
     # Intervals are chained for hours.
     R = orthonormalized(turned[:, -1])
-    # Mean forces of both halves of the window.
+    # Mean forces and rates of both halves of the window.
     half = 0.5 * np.minimum(duration, FORCE_WINDOW)
-    v_half, v_whole = (_at_time(duration - back, passed, dt, v_start, u)
-                       for back in (half, 2 * half))
+    parts = np.concatenate([u, theta], axis=-1)
+    sums = np.cumsum(parts, axis=1)
+    middle, start = (_at_time(duration - back, passed, dt, sums - parts, parts)
+                     for back in (half, 2 * half))
     half = np.maximum(half, 1e-9)[:, None]
-    late, early = (v - v_half) / half, (v_half - v_whole) / half
-    ends = np.stack([1.5 * late - 0.5 * early, (late - early) / half], axis=-1)
-    f_end, f_dot = np.moveaxis(R.transpose(0, 2, 1) @ ends, -1, 0)
+    late, early = (sums[:, -1] - middle) / half, (middle - start) / half
+    line = np.stack([1.5 * late - 0.5 * early, (late - early) / half], axis=-1)
+    f_end, f_dot = np.moveaxis(R.transpose(0, 2, 1) @ line[:, :3], -1, 0)
+    rate, rate_dot = np.moveaxis(line[:, 3:], -1, 0)
     lasts = duration[:, None] > 0
     return Intervals(duration, R, v, p, -A_sum[:, -1], v_g[:, -1], p_g, -p_a, J_Rs, J_vs, J_ps,
                      Q, Q_excess, omega[:, -1], np.where(lasts, f_end, f[:, -1]),
-                     np.where(lasts, f_dot, 0.0))
+                     np.where(lasts, f_dot, 0.0), np.where(lasts, rate, omega[:, -1]),
+                     np.where(lasts, rate_dot, 0.0))
 
 
-def _at_time(time: Array, passed: Array, dt: Array, v_start: Array, u: Array) -> Array:
-    """Velocities, shape (K, 3), at a time within each interval, linear within its steps."""
+def _at_time(time: Array, passed: Array, dt: Array, start: Array, parts: Array) -> Array:
+    """Return sums of parts at a time in each interval, linear within its steps, shape (K, m)."""
     rows = np.arange(time.size)
     step = np.argmax(passed >= time[:, None], axis=1)
     dt_here = np.maximum(dt[rows, step], 1e-9)
     share = 1.0 - (passed[rows, step] - time) / dt_here
-    return v_start[rows, step] + share[:, None] * u[rows, step]
+    return start[rows, step] + share[:, None] * parts[rows, step]
 
 
 def _noise(gyro_variance: Array, accel_variance: Array, dt: Array, remaining: Array,

@@ -201,51 +201,57 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
 
     """
     K = gnss.time.size
-    C, lever, delay = point.C, point.lever_b, point.delay
+    C, lever = point.C, point.lever_b
+    # On the way to the solution the delay may be absurd: from there on the model goes straight.
+    delay = min(max(point.delay, -MAX_DELAY), MAX_DELAY)
+    beyond = point.delay - delay
     CR = C @ chain.R
-    lever_v = _turned(CR, cross(interval.omega, lever))         # in n0
-    lever_p = CR @ lever
-    Ca_v = _turned(C, chain.v) + lever_v
-    Ca_p = _turned(C, chain.p) + lever_p
-    # Over the delay the acceleration is taken linear, from the specific force at the epoch and
-    # its mean over the interval.
-    force = _turned(CR, interval.f)
-    acceleration = force + gnss.gravity
-    jerk = _turned(CR, interval.f_dot)
-    acceleration_then = acceleration - delay * jerk
-    ground_velocity = point.start_velocity + Ca_v + gnss.offset
+    moved_v, moved_p = _turned(C, chain.v), _turned(C, chain.p)         # in n0
+    Ca_v = moved_v + _turned(CR, cross(interval.omega, lever))
+    Ca_p = moved_p + CR @ lever
+    # Over the delay the specific force is taken linear, and the acceleration of the antenna about
+    # the IMU constant: what both saw then.
+    force, jerk = _turned(CR, interval.f), _turned(CR, interval.f_dot)
+    omega, rate, rate_dot = (skew(each) for each in (
+        interval.omega, interval.rate, interval.rate_dot))
+    swing, swing_dot = CR @ omega, CR @ (rate_dot + rate @ rate)
+    pushed = force + _turned(swing_dot, lever)
+    seen_v = Ca_v - delay * (pushed - delay / 2 * jerk)
+    seen_p = Ca_p - delay * (Ca_v - delay / 2 * (pushed - delay / 3 * jerk))
+    ground_velocity = point.start_velocity + gnss.offset
+    seen_velocity = ground_velocity + seen_v - delay * gnss.gravity
     Y = np.zeros((K, 6, 1 + SIZE))
-    Y[:, VELOCITY, 0] = (gnss.s[:, VELOCITY] - point.start_velocity - Ca_v
-                         + delay * (acceleration - 0.5 * delay * jerk))
+    Y[:, VELOCITY, 0] = (gnss.s[:, VELOCITY] - point.start_velocity - seen_v
+                         + delay * gnss.gravity)
     Y[:, POSITION, 0] = (gnss.s[:, POSITION] - point.start_position
-                         - gnss.time[:, None] * point.start_velocity - Ca_p
-                         + delay * (ground_velocity - 0.5 * delay * acceleration))
-    # The measurement saw the chain as it was before the delay. An absurd one, on the way to the
-    # solution, would lead the derivatives astray.
+                         - gnss.time[:, None] * point.start_velocity - seen_p
+                         + delay * (ground_velocity - delay / 2 * gnss.gravity))
     H = Y[:, :, 1:]
-    delay = min(max(delay, -MAX_DELAY), MAX_DELAY)
-    seen_v = Ca_v - delay * force
-    seen_p = Ca_p - delay * (Ca_v - 0.5 * delay * force)
-    lever_v_skew, lever_p_skew = skew(lever_v), skew(lever_p)
     eye = np.eye(3)
     H[:, VELOCITY, ATTITUDE] = -skew(seen_v)
     H[:, POSITION, ATTITUDE] = -skew(seen_p)
     C_R_g, C_v_g, C_v_a = C @ chain.R_g, C @ chain.v_g, C @ chain.v_a
-    CR_lever = CR @ skew(lever)
-    H[:, VELOCITY, GYRO] = C_v_g - (lever_v_skew - delay * skew(force)) @ C_R_g
-    H[:, VELOCITY, GYRO_BIAS] += CR_lever
-    H[:, VELOCITY, GYRO_SCALE] += CR_lever * interval.omega[:, None, :]
-    H[:, POSITION, GYRO] = C @ chain.p_g - delay * C_v_g - lever_p_skew @ C_R_g
+    # What is told in the body frame of now turns with the gyros' errors since t0.
+    H[:, VELOCITY, GYRO] = C_v_g - skew(seen_v - moved_v) @ C_R_g
+    H[:, POSITION, GYRO] = (C @ chain.p_g - delay * C_v_g
+                            - skew(seen_p - moved_p + delay * moved_v) @ C_R_g)
+    # And they are in the rates with which the lever arm swings, now and then.
+    arm = skew(lever)
+    now_g, dot_g = CR @ arm, CR @ (skew(cross(interval.rate, lever)) + rate @ arm)
+    for errors, at_end, of_line in ((GYRO_BIAS, 1.0, 1.0), (
+            GYRO_SCALE, interval.omega[:, None, :], interval.rate[:, None, :])):
+        H[:, VELOCITY, errors] += now_g * at_end - delay * dot_g * of_line
+        H[:, POSITION, errors] -= delay * (now_g * at_end - delay / 2 * dot_g * of_line)
     H[:, VELOCITY, ACCEL_BIAS] = C_v_a + delay * CR
     H[:, POSITION, ACCEL_BIAS] = C @ chain.p_a - delay * C_v_a
     H[:, VELOCITY, START_VELOCITY] = eye
     H[:, POSITION, START_VELOCITY] = (gnss.time - delay)[:, None, None] * eye
     H[:, POSITION, START_POSITION] = eye
-    swing = CR @ skew(interval.omega)
-    H[:, VELOCITY, LEVER_ARM] = swing
-    H[:, POSITION, LEVER_ARM] = CR - delay * swing
-    H[:, VELOCITY, DELAY.start] = -acceleration_then
-    H[:, POSITION, DELAY.start] = -(ground_velocity - delay * acceleration)
+    H[:, VELOCITY, LEVER_ARM] = swing - delay * swing_dot
+    H[:, POSITION, LEVER_ARM] = CR - delay * (swing - delay / 2 * swing_dot)
+    H[:, VELOCITY, DELAY.start] = -(pushed - delay * jerk + gnss.gravity)
+    H[:, POSITION, DELAY.start] = -seen_velocity
+    Y[:, :, 0] -= beyond * H[:, :, DELAY.start]
     return Y
 
 

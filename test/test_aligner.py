@@ -506,6 +506,35 @@ def test_whatever_is_declared_is_right(scenario, grade):
         assert epochs[-1].state is State.ALIGNED
 
 
+@pytest.mark.parametrize('delay', (0.0, 0.1))
+@pytest.mark.parametrize('seed', range(4))
+def test_sharp_positions_of_a_car_that_pulls_away_at_once(seed, delay):
+    """While it gathers speed, any turn about the specific force fits, not about the vertical."""
+    s = simulated('car', imu_grade='mems', seed=seed, duration=40.0, position_std=0.02,
+                  gnss_delay=delay)
+    aligner = Aligner(Config(lever_arm=tuple(s.lever_arm)))
+    epochs = feed(aligner, s, velocity=False)
+    declared = next(epoch for epoch in epochs if epoch.state is State.ALIGNED)
+    assert declared.t_s < 20.0
+    for attitude in (declared.initial, declared.current, aligner.status().initial):
+        assert np.all(np.abs(error_of(attitude, s)) <= 4 * np.sqrt(np.diag(attitude.covariance)))
+
+
+@pytest.mark.parametrize('kind', ('velocity', 'position'))
+@pytest.mark.parametrize('seed', range(3))
+def test_sharp_gnss_that_is_late_sees_the_lever_arm_swing(seed, kind):
+    sharp = {'velocity_std': 0.05} if kind == 'velocity' else {'position_std': 0.02}
+    s = simulated('launch', imu_grade='tactical', seed=seed, duration=60.0, gnss_rate=5.0,
+                  gnss_delay=0.17, lever_arm=(0.9, 1.3, -1.3), **sharp)
+    aligner = Aligner(Config(imu_grade='tactical', lever_arm=tuple(s.lever_arm)))
+    feed(aligner, s, velocity=kind == 'velocity')
+    status = aligner.status()
+    assert status.state is State.ALIGNED
+    assert abs(status.gnss_delay - 0.17) < 0.01
+    for attitude in (status.initial, status.current):
+        assert np.all(np.abs(error_of(attitude, s)) <= 4 * np.sqrt(np.diag(attitude.covariance)))
+
+
 def test_standing_first_neither_spoils_nor_delays():
     late = simulated('car', imu_grade='mems', duration=75.0, seed=4, stand_still=40.0)
     once = simulated('car', imu_grade='mems', duration=40.0, seed=4)

@@ -132,10 +132,22 @@ def test_force_at_the_end_is_of_a_line_through_the_last_of_it(t):
     early = both - late
     assert np.allclose(interval.f[0], 1.5 * late - 0.5 * early, atol=1e-4)
     assert np.allclose(interval.f_dot[0], (late - early) / half, atol=1e-3)
+    assert np.allclose(interval.rate[0], [0.0, 0.0, w])
+    assert np.allclose(interval.rate_dot[0], 0.0, atol=1e-12)
     # What it is for: the velocity of a moment ago.
     for back in (0.05, 0.1, 2 * half):
         line = back * interval.f[0] - 0.5 * back ** 2 * interval.f_dot[0]
         assert np.allclose(line, gained(back), atol=w * w * 2.0 * half ** 2 / 3 * back)
+
+
+def test_rate_at_the_end_is_of_a_line_through_the_last_of_it():
+    stamps = np.arange(-2, 103) * 0.01
+    turn, gain = np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.4, -0.7])
+    steps = split_at_epochs(stamps, turn + stamps[:, None] * gain, np.zeros((stamps.size, 3)),
+                            np.array([0.0, 0.45, 1.0]))
+    interval = preintegrate(steps, ZERO, ZERO, NOISE)
+    assert np.allclose(interval.rate, turn + np.array([[0.45], [1.0]]) * gain, atol=1e-12)
+    assert np.allclose(interval.rate_dot, gain, atol=1e-11)
 
 
 def test_vibration_hardly_reaches_the_force_at_the_end():

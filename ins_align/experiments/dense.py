@@ -39,6 +39,7 @@ import numpy as np
 # Nothing more than "somewhere on the circle" is known of an angle (rad): keeps the information
 # regular where the motion shows no heading.
 _ATTITUDE_STD = math.pi / math.sqrt(3)
+SWING_STEP = 0.1        # s, of the differences that give the angular acceleration
 
 
 @dataclass(frozen=True)
@@ -221,6 +222,7 @@ class _Path:
     int_Gamma: Array
     M: Array
     omega: Array          # of the body to inertial space, body axes
+    omega_dot: Array
     acceleration: Array   # over ground
     v_ground: Array
     C_n0n: Array
@@ -246,8 +248,19 @@ def _path(time: Array, C: Array, omega: Array, f: Array, at: Array, C_n0n: Array
     M = _cumulative(time, z[:, :, None] * z[:, None, :])
     gravity = np.einsum('nij,nj->ni', C_n0n, g_n)
     return _Path(time[at], C[at], U[at], P[at], S[at], _cumulative(time, S)[at], Theta[at],
-                 Gamma[at], _cumulative(time, Gamma)[at], M[at], omega[at], force[at] + gravity,
+                 Gamma[at], _cumulative(time, Gamma)[at], M[at], omega[at],
+                 _rate_of_change(time, omega)[at], force[at] + gravity,
                  np.einsum('nij,nj->ni', C_n0n, v_n), C_n0n)
+
+
+def _rate_of_change(time: Array, omega: Array) -> Array:
+    """Derive the angular rate: second differences of its integral, which calm noise."""
+    angle = _cumulative(time, omega)
+    middle = np.clip(time, time[0] + SWING_STEP, time[-1] - SWING_STEP)
+    before, here, after = (
+        np.stack([np.interp(middle + step, time, column) for column in angle.T], axis=1)
+        for step in (-SWING_STEP, 0.0, SWING_STEP))
+    return (after - 2 * here + before) / SWING_STEP ** 2
 
 
 def _grid(imu_ns: np.ndarray, epochs_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -374,7 +387,8 @@ def _design(path: _Path, lever_b: Array) -> Array:
     position[..., START_POSITION] = np.eye(3)
     velocity[..., LEVER_ARM] = path.C @ skew(path.omega)
     position[..., LEVER_ARM] = path.C
-    velocity[..., DELAY] = -path.acceleration[..., None]
+    swung = np.cross(path.omega_dot, lever_b) + np.cross(path.omega, np.cross(path.omega, lever_b))
+    velocity[..., DELAY] = -(path.acceleration + np.einsum('nij,nj->ni', path.C, swung))[..., None]
     position[..., DELAY] = -path.v_ground[..., None]
     return H.reshape(-1, SIZE)
 
