@@ -505,7 +505,13 @@ def _whitened(V: Array, columns: Array) -> Array:
 
 
 def _inverse(matrix: Array) -> Array:
-    """Inverse of a symmetric positive definite matrix whose rows differ widely in scale."""
+    """
+    Inverse of a symmetric positive definite matrix whose rows differ widely in scale.
+
+    nan where there is no information about an unknown: one position says nothing of velocity.
+    """
+    if not np.diag(matrix).all():
+        return np.full(matrix.shape, math.nan)
     scale = 1 / np.sqrt(np.diag(matrix))
     return np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
 
