@@ -47,7 +47,7 @@ HEADER = ('fault', 'runs', 'within 3 sigma', '3 to 5', 'beyond 5', 'not declared
 # Seeds of the three parts do not meet.
 SILENT_SEED, TIME_SEED = 100_000, 200_000
 # A run of the second and the third part for so many of the first.
-SILENT_PART, TIME_PART = 80, 40
+SILENT_PART, TIME_PART = 80, 10
 # What the aligner of the third part is told beside the very model of the simulation; None: that
 # neither, but the defaults.
 TOLD: tuple[dict[str, Any] | None, ...] = ({}, {'trust_imu_axes': True}, None)
