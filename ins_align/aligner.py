@@ -25,7 +25,7 @@ import math
 from typing import NamedTuple
 
 from ins_align.antenna import Antenna
-from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer
+from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer, PAIR_NS
 from ins_align.config import Config, ConfigError, parameters
 from ins_align.declaration import Declaration, State, Verdict
 from ins_align.earth import EARTH_RATE
@@ -101,7 +101,8 @@ class Aligner:
     def _start_over(self, prior: Prior | None) -> None:
         """Forget everything but the counts and the prior."""
         self._imu = ImuBuffer(self._lateness_ns, self.counts)
-        self._gnss = GnssBuffer(self._lateness_ns, self.counts)
+        self._gnss = GnssBuffer(self._lateness_ns, self.counts,
+                                0 if self.config.use_velocity is False else PAIR_NS)
         self._forget_alignment(prior)
 
     def _forget_alignment(self, prior: Prior | None) -> None:
@@ -206,9 +207,9 @@ class Aligner:
     def flush(self) -> list[Epoch]:
         """Process the rest, at the end of a recording."""
         newest = self._imu.newest_ns
-        return [] if newest is None else self._process(newest)
+        return [] if newest is None else self._process(newest, last=True)
 
-    def _process(self, upto_ns: int) -> list[Epoch]:
+    def _process(self, upto_ns: int, last: bool = False) -> list[Epoch]:
         self._imu.consolidate()
         stamps = self._imu.stamps
         if stamps.size < 4:
@@ -217,10 +218,11 @@ class Aligner:
         # in the next one.
         upto_ns = min(upto_ns, int(stamps[-3]))
         self._silences = self._find_silences()
-        for message in self._gnss.release(upto_ns):
+        for message in self._gnss.release(upto_ns, last):
             self._dry_epochs(message.stamp_ns)
             self._take(message)
-        self._dry_epochs(upto_ns)
+        waiting_ns = self._gnss.oldest_ns
+        self._dry_epochs(upto_ns if waiting_ns is None else min(upto_ns, waiting_ns))
         self._advance()
         if self._method is None:
             self._imu.forget_before(upto_ns - NOISE_WINDOW_NS)

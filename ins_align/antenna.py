@@ -18,7 +18,7 @@ import math
 
 from ins_align.buffers import GnssEpoch
 from ins_align.config import Config
-from ins_align.earth import SEMI_MAJOR_AXIS
+from ins_align.earth import carried, SEMI_MAJOR_AXIS
 from ins_align.messages import Fix, Velocity
 from ins_align.methods import Epoch
 from ins_align.plausibility import VelocityCheck
@@ -114,12 +114,7 @@ class Antenna:
         dt = (stamp_ns - self._place_ns) * 1e-9
         predicted = self._place
         if predicted is not None and v_n is not None and dt < MAX_CARRIED:
-            latitude, longitude, altitude = predicted
-            east, north, up = v_n.tolist()
-            predicted = (latitude + north * dt / SEMI_MAJOR_AXIS,
-                         longitude + east * dt / (SEMI_MAJOR_AXIS
-                                                  * max(math.cos(latitude), 1e-3)),
-                         altitude + up * dt)
+            predicted = carried(predicted, v_n, dt)
         if fix is not None:
             place = (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg),
                      fix.altitude_m)

@@ -23,6 +23,7 @@ from collections import Counter
 from dataclasses import dataclass
 import math
 
+from ins_align.earth import carried
 from ins_align.messages import Fix, Velocity
 from ins_align.plausibility import IMU_BEFORE
 from ins_align.rotation import Array
@@ -33,6 +34,9 @@ MAX_RATE, MAX_ACCELERATION, MAX_SPEED = 200.0, 2000.0, 2000.0
 # A GNSS stamp this far ahead of the IMU comes from another clock (ns).
 MAX_AHEAD_NS = 10_000_000_000
 MAX_PENDING = 10_000
+# A fix and a velocity that are no further apart than this are of one epoch: many drivers stamp
+# each message when it arrives (ns).
+PAIR_NS = 50_000_000
 NO_FIX, STATUS_UNKNOWN = -1, -2
 # IMU samples that are kept before those wanted: interpolation needs two, the checks the rest.
 KEPT_BEFORE = 2 + IMU_BEFORE
@@ -174,6 +178,20 @@ class GnssEpoch:
     fix: Fix | None = None
     velocity: Velocity | None = None
 
+    def with_other_half(self, other: 'GnssEpoch') -> 'GnssEpoch | None':
+        """Join a fix and a velocity at the velocity's stamp; None if that is not what they are."""
+        fix, velocity = self.fix or other.fix, self.velocity or other.velocity
+        if (fix is None or velocity is None
+                or (self.fix is None) == (other.fix is None)
+                or (self.velocity is None) == (other.velocity is None)):
+            return None
+        latitude, longitude, altitude = carried(
+            (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg), fix.altitude_m),
+            velocity.velocity, (velocity.stamp_ns - fix.stamp_ns) * 1e-9)
+        return GnssEpoch(velocity.stamp_ns, fix._replace(
+            stamp_ns=velocity.stamp_ns, latitude_deg=math.degrees(latitude),
+            longitude_deg=math.degrees(longitude), altitude_m=altitude), velocity)
+
 
 class GnssBuffer:
     """
@@ -185,13 +203,16 @@ class GnssBuffer:
         How much later than newer IMU samples a message may arrive.
     counts : Counter
         Where messages are counted.
+    pair_ns : int
+        A fix and a velocity that are no further apart are of one epoch; 0: where the stamp is one.
 
     """
 
-    def __init__(self, lateness_ns: int, counts: Counter[str]) -> None:
+    def __init__(self, lateness_ns: int, counts: Counter[str], pair_ns: int = 0) -> None:
         """Start empty."""
         self._lateness_ns = lateness_ns
         self._counts = counts
+        self._pair_ns = pair_ns
         self._pending: dict[int, GnssEpoch] = {}
 
     def add_fix(self, fix: Fix, imu_newest_ns: int | None) -> None:
@@ -239,7 +260,36 @@ class GnssBuffer:
             self._counts['gnss_overflow'] += 1
         return self._pending.setdefault(stamp_ns, GnssEpoch(stamp_ns))
 
-    def release(self, upto_ns: int) -> list[GnssEpoch]:
-        """Return and forget the epochs up to a stamp, in order."""
-        ready = sorted(stamp for stamp in self._pending if stamp <= upto_ns)
-        return [self._pending.pop(stamp) for stamp in ready]
+    @property
+    def oldest_ns(self) -> int | None:
+        """Stamp of the oldest message that waits."""
+        return min(self._pending, default=None)
+
+    def release(self, upto_ns: int, last: bool = False) -> list[GnssEpoch]:
+        """
+        Return and forget the epochs up to a stamp, in order.
+
+        A fix or a velocity alone waits for its other half, if that may still come, and what is
+        behind it waits too; `last`: nothing comes any more.
+        """
+        stamps = sorted(self._pending)
+        released = []
+        place = 0
+        while place < len(stamps) and stamps[place] <= upto_ns:
+            epoch, used = self._pending[stamps[place]], 1
+            if self._pair_ns and (epoch.fix is None or epoch.velocity is None):
+                close = (place + 1 < len(stamps)
+                         and stamps[place + 1] - stamps[place] <= self._pair_ns)
+                if close:
+                    joint = epoch.with_other_half(self._pending[stamps[place + 1]])
+                    if joint is not None:
+                        epoch, used = joint, 2
+                elif not last and epoch.stamp_ns + self._pair_ns > upto_ns:
+                    break
+                if epoch.stamp_ns > upto_ns:
+                    break
+            released.append(epoch)
+            place += used
+        for stamp in stamps[:place]:
+            del self._pending[stamp]
+        return released

@@ -18,6 +18,8 @@ Latitude and longitude are radians, altitude is metres above the ellipsoid; ever
 over leading axes.
 """
 
+import math
+
 from ins_align.rotation import Array, cross
 import numpy as np
 from numpy.typing import ArrayLike
@@ -58,6 +60,28 @@ def ecef_from_lla(latitude: ArrayLike, longitude: ArrayLike, altitude: ArrayLike
     return np.stack(np.broadcast_arrays(
         equatorial * np.cos(longitude), equatorial * np.sin(longitude),
         (prime_vertical * (1 - ECCENTRICITY2) + height) * sin_lat), axis=-1)
+
+
+def carried(place: tuple[float, float, float], v_n: Array, dt: float,
+            ) -> tuple[float, float, float]:
+    """
+    Carry a place on with a velocity, on a sphere: good to 1 % of the way.
+
+    Parameters
+    ----------
+    place : (latitude, longitude, altitude)
+        Radians, metres.
+    v_n : ndarray, shape (3,)
+        ENU, m/s.
+    dt : float
+        Seconds, of either sign.
+
+    """
+    latitude, longitude, altitude = place
+    east, north, up = v_n.tolist()
+    return (latitude + north * dt / SEMI_MAJOR_AXIS,
+            longitude + east * dt / (SEMI_MAJOR_AXIS * max(math.cos(latitude), 1e-3)),
+            altitude + up * dt)
 
 
 def matrix_en(latitude: ArrayLike, longitude: ArrayLike) -> Array:

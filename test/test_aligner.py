@@ -535,6 +535,32 @@ def test_sharp_gnss_that_is_late_sees_the_lever_arm_swing(seed, kind):
         assert np.all(np.abs(error_of(attitude, s)) <= 4 * np.sqrt(np.diag(attitude.covariance)))
 
 
+def stamp_fixes_apart(aligner, by_ns):
+    """Make an aligner take fixes with a stamp of their own."""
+    add_fix = aligner.add_fix
+    aligner.add_fix = lambda fix: add_fix(fix._replace(stamp_ns=fix.stamp_ns + by_ns))
+    return aligner
+
+
+@pytest.mark.parametrize('apart', (-20_000_000, 20_000_000))
+def test_receiver_that_stamps_fix_and_velocity_apart(flight, result, apart):
+    """NMEA drivers stamp each sentence: the same answer as with one stamp, but for the place."""
+    epochs = feed(stamp_fixes_apart(Aligner(config_for(flight)), apart), flight)
+    assert len(epochs) == len(result[1])
+    declared, expected = (next(epoch for epoch in run if epoch.state is State.ALIGNED)
+                          for run in (epochs, result[1]))
+    assert declared.t_s == expected.t_s
+    assert np.allclose(declared.initial.C_nb, expected.initial.C_nb, atol=1e-5)
+
+
+def test_wrong_frame_shows_with_stamps_apart_too():
+    s = turning_car(1, velocity_frame='ned')
+    aligner = stamp_fixes_apart(Aligner(config_for(s)), -9_000_000)
+    feed(aligner, s)
+    assert aligner.status().state is State.FAULT
+    assert 'velocity_frame' in aligner.status().reason
+
+
 def test_standing_first_neither_spoils_nor_delays():
     late = simulated('car', imu_grade='mems', duration=75.0, seed=4, stand_still=40.0)
     once = simulated('car', imu_grade='mems', duration=40.0, seed=4)

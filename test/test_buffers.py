@@ -17,7 +17,7 @@ from collections import Counter
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ins_align.buffers import GnssBuffer, ImuBuffer, KEPT_BEFORE
+from ins_align.buffers import GnssBuffer, ImuBuffer, KEPT_BEFORE, PAIR_NS
 from ins_align.messages import Fix, Velocity
 import numpy as np
 import pytest
@@ -246,3 +246,44 @@ def test_gnss_without_imu_is_bounded():
     assert counts['gnss_overflow'] == 2_000
     released = buffer.release(12_000)
     assert len(released) == 10_000 and released[-1].stamp_ns == 11_999
+
+
+def pairing_buffer():
+    return GnssBuffer(LATENESS, Counter(), PAIR_NS)
+
+
+@pytest.mark.parametrize('late', (-30 * MS, 30 * MS))
+def test_fix_and_velocity_with_stamps_of_their_own_are_one_epoch(late):
+    """At the velocity's stamp, the fix carried to it: 30 ms at 100 m/s are 3 m."""
+    buffer = pairing_buffer()
+    for stamp in (1000 * MS, 1200 * MS):
+        buffer.add_fix(fix(stamp), None)
+        buffer.add_velocity(velocity(stamp + late, (0.0, 100.0, 10.0)), None)
+    epochs = buffer.release(2000 * MS)
+    assert [epoch.stamp_ns for epoch in epochs] == [1000 * MS + late, 1200 * MS + late]
+    for epoch in epochs:
+        moved = epoch.fix.latitude_deg - fix(0).latitude_deg
+        assert moved * 111_195 == pytest.approx(late * 1e-9 * 100.0, abs=0.02)
+        assert epoch.fix.altitude_m - fix(0).altitude_m == pytest.approx(late * 1e-9 * 10.0)
+        assert epoch.fix.stamp_ns == epoch.velocity.stamp_ns == epoch.stamp_ns
+
+
+def test_half_an_epoch_waits_for_the_other_half_and_not_for_ever():
+    buffer = pairing_buffer()
+    buffer.add_fix(fix(1000 * MS), None)
+    assert buffer.release(1040 * MS) == [] and buffer.oldest_ns == 1000 * MS
+    buffer.add_velocity(velocity(1045 * MS), None)
+    assert buffer.release(1040 * MS) == []             # the epoch is the velocity's
+    joint, = buffer.release(1045 * MS)
+    assert joint.fix is not None and joint.velocity is not None and buffer.oldest_ns is None
+    buffer.add_velocity(velocity(1200 * MS), None)
+    buffer.add_fix(fix(1300 * MS), None)
+    assert [epoch.stamp_ns for epoch in buffer.release(1310 * MS)] == [1200 * MS]
+    assert [epoch.stamp_ns for epoch in buffer.release(1310 * MS, last=True)] == [1300 * MS]
+
+
+def test_two_of_a_kind_are_no_pair():
+    buffer = pairing_buffer()
+    for stamp in (1000 * MS, 1040 * MS):
+        buffer.add_velocity(velocity(stamp), None)
+    assert len(buffer.release(2000 * MS)) == 2
