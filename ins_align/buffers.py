@@ -178,12 +178,15 @@ class GnssEpoch:
     fix: Fix | None = None
     velocity: Velocity | None = None
 
+    @property
+    def is_half(self) -> bool:
+        """Whether there is a fix or a velocity alone."""
+        return (self.fix is None) != (self.velocity is None)
+
     def with_other_half(self, other: 'GnssEpoch') -> 'GnssEpoch | None':
         """Join a fix and a velocity at the velocity's stamp; None if that is not what they are."""
         fix, velocity = self.fix or other.fix, self.velocity or other.velocity
-        if (fix is None or velocity is None
-                or (self.fix is None) == (other.fix is None)
-                or (self.velocity is None) == (other.velocity is None)):
+        if fix is None or velocity is None or not (self.is_half and other.is_half):
             return None
         latitude, longitude, altitude = carried(
             (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg), fix.altitude_m),
@@ -276,20 +279,16 @@ class GnssBuffer:
         released = []
         place = 0
         while place < len(stamps) and stamps[place] <= upto_ns:
-            epoch, used = self._pending[stamps[place]], 1
-            if self._pair_ns and (epoch.fix is None or epoch.velocity is None):
-                close = (place + 1 < len(stamps)
-                         and stamps[place + 1] - stamps[place] <= self._pair_ns)
-                if close:
-                    joint = epoch.with_other_half(self._pending[stamps[place + 1]])
-                    if joint is not None:
-                        epoch, used = joint, 2
-                elif not last and epoch.stamp_ns + self._pair_ns > upto_ns:
-                    break
-                if epoch.stamp_ns > upto_ns:
-                    break
-            released.append(epoch)
-            place += used
+            epoch = self._pending[stamps[place]]
+            close = next((self._pending[stamp] for stamp in stamps[place + 1:place + 2]
+                          if stamp <= epoch.stamp_ns + self._pair_ns), None)
+            joint = None if close is None else epoch.with_other_half(close)
+            half_may_come = (epoch.is_half and close is None and not last
+                             and epoch.stamp_ns + self._pair_ns > upto_ns)
+            if half_may_come or (joint is not None and joint.stamp_ns > upto_ns):
+                break
+            released.append(joint or epoch)
+            place += 1 if joint is None else 2
         for stamp in stamps[:place]:
             del self._pending[stamp]
         return released

@@ -31,7 +31,7 @@ from ins_align.preintegration import Noise, preintegrate, Steps
 from ins_align.rotation import Array, orthonormalized
 from ins_align.signs import SignCheck
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
-                                Prior, SIZE, UNIFORM_ANGLE_STD)
+                                Prior, SIZE, UNIFORM_ANGLE_STD, Unknowns)
 from ins_align.whitening import Measurements
 import numpy as np
 
@@ -109,6 +109,11 @@ class Fit:
         if self.dof <= 0 or self.chi2 / self.dof < 1 + 3 * math.sqrt(2 / self.dof):
             return 1.0
         return self.chi2 / self.dof
+
+
+def _no_fit(offered: int, delay: float) -> Fit:
+    """Return what is known before there is a solution."""
+    return Fit(math.nan, 0, NOTHING_NEW, False, 0, 0, offered, delay)
 
 
 @dataclass(frozen=True)
@@ -307,14 +312,13 @@ class MapMethod:
         """Return how well the data fit."""
         solution = self._estimator.solution
         if solution is None:
-            return Fit(math.nan, 0, NOTHING_NEW, False, 0, 0, self._offered,
-                       self._config.gnss_delay)
+            return _no_fit(self._offered, self._config.gnss_delay)
         rejected = solution.rejected
         past_chi2, past_dof = self._past
         return Fit(past_chi2 + solution.chi2, past_dof + solution.dof, self._innovation,
                    self._estimator.converged,
                    self._rejected[0] + rejected[0], self._rejected[1] + rejected[1],
-                   self._offered, self._config.gnss_delay + float(solution.estimate.delay))
+                   self._offered, self._delay(solution.estimate))
 
     def settle(self) -> None:
         """Relinearise now if that is worth it at all."""
@@ -329,8 +333,11 @@ class MapMethod:
         x = self._estimator.estimate()
         std = np.sqrt(self._estimator.variances)
         return Nuisance(x.gyro_bias, std[GYRO_BIAS], x.accel_bias, std[ACCEL_BIAS],
-                        x.lever_b, std[LEVER_ARM], float(self._config.gnss_delay + x.delay),
-                        float(std[DELAY][0]))
+                        x.lever_b, std[LEVER_ARM], self._delay(x), float(std[DELAY][0]))
+
+    def _delay(self, x: Unknowns) -> float:
+        """Return the delay of the GNSS, of which the configured part is not in the unknowns."""
+        return float(self._config.gnss_delay + x.delay)
 
     def sensor_errors(self) -> tuple[Array, Array, Array]:
         """Return gyro bias, accelerometer bias and gyro scale factor errors."""
@@ -456,8 +463,7 @@ class NoteMethod:
         """Return how well the data fit."""
         dof = 3 * self._moments.count - 3 - 3 * self._nuisance
         if self._solution is None or dof <= 0:
-            return Fit(math.nan, 0, NOTHING_NEW, False, 0, 0, self._offered,
-                       self._config.gnss_delay)
+            return _no_fit(self._offered, self._config.gnss_delay)
         variance = self._variance / self._offered
         return Fit(self._residual / variance, dof, NOTHING_NEW, True, 0, 0, self._offered,
                    self._config.gnss_delay)

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 
-FORCE_WINDOW = 0.3      # s, before an epoch: as long as delays are
+LINE_WINDOW = 0.3       # s, before an epoch: as long as delays are
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Intervals:
         Angular rate at the end of the interval.
     f, f_dot : ndarray, shape (K, 3)
         Specific force at the end, in the body frame there, and its change per second as seen from
-        a frame that does not turn: of a line through the last `FORCE_WINDOW`, since a single
+        a frame that does not turn: of a line through the last `LINE_WINDOW`, since a single
         sample holds all of the vibration.
     rate, rate_dot : ndarray, shape (K, 3)
         Angular rate at the end and its change per second, of such a line.
@@ -383,10 +383,10 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     # Intervals are chained for hours.
     R = orthonormalized(turned[:, -1])
     # Mean forces and rates of both halves of the window.
-    half = 0.5 * np.minimum(duration, FORCE_WINDOW)
+    half = 0.5 * np.minimum(duration, LINE_WINDOW)
     parts = np.concatenate([u, theta], axis=-1)
-    sums = np.cumsum(parts, axis=1)
-    middle, start = (_at_time(duration - back, passed, dt, sums - parts, parts)
+    sums = np.concatenate([v_end, np.cumsum(theta, axis=1)], axis=-1)
+    middle, start = (_at_time(duration - back, passed, dt, sums, parts)
                      for back in (half, 2 * half))
     half = np.maximum(half, 1e-9)[:, None]
     late, early = (sums[:, -1] - middle) / half, (middle - start) / half
@@ -400,13 +400,12 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
                      np.where(lasts, rate_dot, 0.0))
 
 
-def _at_time(time: Array, passed: Array, dt: Array, start: Array, parts: Array) -> Array:
+def _at_time(time: Array, passed: Array, dt: Array, sums: Array, parts: Array) -> Array:
     """Return sums of parts at a time in each interval, linear within its steps, shape (K, m)."""
     rows = np.arange(time.size)
     step = np.argmax(passed >= time[:, None], axis=1)
-    dt_here = np.maximum(dt[rows, step], 1e-9)
-    share = 1.0 - (passed[rows, step] - time) / dt_here
-    return start[rows, step] + share[:, None] * parts[rows, step]
+    ahead = (passed[rows, step] - time) / np.maximum(dt[rows, step], 1e-9)
+    return sums[rows, step] - ahead[:, None] * parts[rows, step]
 
 
 def _noise(gyro_variance: Array, accel_variance: Array, dt: Array, remaining: Array,

@@ -212,20 +212,20 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     # Over the delay the specific force is taken linear, and the acceleration of the antenna about
     # the IMU constant: what both saw then.
     force, jerk = _turned(CR, interval.f), _turned(CR, interval.f_dot)
-    omega, rate, rate_dot = (skew(each) for each in (
-        interval.omega, interval.rate, interval.rate_dot))
-    swing, swing_dot = CR @ omega, CR @ (rate_dot + rate @ rate)
+    rate_skew = skew(interval.rate)
+    swing = CR @ skew(interval.omega)
+    swing_dot = CR @ (skew(interval.rate_dot) + rate_skew @ rate_skew)
     pushed = force + _turned(swing_dot, lever)
     seen_v = Ca_v - delay * (pushed - delay / 2 * jerk)
     seen_p = Ca_p - delay * (Ca_v - delay / 2 * (pushed - delay / 3 * jerk))
-    ground_velocity = point.start_velocity + gnss.offset
-    seen_velocity = ground_velocity + seen_v - delay * gnss.gravity
+    start_velocity = point.start_velocity + gnss.offset                 # over ground
+    ground_velocity = start_velocity + seen_v - delay * gnss.gravity
     Y = np.zeros((K, 6, 1 + SIZE))
     Y[:, VELOCITY, 0] = (gnss.s[:, VELOCITY] - point.start_velocity - seen_v
                          + delay * gnss.gravity)
     Y[:, POSITION, 0] = (gnss.s[:, POSITION] - point.start_position
                          - gnss.time[:, None] * point.start_velocity - seen_p
-                         + delay * (ground_velocity - delay / 2 * gnss.gravity))
+                         + delay * (start_velocity - delay / 2 * gnss.gravity))
     H = Y[:, :, 1:]
     eye = np.eye(3)
     H[:, VELOCITY, ATTITUDE] = -skew(seen_v)
@@ -237,7 +237,7 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
                             - skew(seen_p - moved_p + delay * moved_v) @ C_R_g)
     # And they are in the rates with which the lever arm swings, now and then.
     arm = skew(lever)
-    now_g, dot_g = CR @ arm, CR @ (skew(cross(interval.rate, lever)) + rate @ arm)
+    now_g, dot_g = CR @ arm, CR @ (skew(cross(interval.rate, lever)) + rate_skew @ arm)
     for errors, at_end, of_line in ((GYRO_BIAS, 1.0, 1.0), (
             GYRO_SCALE, interval.omega[:, None, :], interval.rate[:, None, :])):
         H[:, VELOCITY, errors] += now_g * at_end - delay * dot_g * of_line
@@ -250,7 +250,7 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     H[:, VELOCITY, LEVER_ARM] = swing - delay * swing_dot
     H[:, POSITION, LEVER_ARM] = CR - delay * (swing - delay / 2 * swing_dot)
     H[:, VELOCITY, DELAY.start] = -(pushed - delay * jerk + gnss.gravity)
-    H[:, POSITION, DELAY.start] = -seen_velocity
+    H[:, POSITION, DELAY.start] = -ground_velocity
     Y[:, :, 0] -= beyond * H[:, :, DELAY.start]
     return Y
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 """Preintegration against quadrature of closed-form motion, re-integration and Monte Carlo."""
 
-from ins_align.preintegration import (FORCE_WINDOW, Intervals, Noise, preintegrate,
+from ins_align.preintegration import (Intervals, LINE_WINDOW, Noise, preintegrate,
                                       split_at_epochs, white_noise)
 import numpy as np
 import pytest
@@ -122,7 +122,7 @@ def test_force_at_the_end_is_of_a_line_through_the_last_of_it(t):
     steps = split_at_epochs(stamps, np.tile([0.0, 0.0, w], (stamps.size, 1)),
                             np.tile(f, (stamps.size, 1)), np.array([0.0, t]))
     interval = preintegrate(steps, ZERO, ZERO, NOISE)
-    half = min(t, FORCE_WINDOW) / 2
+    half = min(t, LINE_WINDOW) / 2
 
     def gained(back):
         """Velocity gained in the last seconds, in the body frame at the end."""

@@ -385,12 +385,11 @@ def write(out: Path, trials: list[JsonDict]) -> None:
         'one, at each declaration and at the end where that is still ALIGNED. The time is that '
         f'during which, within a run, the current attitude was beyond {BINS[1]:g} sigma and '
         'still called aligned, the longest.')
-    looks = [(where, [moment for t in trials for moment in moments(t)]) for where, moments in (
-        ('declarations', lambda t: t.get('declared', [])),
-        ('runs still aligned at the end', lambda t: list(filter(None, [t.get('final')]))))]
     beyond = '; '.join(
         f'of {len(found)} {where} {_beyond(found, 0)} in tilt and {_beyond(found, 1)} in heading'
-        for where, found in looks)
+        for where, found in (
+            ('declarations', [moment for t in trials for moment in t.get('declared', [])]),
+            ('runs still aligned at the end', [t['final'] for t in trials if t.get('final')])))
     share = numbers['3 to 5'] + numbers['beyond 5']
     report.text(
         f"{share} of the {numbers['declared']} "
