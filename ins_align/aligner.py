@@ -34,7 +34,7 @@ from ins_align.methods import Epoch as MethodEpoch
 from ins_align.methods import ImuSteps, MapMethod, Method, NoteMethod, Nuisance
 from ins_align.plausibility import ForceCheck, IMU_BEFORE, stuck, without_spikes
 from ins_align.prediction import Prediction
-from ins_align.preintegration import Noise, split_at_epochs, white_noise
+from ins_align.preintegration import Noise, split_at_epochs, Steps, white_noise
 from ins_align.results import Attitude, Epoch, Status
 from ins_align.rotation import Array, Index
 from ins_align.unknowns import Prior
@@ -46,6 +46,8 @@ MAX_GAP_NS = 500_000_000
 # (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
 GAP_STEPS = 2.5
 GAP_ANGULAR_ACCELERATION, GAP_JERK = 2.0, 20.0
+# Standard deviation of stamps over the median of what the steps between them deviate.
+JITTER_OF_MEDIAN = 1.4826 / math.sqrt(2)
 # Noise is measured over the interval and this long before it (ns); it counts when it is this
 # many times the stated one.
 NOISE_WINDOW_NS = 500_000_000
@@ -343,7 +345,7 @@ class Aligner:
         self.counts['imu_spike'] += int(np.count_nonzero(spikes[ends[0] - 2:ends[-1] - 2]))
         stamps, samples = stamps[:ends[-1]], samples[:ends[-1]]
         steps = split_at_epochs(stamps, samples[:, :3], samples[:, 3:], ends_ns, unit=1e-9)
-        noise = self._noise(stamps, samples, windows, ends[1:], steps.dt)
+        noise = self._noise(stamps, samples, windows, ends[1:], steps)
         forces = [samples[first:last, 3:] for first, last in zip(ends[:-1] - 2, ends[1:] - 2)]
         self._steps_ns = epochs_ns[-1]
         self._imu.forget_before(self._steps_ns - NOISE_WINDOW_NS)
@@ -351,20 +353,34 @@ class Aligner:
         return ImuSteps(steps, noise), forces
 
     def _noise(self, stamps: Index, samples: Array, first: Index, last: Index,
-               dt: Array) -> Noise:
-        """White noise of each step: stated, measured, and what motion can do in a gap."""
+               steps: Steps) -> Noise:
+        """
+        White noise of each step: stated, measured, and what stamps do.
+
+        That is, what the motion can do in a gap and what it does to a sample whose stamp jitters:
+        its change per second times the jitter.
+        """
         stated = self._stated_noise
         measured = white_noise(stamps, samples, first, last, unit=1e-9)
         excess = np.where(measured > NOISE_EXCESS * stated,
                           np.sqrt(np.maximum(measured ** 2 - stated ** 2, 0.0)), 0.0)
-        between = np.diff(stamps)
-        usual = np.array([_median(between[i:j - 1]) for i, j in zip(first, last)]) * 1e-9
-        gap = np.where(dt > GAP_STEPS * usual[:, None], dt, 0.0)
+        between = np.diff(stamps) * 1e-9
+        usual = np.array([_median(between[i:j - 1]) for i, j in zip(first, last)])[:, None]
+        jitter = np.array([_median(np.abs(between[i:j - 1] - median)) for i, j, median
+                           in zip(first, last, usual)])[:, None] * JITTER_OF_MEDIAN
+        gap = np.where(steps.dt > GAP_STEPS * usual, steps.dt, 0.0)
         self.counts['imu_gap'] += int(np.count_nonzero(gap))
         # An error of acceleration * dt^2 over the step, as a density: squared, over dt.
         density = gap ** 1.5
-        return Noise(np.hypot(stated[0], GAP_ANGULAR_ACCELERATION * density),
-                     np.hypot(stated[1], GAP_JERK * density), excess[:, :1], excess[:, 1:])
+        jittered = jitter * np.sqrt(steps.dt)
+
+        def of_stamps(in_gap: float, slope: Array) -> Array:
+            rms = np.sqrt(np.mean(np.square(slope[:, 1:]), axis=2))
+            return np.hypot(in_gap * density, jittered * rms)
+
+        return Noise(np.hypot(stated[0], of_stamps(GAP_ANGULAR_ACCELERATION, steps.omega_dot)),
+                     np.hypot(stated[1], of_stamps(GAP_JERK, steps.f_dot)),
+                     excess[:, :1], excess[:, 1:])
 
     def _lose(self, why: str) -> None:
         """Start the alignment over; biases are kept."""

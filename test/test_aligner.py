@@ -219,6 +219,20 @@ def test_short_gaps_of_the_imu_are_survived_and_doubted(flight):
     assert np.all(status.current.sigma_deg > whole.status().current.sigma_deg)
 
 
+def test_stamps_that_jitter_are_doubted_as_much_as_the_motion_makes_of_it():
+    """A driver stamps samples when it gets round to it; a throw shows it, a good IMU most."""
+    squares = 0.0
+    for seed in range(6):
+        s = simulated('launch', imu_grade='navigation', seed=seed, duration=30.0)
+        step = np.median(np.diff(s.imu_stamps_ns))
+        jitter = 0.45 * step * np.random.default_rng(seed).uniform(-1, 1, len(s.imu_stamps_ns))
+        jittered = replace(s, imu_stamps_ns=s.imu_stamps_ns + np.rint(jitter).astype(np.int64))
+        aligner = Aligner(config_for(s, lever_arm_std=1.0, gnss_delay_std=0.1))
+        give_all(aligner, jittered)
+        squares += normalised_error(aligner.status().initial, s)
+    assert squares < chi2.ppf(0.9999, 3 * 6)
+
+
 def test_single_samples_that_no_motion_makes_are_counted_and_do_little(flight, result):
     random = np.random.default_rng(7)
     places = np.arange(150, 2950, 100) + random.integers(0, 50, 28)
