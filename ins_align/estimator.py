@@ -128,6 +128,8 @@ class MapEstimator:
         # With which the intervals were integrated.
         self._sensor_errors = np.zeros((capacity, 3, 3))
         self._gnss = Measurements.empty(capacity)
+        # Outliers when they came.
+        self._refused = np.zeros((capacity, 2), bool)
         self.count = 0
         self.solution: Solution | None = None
         self._last_fit = self._last_tuned = 0
@@ -194,6 +196,7 @@ class MapEstimator:
                 if wild:
                     # Once more from here, without it; where there is one, there may be many.
                     wanted[done, wild[0]] = False
+                    self._refused[self.count, wild[0]] = True
                     s.rejected[wild[0]] += 1
                     refused[wild[0]] = tests[wild[0]]
                     ahead = 1
@@ -272,10 +275,12 @@ class MapEstimator:
         return bool(age >= (self.IDLE_TIME if still else self.MAX_IDLE_TIME))
 
     def _run(self, s: Solution, gate: Gate | None) -> None:
-        """Take all stored epochs into an empty solution."""
+        """Take all stored epochs into an empty solution; without a gate those not refused."""
         epochs = slice(0, self.count)
         gnss = self._gnss.take(epochs)
-        s.run(s.rows(gnss, self._corrected(epochs, s.point)), gnss.present[:, :s.kinds], gate,
+        present = gnss.present[:, :s.kinds]
+        wanted = present if gate is not None else present & ~self._refused[epochs, :s.kinds]
+        s.run(s.rows(gnss, self._corrected(epochs, s.point)), present, wanted, gate,
               self._gate_scale)
 
     def _corrected(self, epochs: slice, point: Unknowns) -> Intervals:
@@ -301,6 +306,7 @@ class MapEstimator:
             if sum(s.rejected) > self.MAX_REJECTED * self.count:
                 # Not a few outliers but a wrong picture: look at everything again.
                 s, P = self._start(point), None
+                self._refused[:] = False
                 self._run(s, None)
             if s.nonlinearity <= self.NONLINEARITY:
                 break

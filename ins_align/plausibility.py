@@ -13,6 +13,7 @@
 # limitations under the License.
 """Checks that need no alignment: samples and units of the IMU, velocity against position."""
 
+from collections import deque
 import math
 
 from ins_align.earth import ecef_from_lla, matrix_en
@@ -28,6 +29,8 @@ DISTANCE_SIGMAS = 8.0
 # Mismatch, as a share of the distance, that no noise explains, and how many in a row convict.
 MAX_MISMATCH = 0.5
 CONVICTING = 4
+# So many fixes in a row have to agree, to within the same share of the distance, at its end.
+AGREEING = 3
 # A spike leaves the mean of its neighbours by at least this (rad/s, m/s^2), by this many times as
 # much as the neighbours differ, and as other samples do: of so many before it, this one in the
 # order of size, so that one more spike among them does no harm.
@@ -138,10 +141,12 @@ class VelocityCheck:
 
     def __init__(self) -> None:
         """Start with nothing compared."""
-        self._anchor: Array | None = None
+        self._origin: Array | None = None
         self._C_ne = np.eye(3)
-        self._travelled = np.zeros(3)
-        self._far = False
+        self._path = np.zeros(3)
+        # East and north of the fix, and of what the velocity makes of the way, since the origin.
+        self._recent: deque[tuple[float, ...]] = deque(maxlen=AGREEING)
+        self._anchor: tuple[float, ...] | None = None
         self._last: tuple[float, Array] | None = None
         self.bad_in_a_row = 0
         self._as_ned_in_a_row = 0
@@ -151,29 +156,35 @@ class VelocityCheck:
         """Take an epoch that has both; seconds, radians, metres, ENU."""
         r_e = ecef_from_lla(latitude, longitude, altitude)
         if self._last is not None and 0 < time - self._last[0] < 2.5:
-            self._travelled = self._travelled + (time - self._last[0]) / 2 * (v_n + self._last[1])
+            self._path = self._path + (time - self._last[0]) / 2 * (v_n + self._last[1])
         else:
-            self._anchor = None
+            self._origin = None
         self._last = time, v_n
+        if self._origin is None:
+            self._origin, self._path, self._anchor = r_e, np.zeros(3), None
+            self._C_ne = matrix_en(latitude, longitude).T
+            self._recent.clear()
+        place = self._C_ne @ (r_e - self._origin)
+        self._recent.append((*place[:2].tolist(), *self._path[:2].tolist()))
+        if len(self._recent) < AGREEING:
+            return
+        here = self._recent[AGREEING // 2]
         if self._anchor is None:
-            self._restart(r_e, latitude, longitude)
+            self._anchor = here
             return
-        moved = (self._C_ne @ (r_e - self._anchor))[:2]
-        travelled = self._travelled[:2]
-        distance = max(math.hypot(*moved), math.hypot(*travelled))
-        far, before = distance >= max(MIN_DISTANCE, DISTANCE_SIGMAS * position_std), self._far
-        self._far = far
-        if not (far and before):              # a single bad fix is no journey
+        moved_e, moved_n, went_e, went_n = (now - then for now, then in zip(here, self._anchor))
+        distance = max(math.hypot(moved_e, moved_n), math.hypot(went_e, went_n))
+        tolerance = MAX_MISMATCH * distance
+        # A wild fix is no journey, and one after the other they do not agree.
+        if (distance < max(MIN_DISTANCE, DISTANCE_SIGMAS * position_std)
+                or any(math.dist(other[:2], here[:2]) > tolerance for other in self._recent)):
             return
-        bad = math.hypot(*(moved - travelled)) > MAX_MISMATCH * distance
-        as_ned = math.hypot(*(moved - travelled[::-1])) < MAX_MISMATCH * distance
+        bad = math.hypot(moved_e - went_e, moved_n - went_n) > tolerance
+        as_ned = math.hypot(moved_e - went_n, moved_n - went_e) < tolerance
         self.bad_in_a_row = self.bad_in_a_row + 1 if bad else 0
         self._as_ned_in_a_row = self._as_ned_in_a_row + 1 if bad and as_ned else 0
-        self._restart(r_e, latitude, longitude)
-
-    def _restart(self, r_e: Array, latitude: float, longitude: float) -> None:
-        self._anchor, self._travelled, self._far = r_e, np.zeros(3), False
-        self._C_ne = matrix_en(latitude, longitude).T
+        self._origin = None                   # the next journey begins here
+        self._anchor = None
 
     @property
     def fault(self) -> str:

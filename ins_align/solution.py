@@ -141,13 +141,14 @@ class Solution:
         """Kinds of measurements: velocities, or velocities and positions."""
         return 2 if self._size == 9 else 1
 
-    def run(self, rows: Rows, present: np.ndarray, gate: Gate | None, gate_scale: float) -> None:
-        """Take epochs at one go; outliers by one gate for all."""
-        whitened = self.whitener.whitened(rows, present)
+    def run(self, rows: Rows, present: np.ndarray, wanted: np.ndarray, gate: Gate | None,
+            gate_scale: float) -> None:
+        """Take what is wanted of epochs at one go; outliers by one gate for all."""
+        whitened = self.whitener.whitened(rows, wanted)
         if gate is not None:
             nis, _ = gate.test(whitened.innovation, whitened.S)
             if not np.all(nis < GATE * gate_scale):
-                whitened = self.whitener.whitened(rows, present, gate, gate_scale)
+                whitened = self.whitener.whitened(rows, wanted, gate, gate_scale)
         for kind, count in enumerate(np.count_nonzero(present & ~whitened.used, axis=0).tolist()):
             self.rejected[kind] += count
         self.take(self._course(rows, whitened, slice(-1, None)), 0)
