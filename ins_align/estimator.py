@@ -98,6 +98,8 @@ class MapEstimator:
     TUNE_FROM, TUNE_GROWTH, TUNE_STEP, TUNE_GAIN = 12, 0.5, 9.0, 3.0
     MAX_EXCESS = 3.0
     MAX_REJECTED = 0.3
+    # Chi-square per degree of freedom from which on a fit looks for outliers among its residuals.
+    MISFIT = 4.0
     # Ages (s) at which t0 moves on: when no heading is known to within this (rad), though the
     # velocity is (m/s) and the unknown turn is about the vertical to within this (rad: a vehicle
     # that gathers speed soon shows its heading); when neither is; when both are. The first two
@@ -239,7 +241,8 @@ class MapEstimator:
         if self.count >= max(self.TUNE_FROM, self._last_tuned * (1 + self.TUNE_GROWTH)):
             self._tune()
         growth = self.GROWTH_FAR if s.nonlinearity > self.FAR else self.GROWTH
-        if s.nonlinearity > self.NONLINEARITY and self.count >= self._last_fit * (1 + growth):
+        if ((s.nonlinearity > self.NONLINEARITY or self._misfits(s))
+                and self.count >= self._last_fit * (1 + growth)):
             self._fit()
         if not tested:
             return NOTHING_NEW
@@ -274,14 +277,18 @@ class MapEstimator:
                  and self.free_axis_tilt < self.IDLE_AXIS_TILT)
         return bool(age >= (self.IDLE_TIME if still else self.MAX_IDLE_TIME))
 
-    def _run(self, s: Solution, gate: Gate | None) -> None:
-        """Take all stored epochs into an empty solution; without a gate those not refused."""
+    def _run(self, s: Solution, gate: Gate | None) -> Array:
+        """
+        Take all stored epochs into an empty solution; without a gate those not refused.
+
+        Returns the normalised squares of the residuals, shape (K, kinds).
+        """
         epochs = slice(0, self.count)
         gnss = self._gnss.take(epochs)
         present = gnss.present[:, :s.kinds]
         wanted = present if gate is not None else present & ~self._refused[epochs, :s.kinds]
-        s.run(s.rows(gnss, self._corrected(epochs, s.point)), present, wanted, gate,
-              self._gate_scale)
+        return s.run(s.rows(gnss, self._corrected(epochs, s.point)), present, wanted, gate,
+                     self._gate_scale)
 
     def _corrected(self, epochs: slice, point: Unknowns) -> Intervals:
         """Return stored intervals as they would be with the sensor errors of a point."""
@@ -302,16 +309,34 @@ class MapEstimator:
         """Gauss-Newton over the store from a starting point."""
         for _ in range(self.MAX_ITERATIONS):
             s = self._start(point)
-            self._run(s, None if P is None else Gate(s.dx, P))
+            squares = self._run(s, None if P is None else Gate(s.dx, P))
             if sum(s.rejected) > self.MAX_REJECTED * self.count:
                 # Not a few outliers but a wrong picture: look at everything again.
                 s, P = self._start(point), None
                 self._refused[:] = False
-                self._run(s, None)
+                squares = self._run(s, None)
             if s.nonlinearity <= self.NONLINEARITY:
-                break
+                if not (self.gated and self._misfits(s) and self._refuse_wild(squares)):
+                    break
+                P = None
             point = s.estimate
         return s
+
+    def _misfits(self, s: Solution) -> bool:
+        """Whether a solution leaves residuals that no noise makes."""
+        return s.chi2 > self.MISFIT * max(s.dof, 1)
+
+    def _refuse_wild(self, squares: Array) -> bool:
+        """Refuse the outliers among residuals that the others make look wild; if there are few."""
+        wild = np.zeros(squares.shape, bool)
+        for kind, of_kind in enumerate(squares.T):
+            usual = np.median(of_kind[of_kind > 0.0]) if of_kind.any() else 0.0
+            wild[:, kind] = of_kind > GATE * max(1.0, usual / MEDIAN_CHI2_3)
+        refused = self._refused[:self.count, :squares.shape[1]]
+        few = np.count_nonzero(refused | wild) <= self.MAX_REJECTED * self.count
+        if few:
+            refused |= wild
+        return bool(few and wild.any())
 
     def _fit(self) -> None:
         """Move the linearisation point; while the heading is not resolved, try the q-method."""

@@ -142,8 +142,16 @@ class Solution:
         return 2 if self._size == 9 else 1
 
     def run(self, rows: Rows, present: np.ndarray, wanted: np.ndarray, gate: Gate | None,
-            gate_scale: float) -> None:
-        """Take what is wanted of epochs at one go; outliers by one gate for all."""
+            gate_scale: float) -> Array:
+        """
+        Take what is wanted of epochs at one go; outliers by one gate for all.
+
+        Returns
+        -------
+        ndarray, shape (K, kinds)
+            Normalised squares of the residuals at the estimate, 0 where nothing was taken.
+
+        """
         whitened = self.whitener.whitened(rows, wanted)
         if gate is not None:
             nis, _ = gate.test(whitened.innovation, whitened.S)
@@ -152,6 +160,7 @@ class Solution:
         for kind, count in enumerate(np.count_nonzero(present & ~whitened.used, axis=0).tolist()):
             self.rejected[kind] += count
         self.take(self._course(rows, whitened, slice(-1, None)), 0)
+        return Gate(self.dx, np.zeros_like(self.P)).test(whitened.innovation, whitened.S)[0]
 
     def course(self, rows: Rows, wanted: np.ndarray) -> Course:
         """Return what the solution would be after each of K epochs if it took what is wanted."""

@@ -19,6 +19,7 @@ from alignment import aligned, config_for, error_deg, error_of, normalised_error
 from ins_align.aligner import Aligner
 from ins_align.config import Config, ConfigError
 from ins_align.declaration import State
+from ins_align.experiments.declare import largest, run_trial, trial
 from ins_align.rotation import matrix_from_quaternion, roll_pitch_yaw
 from ins_align.simulation import feed
 import numpy as np
@@ -532,6 +533,29 @@ def test_sharp_positions_of_a_car_that_pulls_away_at_once(seed, delay):
     assert declared.t_s < 20.0
     for attitude in (declared.initial, declared.current, aligner.status().initial):
         assert np.all(np.abs(error_of(attitude, s)) <= 4 * np.sqrt(np.diag(attitude.covariance)))
+
+
+@pytest.mark.parametrize('seed', range(2))
+@pytest.mark.parametrize('scenario', ('hover', 'static'))
+def test_wild_gnss_from_the_start_is_found_out(scenario, seed):
+    """Some are among the first, from which nobody can tell which is wild."""
+    s = simulated(scenario, imu_grade='navigation', seed=seed, duration=60.0, outlier_rate=0.09,
+                  outlier_velocity=2.0, outlier_position=50.0)
+    aligner, epochs = aligned(s, lever_arm_std=1.0, gnss_delay_std=0.1)
+    status = aligner.status()
+    assert status.state in (State.LEVELLED, State.ALIGNED)
+    for attitude in (status.initial, status.current):
+        assert normalised_error(attitude, s) < chi2.ppf(0.9999, 3)
+    assert abs(status.gnss_delay) < 4 * status.gnss_delay_std
+    rejected = status.counts['epochs_rejected_velocity']
+    assert 0.9 * np.sum(s.outlier) <= rejected <= np.sum(s.outlier) + 2
+
+
+def test_wild_velocities_that_a_fit_has_swallowed_are_found_out():
+    """Taken for good, they make it believe in an absurd delay and widen the gate."""
+    result = run_trial(trial(21))
+    assert result['state'] == 'ALIGNED' and result['withdrawals'] == 0
+    assert largest(result) < 3.0
 
 
 @pytest.mark.parametrize('kind', ('velocity', 'position'))

@@ -47,7 +47,8 @@ def test_force_check_waits_for_enough_samples_and_forgives():
 
 
 def drive(check, sent, *, speed=10.0, turn=0.1, seconds=60.0, rate=5.0, noise=0.5, wild=0.0):
-    """Drive circles; `sent` makes what the receiver says of the true velocity.
+    """
+    Drive circles; `sent` makes what the receiver says of the true velocity.
 
     A share `wild` of the fixes is off by 30 to 100 m.
     """
