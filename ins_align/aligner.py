@@ -293,9 +293,9 @@ class Aligner:
         cuts = np.flatnonzero(np.diff((place - place[0]) // MAX_RUN_SAMPLES)) + 1
         for part in np.split(np.arange(len(run)), cuts):
             epochs = [run[k].epoch for k in part]
-            imu, samples = self._imu_steps([epoch.stamp_ns for epoch in epochs])
+            imu, forces = self._imu_steps([epoch.stamp_ns for epoch in epochs])
             for k, epoch in enumerate(method.advance(epochs, imu)):
-                self._force_check.add(samples[k])
+                self._force_check.add(*forces[k])
                 done = self._judge(epoch, run[part[k]].fault)
                 if not run[part[k]].dry:
                     self._done.append(done)
@@ -334,8 +334,8 @@ class Aligner:
             self._method = NoteMethod(self.config, epoch, imu, epoch.v_n is None)
         self._done.append(self._judge(epoch, self._antenna.fault))
 
-    def _imu_steps(self, epochs_ns: list[int]) -> tuple[ImuSteps, list[Array]]:
-        """IMU steps up to each epoch since the one before, and the specific forces in them."""
+    def _imu_steps(self, epochs_ns: list[int]) -> tuple[ImuSteps, list[tuple[float, int]]]:
+        """IMU steps up to each epoch since the one before; sum and number of forces in them."""
         stamps, start_ns = self._imu.stamps, self._steps_ns
         ends_ns = np.array([start_ns, *epochs_ns])
         ends = np.searchsorted(stamps, ends_ns, side='left') + 2
@@ -346,7 +346,9 @@ class Aligner:
         stamps, samples = stamps[:ends[-1]], samples[:ends[-1]]
         steps = split_at_epochs(stamps, samples[:, :3], samples[:, 3:], ends_ns, unit=1e-9)
         noise = self._noise(stamps, samples, windows, ends[1:], steps)
-        forces = [samples[first:last, 3:] for first, last in zip(ends[:-1] - 2, ends[1:] - 2)]
+        magnitudes = np.sqrt(np.sum(np.square(samples[:, 3:]), axis=1))
+        sums = np.diff(np.concatenate([[0.0], np.cumsum(magnitudes)])[ends - 2])
+        forces = list(zip(sums.tolist(), np.diff(ends).tolist()))
         self._steps_ns = epochs_ns[-1]
         self._imu.forget_before(self._steps_ns - NOISE_WINDOW_NS)
         self._imu.used_ns = self._steps_ns

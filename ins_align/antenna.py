@@ -18,7 +18,7 @@ import math
 
 from ins_align.buffers import GnssEpoch
 from ins_align.config import Config
-from ins_align.earth import carried, SEMI_MAJOR_AXIS
+from ins_align.earth import carried, Place, way
 from ins_align.messages import Fix, Velocity
 from ins_align.methods import Epoch
 from ins_align.plausibility import VelocityCheck
@@ -35,8 +35,6 @@ _UNKNOWN_VERTICAL_STD = 1e3
 # epochs, is not believed: a receiver that is ten times better than it was will say so again. One
 # that was worse than the configuration expects need not.
 BETTER_THAN_USUAL, USUAL_EPOCHS = 100.0, 11
-
-Place = tuple[float, float, float]            # latitude, longitude (radians), altitude (m)
 
 
 class Antenna:
@@ -94,7 +92,7 @@ class Antenna:
             self._look_for_vertical(v_n)
             if believed:
                 variances = position_covariance.diagonal().tolist()
-                self._check.add(message.stamp_ns * 1e-9, *self._place, v_n,
+                self._check.add(message.stamp_ns * 1e-9, self._place, v_n,
                                 math.sqrt(max(variances[:2])))
         return Epoch(message.stamp_ns, *self._place, v_n, self._covariance_of(velocity),
                      believed, position_covariance)
@@ -118,7 +116,7 @@ class Antenna:
         if fix is not None:
             place = (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg),
                      fix.altitude_m)
-            if predicted is None or _distance(place, predicted) <= MAX_FIX_JUMP * (1 + dt):
+            if predicted is None or math.hypot(*way(predicted, place)) <= MAX_FIX_JUMP * (1 + dt):
                 self._jumps = 0
                 self._place, self._place_ns = place, stamp_ns
                 return True
@@ -179,9 +177,3 @@ class StatedNoise:
             return covariance
         scale = np.sqrt(factors)
         return covariance * scale * scale[:, None]
-
-
-def _distance(a: Place, b: Place) -> float:
-    """Rough distance of two places, metres."""
-    east = math.remainder(a[1] - b[1], 2 * math.pi) * math.cos(a[0])
-    return math.hypot(SEMI_MAJOR_AXIS * (a[0] - b[0]), SEMI_MAJOR_AXIS * east, a[2] - b[2])

@@ -34,6 +34,8 @@ SOMIGLIANA_K = 0.00193185265241
 # omega^2 a^2 b / GM, the ratio of centrifugal to gravitational acceleration at the equator.
 GRAVITY_RATIO = 0.00344978650684
 
+Place = tuple[float, float, float]     # latitude, longitude (radians), altitude (m)
+
 
 def normal_gravity(latitude: ArrayLike, altitude: ArrayLike) -> Array:
     """
@@ -62,8 +64,7 @@ def ecef_from_lla(latitude: ArrayLike, longitude: ArrayLike, altitude: ArrayLike
         (prime_vertical * (1 - ECCENTRICITY2) + height) * sin_lat), axis=-1)
 
 
-def carried(place: tuple[float, float, float], v_n: Array, dt: float,
-            ) -> tuple[float, float, float]:
+def carried(place: Place, v_n: Array, dt: float) -> Place:
     """
     Carry a place on with a velocity, on a sphere: good to 1 % of the way.
 
@@ -82,6 +83,12 @@ def carried(place: tuple[float, float, float], v_n: Array, dt: float,
     return (latitude + north * dt / SEMI_MAJOR_AXIS,
             longitude + east * dt / (SEMI_MAJOR_AXIS * max(math.cos(latitude), 1e-3)),
             altitude + up * dt)
+
+
+def way(start: Place, end: Place) -> tuple[float, float, float]:
+    """Return the way east, north and up between two places, metres: `carried` the other way."""
+    east = math.remainder(end[1] - start[1], 2 * math.pi) * max(math.cos(start[0]), 1e-3)
+    return SEMI_MAJOR_AXIS * east, SEMI_MAJOR_AXIS * (end[0] - start[0]), end[2] - start[2]
 
 
 def matrix_en(latitude: ArrayLike, longitude: ArrayLike) -> Array:

@@ -153,7 +153,8 @@ def _usable_covariance(covariance: np.ndarray,
                         in zip(variances, known, default_std)])
     bounded = list(map(_bounded, variances))
     diagonal = np.diag(bounded)
-    if bounded != variances or np.array_equal(covariance, diagonal):
+    entries = covariance.ravel().tolist()
+    if bounded != variances or not any(entries[1:4] + entries[5:8]):
         return diagonal
     symmetric = 0.5 * covariance + 0.5 * covariance.T
     # Correlations without sense must not turn into a negative variance in some direction.

@@ -16,7 +16,7 @@
 from collections import deque
 import math
 
-from ins_align.earth import ecef_from_lla, matrix_en
+from ins_align.earth import Place, way
 from ins_align.rotation import Array, Index
 import numpy as np
 
@@ -123,10 +123,10 @@ class ForceCheck:
         self._count = 0
         self.fault = ''
 
-    def add(self, f: Array) -> None:
-        """Take samples, shape (N, 3)."""
-        self._sum += float(np.sum(np.sqrt(np.sum(f * f, axis=1))))
-        self._count += f.shape[0]
+    def add(self, total: float, count: int) -> None:
+        """Take the sum of so many magnitudes."""
+        self._sum += total
+        self._count += count
         if self._count < FORCE_SAMPLES:
             return
         mean = self._sum / self._count
@@ -141,31 +141,29 @@ class VelocityCheck:
 
     def __init__(self) -> None:
         """Start with nothing compared."""
-        self._origin: Array | None = None
-        self._C_ne = np.eye(3)
-        self._path = np.zeros(3)
+        self._origin: Place | None = None
+        self._path = 0.0, 0.0
         # East and north of the fix, and of what the velocity makes of the way, since the origin.
         self._recent: deque[tuple[float, ...]] = deque(maxlen=AGREEING)
         self._anchor: tuple[float, ...] | None = None
-        self._last: tuple[float, Array] | None = None
+        self._last: tuple[float, float, float] | None = None
         self.bad_in_a_row = 0
         self._as_ned_in_a_row = 0
 
-    def add(self, time: float, latitude: float, longitude: float, altitude: float,
-            v_n: Array, position_std: float) -> None:
+    def add(self, time: float, place: Place, v_n: Array, position_std: float) -> None:
         """Take an epoch that has both; seconds, radians, metres, ENU."""
-        r_e = ecef_from_lla(latitude, longitude, altitude)
+        east, north, _ = v_n.tolist()
         if self._last is not None and 0 < time - self._last[0] < 2.5:
-            self._path = self._path + (time - self._last[0]) / 2 * (v_n + self._last[1])
+            half = (time - self._last[0]) / 2
+            self._path = (self._path[0] + half * (self._last[1] + east),
+                          self._path[1] + half * (self._last[2] + north))
         else:
             self._origin = None
-        self._last = time, v_n
+        self._last = time, east, north
         if self._origin is None:
-            self._origin, self._path, self._anchor = r_e, np.zeros(3), None
-            self._C_ne = matrix_en(latitude, longitude).T
+            self._origin, self._path, self._anchor = place, (0.0, 0.0), None
             self._recent.clear()
-        place = self._C_ne @ (r_e - self._origin)
-        self._recent.append((*place[:2].tolist(), *self._path[:2].tolist()))
+        self._recent.append((*way(self._origin, place)[:2], *self._path))
         if len(self._recent) < AGREEING:
             return
         here = self._recent[AGREEING // 2]
@@ -184,7 +182,6 @@ class VelocityCheck:
         self.bad_in_a_row = self.bad_in_a_row + 1 if bad else 0
         self._as_ned_in_a_row = self._as_ned_in_a_row + 1 if bad and as_ned else 0
         self._origin = None                   # the next journey begins here
-        self._anchor = None
 
     @property
     def fault(self) -> str:

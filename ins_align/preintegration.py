@@ -376,10 +376,22 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     remaining = duration[:, None] - passed + 0.5 * dt
     v_rest = v[:, None] - v_mid
     p_rest = p[:, None] - (p_end - 0.5 * p_step) - v_mid * remaining[..., None]
-    Q, Q_excess = (
-        _noise(dt * np.square(gyro), dt * np.square(accel), dt, remaining, v_rest, p_rest)
-        for gyro, accel in ((noise.angle_random_walk, noise.velocity_random_walk),
-                            (noise.gyro_excess, noise.accel_excess)))
+    gyro_noise = _of_gyros(dt, v_rest, p_rest)
+    accel_noise = _of_accelerometers(dt, dt, remaining)
+
+    def covariance(gyro: ArrayLike, accel: ArrayLike) -> Array:
+        """Of the errors at the end, from densities in each step."""
+        gyro_least, gyro_more = _least_and_more(gyro)
+        accel_least, accel_more = _least_and_more(accel)
+        Q = gyro_least * gyro_noise + accel_least * accel_noise
+        if gyro_more.any():
+            Q += _of_gyros(gyro_more * dt, v_rest, p_rest)
+        if accel_more.any():
+            Q += _of_accelerometers(accel_more * dt, dt, remaining)
+        return Q
+
+    Q = covariance(noise.angle_random_walk, noise.velocity_random_walk)
+    Q_excess = covariance(noise.gyro_excess, noise.accel_excess)
     # Intervals are chained for hours.
     R = orthonormalized(turned[:, -1])
     # Mean forces and rates of both halves of the window.
@@ -408,23 +420,26 @@ def _at_time(time: Array, passed: Array, dt: Array, sums: Array, parts: Array) -
     return sums[rows, step] - ahead[:, None] * parts[rows, step]
 
 
-def _noise(gyro_variance: Array, accel_variance: Array, dt: Array, remaining: Array,
-           v_rest: Array, p_rest: Array) -> Array:
-    """
-    Covariance of the errors (rotation, v, p) at the end, shape (K, 9, 9).
+def _least_and_more(density: ArrayLike) -> tuple[Array, Array]:
+    """Square of a density, () or (K, n): the least of each interval, (K, 1, 1), and the rest."""
+    squares = np.atleast_2d(np.square(density))
+    least = squares.min(axis=1, keepdims=True)
+    return least[..., None], squares - least
 
-    Isotropic noise stays isotropic under the rotation of the body, so that only the time, velocity
-    and distance still to come after each step (remaining, v_rest, p_rest) matter. The variances
-    are those of each step's angle and velocity increment, shape (K, n).
+
+def _of_gyros(variance: Array, v_rest: Array, p_rest: Array) -> Array:
     """
-    K = dt.shape[0]
-    Q = np.zeros((K, 9, 9))
-    if not (np.any(gyro_variance) or np.any(accel_variance)):
-        return Q
-    # An error of a step's angle turns what is still to come: sums of the products of
-    # [1, v_rest, p_rest], from which those of [I, -[v_rest x], -[p_rest x]] follow.
-    rest = np.concatenate([np.ones(dt.shape + (1,)), v_rest, p_rest], axis=-1)
-    moment = np.sum((gyro_variance[..., None] * rest)[..., None] * rest[..., None, :], axis=1)
+    Covariance of the errors (rotation, v, p) at the end from errors of angle, shape (K, 9, 9).
+
+    Isotropic noise stays isotropic under the rotation of the body, so that only the velocity and
+    distance still to come after each step matter (v_rest, p_rest): an error of a step's angle
+    turns them. The variance is that of each step's angle increment, shape (K, n).
+    """
+    Q = np.zeros((variance.shape[0], 9, 9))
+    # Sums of the products of [1, v_rest, p_rest], from which those of
+    # [I, -[v_rest x], -[p_rest x]] follow.
+    rest = np.concatenate([np.ones(variance.shape + (1,)), v_rest, p_rest], axis=-1)
+    moment = np.sum((variance[..., None] * rest)[..., None] * rest[..., None, :], axis=1)
     eye = np.eye(3)
     angle, v, p = slice(0, 3), slice(3, 6), slice(6, 9)
     Q[:, angle, angle] = moment[:, :1, :1] * eye
@@ -436,8 +451,20 @@ def _noise(gyro_variance: Array, accel_variance: Array, dt: Array, remaining: Ar
             product = moment[:, i, j]             # [a x] [b x]^T = (a . b) I - b a^T
             Q[:, row, column] = (np.trace(product, axis1=1, axis2=2)[:, None, None] * eye
                                  - product.transpose(0, 2, 1))
+    return Q
+
+
+def _of_accelerometers(variance: Array, dt: Array, remaining: Array) -> Array:
+    """
+    Covariance of the errors (rotation, v, p) at the end from errors of velocity, (K, 9, 9).
+
+    The variance is that of each step's velocity increment; `remaining` is the time still to come
+    after the middle of the step, in which it becomes distance; both have shape (K, n).
+    """
+    Q = np.zeros((variance.shape[0], 9, 9))
+    v, p = slice(3, 6), slice(6, 9)
     for row, column, weight in ((v, v, 1.0), (v, p, remaining), (p, v, remaining),
                                 # dt^2 / 12 is the variance within the step itself
                                 (p, p, remaining ** 2 + dt ** 2 / 12)):
-        Q[:, row, column] += np.cumsum(accel_variance * weight, axis=1)[:, -1, None, None] * eye
+        Q[:, row, column] = np.cumsum(variance * weight, axis=1)[:, -1, None, None] * np.eye(3)
     return Q

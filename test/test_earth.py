@@ -127,3 +127,15 @@ def test_gravitation_is_that_of_python_ins_and_turned_with_the_earth():
         expected = C_n0e @ Rotation.from_euler('z', earth.EARTH_RATE * 50.0).apply(
             reference.gravitation_ecef(degrees))
         assert np.allclose(level.gravitation(50.0, *place), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize('place', ((0.8, 0.2, 100.0), (-0.3, np.pi - 1e-6, 0.0), (1.4, -2.0, 9e3)))
+def test_the_way_between_places_is_what_carried_goes_and_what_the_ellipsoid_has(place):
+    step = np.array([300.0, -200.0, 50.0])
+    there = earth.carried(place, step, 1.0)
+    assert np.allclose(earth.way(place, there), step, rtol=1e-9, atol=1e-6)
+    turned = (there[0], there[1] - 2 * np.pi, there[2])
+    assert np.allclose(earth.way(place, turned), step, rtol=1e-9, atol=1e-6)
+    moved = earth.matrix_en(*place[:2]).T @ (
+        earth.ecef_from_lla(*there) - earth.ecef_from_lla(*place))
+    assert np.allclose(moved, step, rtol=0.012, atol=0.1)
