@@ -68,7 +68,8 @@ bench: $(VENV)/ready
 #: make experiments            renews the figures and tables in docs/experiments; those of real
 #:                             recordings with DATA=folder
 experiments: demo
-	@cp build/demo/flight.png docs/images/
+	@$(BIN)/python -c "from PIL import Image; Image.open('build/demo/flight.png').convert( \
+	    'RGB').quantize(256).save('docs/images/flight.png', optimize=True)"
 	@$(BIN)/ins_align experiment all --out docs/experiments $(if $(DATA),--data '$(DATA)')
 
 #: make lock                   renews the pinned versions in requirements/ (needs uv)

@@ -227,11 +227,12 @@ def _velocities(messages: list[Any]) -> tuple[np.ndarray, Array]:
 
 
 def _change(velocities: Any) -> float:
-    """Largest difference of two velocities, m/s."""
+    """Largest difference of two velocities, shape (N, 2), m/s, to 1 %."""
     if len(velocities) < 2:
         return 0.0
-    v = np.asarray(velocities)
-    return float(np.max(np.linalg.norm(v[:, None] - v[None], axis=2)))
+    angles = np.radians(np.arange(0.0, 180.0, 15.0))
+    extents = np.ptp(np.asarray(velocities) @ [np.cos(angles), np.sin(angles)], axis=0)
+    return float(np.max(extents))
 
 
 def _course_error(stamp_ns: int, C_true: Array, stamps: np.ndarray, velocities: Array) -> float:
