@@ -30,8 +30,7 @@ from ins_align.config import Config, ConfigError, parameters
 from ins_align.declaration import Declaration, State, Verdict
 from ins_align.earth import EARTH_RATE
 from ins_align.messages import Fix, Velocity
-from ins_align.methods import Epoch as MethodEpoch
-from ins_align.methods import ImuSteps, MapMethod, Method, NoteMethod, Nuisance
+from ins_align.methods import AntennaEpoch, ImuSteps, MapMethod, Method, NoteMethod, Nuisance
 from ins_align.plausibility import ForceCheck, IMU_BEFORE, stuck, without_spikes
 from ins_align.prediction import Prediction
 from ins_align.preintegration import Noise, split_at_epochs, Steps, white_noise
@@ -73,7 +72,7 @@ class _Silence(NamedTuple):
 class _Located(NamedTuple):
     """An epoch, what was known to be wrong with the GNSS then, and whether it is without GNSS."""
 
-    epoch: MethodEpoch
+    epoch: AntennaEpoch
     fault: str
     dry: bool
 
@@ -222,7 +221,7 @@ class Aligner:
         self._silences = self._find_silences()
         for message in self._gnss.release(upto_ns, last):
             self._dry_epochs(message.stamp_ns)
-            self._take(message)
+            self._line_up(message)
         waiting_ns = self._gnss.oldest_ns
         self._dry_epochs(upto_ns if waiting_ns is None else min(upto_ns, waiting_ns))
         self._advance()
@@ -237,9 +236,9 @@ class Aligner:
         """Go on without GNSS up to a stamp in steps of bounded length."""
         while (self._method is not None and self._last_ns is not None
                and upto_ns - self._last_ns > DRY_INTERVAL_NS):
-            self._take(GnssEpoch(self._last_ns + DRY_INTERVAL_NS), dry=True)
+            self._line_up(GnssEpoch(self._last_ns + DRY_INTERVAL_NS), dry=True)
 
-    def _take(self, message: GnssEpoch, dry: bool = False) -> None:
+    def _line_up(self, message: GnssEpoch, dry: bool = False) -> None:
         """Put an epoch into the run of those that the method takes at one go."""
         if self._last_ns is not None and message.stamp_ns <= self._last_ns:
             self.counts['gnss_out_of_order'] += 1
@@ -300,7 +299,7 @@ class Aligner:
                 if not run[part[k]].dry:
                     self._done.append(done)
 
-    def _start(self, epoch: MethodEpoch) -> None:
+    def _start(self, epoch: AntennaEpoch) -> None:
         """Make an epoch t0 if it can be one."""
         if not epoch.position_measured:
             return
@@ -393,7 +392,7 @@ class Aligner:
             self._events.append(f'alignment starts over: {why}')
         self._forget_alignment(prior)
 
-    def _judge(self, epoch: MethodEpoch, fault: str) -> Epoch:
+    def _judge(self, epoch: AntennaEpoch, fault: str) -> Epoch:
         """Results and state after an epoch; `fault` is what is known to be wrong with the GNSS."""
         method, stamp_ns = self._method, epoch.stamp_ns
         assert method is not None and self._first_t0_ns is not None

@@ -20,7 +20,7 @@ from ins_align.buffers import GnssEpoch
 from ins_align.config import Config
 from ins_align.earth import carried, Place, way
 from ins_align.messages import Fix, Velocity
-from ins_align.methods import Epoch
+from ins_align.methods import AntennaEpoch
 from ins_align.plausibility import VelocityCheck
 from ins_align.rotation import Array
 import numpy as np
@@ -74,7 +74,7 @@ class Antenna:
         """Fault of the velocities in words; empty when nothing is known to be wrong."""
         return self._check.fault
 
-    def epoch(self, message: GnssEpoch) -> Epoch | None:
+    def epoch(self, message: GnssEpoch) -> AntennaEpoch | None:
         """Take what the receiver said at an epoch; None while the place is not known."""
         config, velocity, fix = self._config, message.velocity, message.fix
         v_n = None
@@ -94,8 +94,8 @@ class Antenna:
                 variances = position_covariance.diagonal().tolist()
                 self._check.add(message.stamp_ns * 1e-9, self._place, v_n,
                                 math.sqrt(max(variances[:2])))
-        return Epoch(message.stamp_ns, *self._place, v_n, self._covariance_of(velocity),
-                     believed, position_covariance)
+        return AntennaEpoch(message.stamp_ns, *self._place, v_n, self._covariance_of(velocity),
+                            believed, position_covariance)
 
     def _look_for_vertical(self, v_n: Array) -> None:
         """Notice a receiver that moves and never says anything but 0 of the vertical."""

@@ -203,7 +203,7 @@ class MapEstimator:
                     refused[wild[0]] = tests[wild[0]]
                     ahead = 1
                     break
-                s.take(course, k)
+                s.move_to(course, k)
                 self.count += 1
                 done += 1
                 yield self._taken(s, tests | refused)

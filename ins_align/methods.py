@@ -45,9 +45,9 @@ MAX_AHEAD = 64
 
 
 @dataclass(frozen=True)
-class Epoch:
+class AntennaEpoch:
     """
-    A GNSS epoch as a method takes it.
+    Where the antenna is and how it moves at a GNSS epoch, as a method takes it.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class Method(Protocol):
     t0_ns: int
     moved: int                          # how often t0 was moved forward
 
-    def advance(self, epochs: Sequence[Epoch], imu: ImuSteps) -> Iterator[Epoch]:
+    def advance(self, epochs: Sequence[AntennaEpoch], imu: ImuSteps) -> Iterator[AntennaEpoch]:
         """Take epochs and the IMU steps before each; yield each when the results are its."""
 
     def initial(self) -> tuple[Array, Array] | None:
@@ -174,7 +174,7 @@ class MapMethod:
     Parameters
     ----------
     config : Config
-    epoch : Epoch
+    epoch : AntennaEpoch
         t0.
     imu : ImuSteps
         Of no length, at t0.
@@ -186,7 +186,7 @@ class MapMethod:
 
     """
 
-    def __init__(self, config: Config, epoch: Epoch, imu: ImuSteps, use_position: bool,
+    def __init__(self, config: Config, epoch: AntennaEpoch, imu: ImuSteps, use_position: bool,
                  prior: Prior | None = None, capacity: int = 1000) -> None:
         """Start at t0."""
         self._config = config
@@ -211,7 +211,7 @@ class MapMethod:
         self._start(epoch, prior)
         self._take_start(epoch, imu)
 
-    def _start(self, epoch: Epoch, prior: Prior, excess: float = FIRST_EXCESS) -> None:
+    def _start(self, epoch: AntennaEpoch, prior: Prior, excess: float = FIRST_EXCESS) -> None:
         self.t0_ns = epoch.stamp_ns
         self._renewed = False
         self._track = InertialTrack.start(epoch.latitude, epoch.longitude, epoch.altitude)
@@ -221,12 +221,12 @@ class MapMethod:
             estimate_delay=self._config.gnss_delay_std > 0, capacity=self._capacity,
             estimate_gyro_scale=self._scaled, excess=excess)
 
-    def _take_start(self, epoch: Epoch, imu: ImuSteps) -> None:
+    def _take_start(self, epoch: AntennaEpoch, imu: ImuSteps) -> None:
         """Take the epoch at t0."""
         for _ in self._take([epoch], imu):
             pass
 
-    def advance(self, epochs: Sequence[Epoch], imu: ImuSteps) -> Iterator[Epoch]:
+    def advance(self, epochs: Sequence[AntennaEpoch], imu: ImuSteps) -> Iterator[AntennaEpoch]:
         """Take epochs and the IMU steps before each; yield each when the results are its."""
         done = 0
         while done < len(epochs):
@@ -250,7 +250,7 @@ class MapMethod:
         """Move t0 to the last epoch before the next one is taken."""
         self._renewed = self._estimator.solution is not None
 
-    def _take(self, epochs: Sequence[Epoch], imu: ImuSteps) -> Iterator[Epoch]:
+    def _take(self, epochs: Sequence[AntennaEpoch], imu: ImuSteps) -> Iterator[AntennaEpoch]:
         """Take epochs as long as the estimator stays where it is."""
         track = self._track.extended(
             np.array([epoch.stamp_ns - self.t0_ns for epoch in epochs]) * 1e-9,
@@ -359,7 +359,7 @@ class NoteMethod:
     Parameters
     ----------
     config : Config
-    epoch : Epoch
+    epoch : AntennaEpoch
         t0.
     imu : ImuSteps
         Of no length, at t0.
@@ -368,7 +368,8 @@ class NoteMethod:
 
     """
 
-    def __init__(self, config: Config, epoch: Epoch, imu: ImuSteps, use_position: bool) -> None:
+    def __init__(self, config: Config, epoch: AntennaEpoch, imu: ImuSteps,
+                 use_position: bool) -> None:
         """Start at t0."""
         self.t0_ns = epoch.stamp_ns
         self.moved = 0
@@ -399,7 +400,7 @@ class NoteMethod:
         if self._free or self._from_positions:
             self._pair(epoch)
 
-    def advance(self, epochs: Sequence[Epoch], imu: ImuSteps) -> Iterator[Epoch]:
+    def advance(self, epochs: Sequence[AntennaEpoch], imu: ImuSteps) -> Iterator[AntennaEpoch]:
         """Take epochs and the IMU steps before each; yield each when the results are its."""
         intervals = preintegrate(imu.steps, self._zero, self._zero, Noise())
         for k, epoch in enumerate(epochs):
@@ -412,7 +413,7 @@ class NoteMethod:
             self._pair(epoch)
             yield epoch
 
-    def _pair(self, epoch: Epoch) -> None:
+    def _pair(self, epoch: AntennaEpoch) -> None:
         """Add the pair of vectors of an epoch and solve."""
         body, time = self._body, float(self._track.time)
         if self._from_positions:

@@ -159,7 +159,7 @@ class Solution:
                 whitened = self.whitener.whitened(rows, wanted, gate, gate_scale)
         for kind, count in enumerate(np.count_nonzero(present & ~whitened.used, axis=0).tolist()):
             self.rejected[kind] += count
-        self.take(self._course(rows, whitened, slice(-1, None)), 0)
+        self.move_to(self._course(rows, whitened, slice(-1, None)), 0)
         return Gate(self.dx, np.zeros_like(self.P)).test(whitened.innovation, whitened.S)[0]
 
     def course(self, rows: Rows, wanted: np.ndarray) -> Course:
@@ -172,10 +172,10 @@ class Solution:
                       np.concatenate([self.P[None], course.P[:-1]])[:, None])
         return before.test(course.whitened.innovation, course.whitened.S)
 
-    def take(self, course: Course, k: int) -> None:
+    def move_to(self, course: Course, k: int) -> None:
         """Go to where the solution is after one of the epochs."""
         self.chain = course.chain.at(k)
-        self.whitener.take(course.whitened, k)
+        self.whitener.move_to(course.whitened, k)
         self.time = float(course.time[k])
         self.dx, self.P, self.estimate = course.dx[k], course.P[k], course.estimate.at(k)
         self.chi2, self.dof = float(course.chi2[k]), int(course.dof[k])

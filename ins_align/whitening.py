@@ -389,7 +389,7 @@ class Whitener:
         self.spurious = 0.0
         self.log_det = 0.0
 
-    def take(self, whitened: Whitened, k: int) -> None:
+    def move_to(self, whitened: Whitened, k: int) -> None:
         """Go to the state after one of the epochs."""
         self.P, self.X, self.normal = whitened.P[k], whitened.X[k], whitened.normal[k]
         self.rows = int(whitened.rows[k])
