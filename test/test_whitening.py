@@ -140,7 +140,7 @@ def test_whitener_is_dense_generalised_least_squares(size, kinds):
     # In two goes: the second one starts where the first one ended.
     for part in (slice(0, 3), slice(3, epochs)):
         whitened = whitener.whitened(rows_of(D[part], R[part], steps[part]), wanted[part])
-        whitener.take(whitened, -1)
+        whitener.move_to(whitened, -1)
     times = np.repeat(np.arange(epochs), len(kinds))
     noises = [R[epoch][kind] for epoch in range(epochs) for kind in kinds]
     D = [D[epoch][kind] for epoch in range(epochs) for kind in kinds]
