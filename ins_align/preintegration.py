@@ -350,30 +350,26 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     p_step = h * v_start + (A @ step_p[..., None])[..., 0]
     p_end = np.cumsum(p_step, axis=1)
 
-    # Derivatives: a gyro bias turns the rest of the interval by minus the integral of A.
-    hh = dt[..., None, None]
-    A_step = A @ jacobian * hh
-    A_sum = np.cumsum(A_step, axis=1)
-    A_mid = A_sum - 0.5 * A_step
-    skew_u = skew(u)
-    v_g_step = skew_u @ A_mid
-    v_g = np.cumsum(v_g_step, axis=1)
-    p_g = np.sum(hh * (v_g - 0.5 * v_g_step), axis=1)
-    p_a = np.sum(hh * A_mid, axis=1)
-    J_Rs = J_vs = J_ps = np.zeros((dt.shape[0], 3, 3))
-    if gyro_scale is not None:
-        # A scale factor is a bias in proportion to the rate of its axis.
-        S_step = A_step * (0.5 * (omega0 + omega1))[..., None, :]
-        S_sum = np.cumsum(S_step, axis=1)
-        v_s_step = skew_u @ (S_sum - 0.5 * S_step)
-        v_s = np.cumsum(v_s_step, axis=1)
-        J_Rs, J_vs = -S_sum[:, -1], v_s[:, -1]
-        J_ps = np.sum(hh * (v_s - 0.5 * v_s_step), axis=1)
-
     passed = np.cumsum(dt, axis=1)
     duration = passed[:, -1]
+    remaining = duration[:, None] - passed + 0.5 * dt       # from the middle of each step on
+    # Derivatives: a gyro bias turns the rest of the interval by minus the integral of A; a scale
+    # factor is a bias in proportion to the rate of its axis.
+    errors = 1 if gyro_scale is None else 2
+    turns = np.empty(dt.shape + (3, 3 * errors))
+    turns[..., :3] = A @ jacobian * dt[..., None, None]
+    if gyro_scale is not None:
+        turns[..., 3:] = turns[..., :3] * (0.5 * (omega0 + omega1))[..., None, :]
+    turned_by = np.cumsum(turns, axis=1)
+    pushes = skew(u) @ (turned_by - 0.5 * turns)
+    J_R, J_v = -turned_by[:, -1], np.sum(pushes, axis=1)
+    # What a step adds to the velocity moves the body for the time that remains.
+    J_p = np.sum(remaining[..., None, None] * pushes, axis=1)
+    J_pa = -np.sum(remaining[..., None, None] * turns[..., :3], axis=1)
+    no_scale = np.zeros((dt.shape[0], 3, 3))
+    J_Rs, J_vs, J_ps = (no_scale if gyro_scale is None else J[..., 3:] for J in (J_R, J_v, J_p))
+
     v, p = v_end[:, -1], p_end[:, -1]
-    remaining = duration[:, None] - passed + 0.5 * dt
     v_rest = v[:, None] - v_mid
     p_rest = p[:, None] - (p_end - 0.5 * p_step) - v_mid * remaining[..., None]
     gyro_noise = _of_gyros(dt, v_rest, p_rest)
@@ -406,8 +402,8 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     f_end, f_dot = np.moveaxis(R.transpose(0, 2, 1) @ line[:, :3], -1, 0)
     rate, rate_dot = np.moveaxis(line[:, 3:], -1, 0)
     lasts = duration[:, None] > 0
-    return Intervals(duration, R, v, p, -A_sum[:, -1], v_g[:, -1], p_g, -p_a, J_Rs, J_vs, J_ps,
-                     Q, Q_excess, omega[:, -1], np.where(lasts, f_end, f[:, -1]),
+    return Intervals(duration, R, v, p, J_R[..., :3], J_v[..., :3], J_p[..., :3], J_pa, J_Rs, J_vs,
+                     J_ps, Q, Q_excess, omega[:, -1], np.where(lasts, f_end, f[:, -1]),
                      np.where(lasts, f_dot, 0.0), np.where(lasts, rate, omega[:, -1]),
                      np.where(lasts, rate_dot, 0.0))
 
