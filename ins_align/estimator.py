@@ -400,10 +400,17 @@ class MapEstimator:
             total += float(np.sum(both * both))
         return attitude_from_moments(moments, total)[0]
 
-    def settle(self) -> None:
-        """Move the linearisation point now if that is worth it at all, growth or hardly."""
-        if (not self.converged and self.solution is not None
-                and self.count > self._last_fit * (1 + self.GROWTH_FAR)):
+    def settle(self, last: bool = False) -> None:
+        """
+        Move the linearisation point now if that is worth it at all, growth or hardly.
+
+        `last`: move it to the estimate of a resolved heading in any case, because the covariance
+        is about to be handed on: the joint of tilt and biases can be so much sharper than each of
+        them that even a small step of the heading feigns information on both.
+        """
+        grown = self.count > self._last_fit * (1 + self.GROWTH_FAR)
+        if self.solution is not None and (self.heading_std < HEADING_RESOLVED_STD if last
+                                          else grown and not self.converged):
             self._fit()
 
     def fitted_afresh(self, prior: Prior, intervals: Intervals) -> Solution:

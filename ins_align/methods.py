@@ -277,6 +277,7 @@ class MapMethod:
 
     def _move_start(self) -> None:
         """Move t0 to the last epoch; what was learnt becomes the prior."""
+        self._estimator.settle(last=True)
         track, steps = self._track, self._last_imu.steps
         fit = self.fit()
         prior = prior_from_now(self._estimator, track.C_n0n, -track.still_v, -track.s_p,

@@ -127,16 +127,22 @@ class Prior:
         return prior_of(mean, covariance * np.outer(sign, sign), unknowns, False)
 
     def at(self, point: Unknowns) -> tuple[Array, Array]:
-        """Return the information about the step from `point`, and the mean of that step."""
-        mean, information = self.mean, self.information
+        """
+        Return the information about the step from `point`, and the mean of that step.
+
+        What the past has told about tilt and velocity it told about axes of the body: under
+        another heading it is information about other axes of the navigation frame.
+        """
+        mean = self.mean
+        turn = point.C @ mean.C.T
+        psi = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+        Rz = exp_so3([0.0, 0.0, psi])
         if self.heading_free:
-            turn = point.C @ mean.C.T
-            psi = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-            Rz = exp_so3([0.0, 0.0, psi])
             mean = replace(mean, C=Rz @ mean.C)
-            information = information.copy()
-            information[:3] = Rz @ information[:3]
-            information[:, :3] = information[:, :3] @ Rz.T
+        information = self.information.copy()
+        for block in (ATTITUDE, START_VELOCITY, START_POSITION):
+            information[block] = Rz @ information[block]
+            information[:, block] = information[:, block] @ Rz.T
         return information, mean.minus(point)
 
 

@@ -156,6 +156,20 @@ def test_handover_gives_the_attitude_of_one_that_never_handed_over(changes, monk
         assert np.all(np.abs(getattr(other, name) - getattr(one, name)) <= 0.15 * sigma), name
 
 
+@pytest.mark.parametrize('scenario', ('reverse', 'flight', 'hover'))
+def test_handover_feigns_no_information(scenario, monkeypatch):
+    """RTK knows the sum of tilt and bias far better than each: a little turn would tell them."""
+    s = simulated(scenario, imu_grade='mems', duration=60.0, seed=0, position_std=0.02)
+    one = {epoch.stamp_ns: epoch.current for epoch in aligned(s, velocity=False)[1]}
+    monkeypatch.setattr('ins_align.aligner.MapMethod', partial(MapMethod, capacity=50))
+    aligner, epochs = aligned(s, velocity=False)
+    assert aligner.status().counts['rebases'] >= 4
+    ratios = [np.sqrt(np.diag(epoch.current.covariance) / np.diag(one[epoch.stamp_ns].covariance))
+              for epoch in epochs if epoch.current is not None
+              and one[epoch.stamp_ns].sigma_deg[2] < 10.0]
+    assert len(ratios) > 200 and np.min(ratios) > 0.93
+
+
 def test_handover_while_standing_still_keeps_tilt_and_biases(monkeypatch):
     """Standing long must neither spoil the estimate nor delay it."""
     monkeypatch.setattr('ins_align.aligner.MapMethod', partial(MapMethod, capacity=60))

@@ -18,7 +18,7 @@ from dataclasses import replace
 from alignment import LEVER
 from ins_align.rotation import exp_so3
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, GYRO_SCALE,
-                                inverse_spd, LEVER_ARM, Prior, SIZE, START_POSITION,
+                                inverse_spd, LEVER_ARM, Prior, prior_of, SIZE, START_POSITION,
                                 START_VELOCITY, Unknowns)
 import numpy as np
 import pytest
@@ -74,6 +74,25 @@ def test_prior_of_free_heading_says_the_same_at_any_heading(turn):
     assert np.allclose(Rz.T @ step[:3], plain_step[:3], atol=1e-3)
     assert abs(step[2]) < 1e-3
     assert np.all(at[2] == 0) and np.all(at[:, 2] == 0)
+
+
+@pytest.mark.parametrize('turn', (0.02, -1.0))
+def test_prior_of_a_known_heading_is_about_axes_of_the_body(turn):
+    """What it says of a tilt about such an axis and of the biases is the same at any heading."""
+    r = np.random.default_rng(4)
+    mean = some_unknowns()
+    A = r.standard_normal((SIZE, SIZE))
+    prior = prior_of(mean, A @ A.T, np.arange(SIZE), False)
+    Rz = exp_so3([0.0, 0.0, turn])
+    step = r.standard_normal(SIZE)
+    turned = step.copy()
+    for block in (ATTITUDE, START_VELOCITY, START_POSITION):
+        turned[block] = Rz @ step[block]
+    here, _ = prior.at(mean)
+    there, to_mean = prior.at(replace(mean, C=Rz @ mean.C))
+    assert turned @ there @ turned == pytest.approx(step @ here @ step, rel=1e-9)
+    assert np.allclose(to_mean[ATTITUDE], [0.0, 0.0, -turn])
+    assert np.allclose(to_mean[3:], 0.0)
 
 
 def test_inverse_of_rows_of_any_scale():
