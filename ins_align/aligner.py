@@ -70,10 +70,11 @@ class _Silence(NamedTuple):
 
 
 class _Located(NamedTuple):
-    """An epoch, what was known to be wrong with the GNSS then, and whether it is without GNSS."""
+    """An epoch, what was known of the GNSS then, and whether it is without GNSS."""
 
     epoch: AntennaEpoch
-    fault: str
+    fault: str                  # of the velocities
+    gravity_drift: float        # noise of gravity for want of a place, m/s/sqrt(s)
     dry: bool
 
 
@@ -257,7 +258,8 @@ class Aligner:
             self.counts[silence.counter] += 1
             self._lose(silence.why)
         else:
-            self._run.append(_Located(epoch, self._antenna.fault, dry))
+            self._run.append(_Located(epoch, self._antenna.fault,
+                                      self._antenna.gravity_drift(epoch.stamp_ns), dry))
             self._last_ns = epoch.stamp_ns
 
     def _find_silences(self) -> list[_Silence]:
@@ -292,7 +294,8 @@ class Aligner:
         cuts = np.flatnonzero(np.diff((place - place[0]) // MAX_RUN_SAMPLES)) + 1
         for part in np.split(np.arange(len(run)), cuts):
             epochs = [run[k].epoch for k in part]
-            imu, forces = self._imu_steps([epoch.stamp_ns for epoch in epochs])
+            imu, forces = self._imu_steps([epoch.stamp_ns for epoch in epochs],
+                                          [run[k].gravity_drift for k in part])
             for k, epoch in enumerate(method.advance(epochs, imu)):
                 self._force_check.add(*forces[k])
                 done = self._judge(epoch, run[part[k]].fault)
@@ -326,14 +329,15 @@ class Aligner:
             self._set_verdict(Verdict(State.WAITING_FOR_IMU, silence.why))
             return
         self._last_ns = self._first_t0_ns = self._steps_ns = epoch.stamp_ns
-        imu, _ = self._imu_steps([epoch.stamp_ns])
+        imu, _ = self._imu_steps([epoch.stamp_ns], [0.0])
         if self.config.method == 'map':
             self._method = MapMethod(self.config, epoch, imu, bool(use_position), self._prior)
         else:
             self._method = NoteMethod(self.config, epoch, imu, epoch.v_n is None)
         self._done.append(self._judge(epoch, self._antenna.fault))
 
-    def _imu_steps(self, epochs_ns: list[int]) -> tuple[ImuSteps, list[tuple[float, int]]]:
+    def _imu_steps(self, epochs_ns: list[int], gravity_drift: list[float],
+                   ) -> tuple[ImuSteps, list[tuple[float, int]]]:
         """IMU steps up to each epoch since the one before; sum and number of forces in them."""
         stamps, start_ns = self._imu.stamps, self._steps_ns
         ends_ns = np.array([start_ns, *epochs_ns])
@@ -344,7 +348,8 @@ class Aligner:
         self.counts['imu_spike'] += int(np.count_nonzero(spikes[ends[0] - 2:ends[-1] - 2]))
         stamps, samples = stamps[:ends[-1]], samples[:ends[-1]]
         steps = split_at_epochs(stamps, samples[:, :3], samples[:, 3:], ends_ns, unit=1e-9)
-        noise = self._noise(stamps, samples, windows, ends[1:], steps)
+        noise = self._noise(stamps, samples, windows, ends[1:], steps,
+                            np.array(gravity_drift)[:, None])
         magnitudes = np.sqrt(np.sum(np.square(samples[:, 3:]), axis=1))
         sums = np.diff(np.concatenate([[0.0], np.cumsum(magnitudes)])[ends - 2])
         forces = list(zip(sums.tolist(), np.diff(ends).tolist()))
@@ -354,9 +359,9 @@ class Aligner:
         return ImuSteps(steps, noise), forces
 
     def _noise(self, stamps: Index, samples: Array, first: Index, last: Index,
-               steps: Steps) -> Noise:
+               steps: Steps, gravity_drift: Array) -> Noise:
         """
-        White noise of each step: stated, measured, and what stamps do.
+        White noise of each step: stated, measured, that of gravity, and what stamps do.
 
         That is, what the motion can do in a gap and what it does to a sample whose stamp jitters:
         its change per second times the jitter.
@@ -380,7 +385,8 @@ class Aligner:
             return np.hypot(in_gap * density, jittered * rms)
 
         return Noise(np.hypot(stated[0], of_stamps(GAP_ANGULAR_ACCELERATION, steps.omega_dot)),
-                     np.hypot(stated[1], of_stamps(GAP_JERK, steps.f_dot)),
+                     np.hypot(np.hypot(stated[1], gravity_drift),
+                              of_stamps(GAP_JERK, steps.f_dot)),
                      excess[:, :1], excess[:, 1:])
 
     def _lose(self, why: str) -> None:

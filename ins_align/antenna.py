@@ -18,14 +18,15 @@ import math
 
 from ins_align.buffers import GnssEpoch
 from ins_align.config import Config
-from ins_align.earth import carried, Place, way
+from ins_align.earth import carried, GRAVITY_EQUATOR, Place, SEMI_MAJOR_AXIS, way
 from ins_align.messages import Fix, Velocity
 from ins_align.methods import AntennaEpoch
 from ins_align.plausibility import VelocityCheck
 from ins_align.rotation import Array
 import numpy as np
 
-# A fix this far (m) from where the last one and the velocity lead is not believed at first.
+# A fix this far (m) from where the last one and the velocity lead, and as much again for every
+# second since then, is not believed at first.
 MAX_FIX_JUMP = 300.0
 FIX_JUMPS_BELIEVED = 5
 # A place this old (s) is not carried on with the velocity.
@@ -55,8 +56,9 @@ class Antenna:
         self._config = config
         self._counts = counts
         self._place: Place | None = None
-        self._place_ns = 0
+        self._place_ns = self._fix_ns = self._seen_ns = 0
         self._v_n: Array | None = None
+        self._speed = 0.0
         self._jumps = 0
         self._vertical = config.velocity_vertical == 'measured'
         self._vertical_seen = False
@@ -74,6 +76,16 @@ class Antenna:
         """Fault of the velocities in words; empty when nothing is known to be wrong."""
         return self._check.fault
 
+    def gravity_drift(self, stamp_ns: int) -> float:
+        """
+        Return what the way since the last GNSS does to gravity, as a noise density, m/s/sqrt(s).
+
+        Gravity turns with the place. A way of v t that nobody knows turns it by v t / R, which
+        adds g v t^2 / 2 R to the velocity: as much as white noise of this density does.
+        """
+        silent = max(stamp_ns - self._seen_ns, 0) * 1e-9
+        return GRAVITY_EQUATOR / SEMI_MAJOR_AXIS * self._speed * silent ** 1.5
+
     def epoch(self, message: GnssEpoch) -> AntennaEpoch | None:
         """Take what the receiver said at an epoch; None while the place is not known."""
         config, velocity, fix = self._config, message.velocity, message.fix
@@ -87,8 +99,10 @@ class Antenna:
         position_covariance = self._position_noise.believed(stated)
         if position_covariance is not stated and stated is not None:
             self._counts['fix_covariance'] += 1
+        if v_n is not None or believed:
+            self._seen_ns = message.stamp_ns
         if v_n is not None:
-            self._v_n = v_n
+            self._v_n, self._speed = v_n, math.hypot(*v_n.tolist())
             self._look_for_vertical(v_n)
             if believed:
                 variances = position_covariance.diagonal().tolist()
@@ -116,9 +130,13 @@ class Antenna:
         if fix is not None:
             place = (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg),
                      fix.altitude_m)
-            if predicted is None or math.hypot(*way(predicted, place)) <= MAX_FIX_JUMP * (1 + dt):
+            silent = (stamp_ns - self._fix_ns) * 1e-9
+            if (predicted is None
+                    or math.hypot(*way(predicted, place)) <= MAX_FIX_JUMP * (1 + silent)):
                 self._jumps = 0
-                self._place, self._place_ns = place, stamp_ns
+                if self._place is not None and v_n is None and dt > 0:
+                    self._speed = math.hypot(*way(self._place, place)) / dt
+                self._place, self._place_ns, self._fix_ns = place, stamp_ns, stamp_ns
                 return True
             self._counts['fix_jump'] += 1
             self._jumps += 1

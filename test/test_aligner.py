@@ -389,6 +389,17 @@ def test_position_that_jumps_for_good_starts_over(flight):
     assert aligner.status().counts['fix_jump'] >= 5
 
 
+@pytest.mark.parametrize('velocity', (True, False))
+def test_a_minute_without_gnss_in_turns_is_bridged(velocity):
+    """The place is lost by kilometres, and with it where gravity points, but not the attitude."""
+    s = simulated('flight', imu_grade='tactical', seed=1, duration=130.0, position_std=0.02,
+                  outages=((50.0, 110.0),))
+    status = aligned(s, velocity=velocity)[0].status()
+    assert status.state is State.ALIGNED and status.counts.get('restarts', 0) == 0
+    for attitude in (status.initial, status.current):
+        assert normalised_error(attitude, s) < chi2.ppf(0.9999, 3)
+
+
 def test_single_wild_fix_is_not_believed(flight):
     aligner = Aligner(config_for(flight))
     for k, (kind, payload) in enumerate(flight.messages()):

@@ -14,6 +14,7 @@
 """What a receiver says of itself, and what of that is believed."""
 
 from collections import Counter
+import math
 
 from ins_align.antenna import Antenna, StatedNoise
 from ins_align.buffers import GnssEpoch
@@ -81,3 +82,20 @@ def test_an_antenna_counts_what_it_does_not_believe():
         # Ten centimetres are far better than expected, until they are stated again.
         assert (k == 0) != np.allclose(epoch.position_covariance, CORRELATED)
     assert (counts['velocity_covariance'], counts['fix_covariance']) == (3, 4)
+
+
+@pytest.mark.parametrize('velocity', (True, False))
+def test_gravity_is_in_doubt_by_the_way_since_the_last_gnss(velocity):
+    """All of it unknown: g (v t / R) t / 2 of velocity, and nothing while there is GNSS."""
+    antenna = Antenna(Config(), Counter())
+    speed, second = 50.0, 1_000_000_000
+    for k in range(11):
+        stamp = k * second // 10
+        latitude = 48.0 + math.degrees(speed * 0.1 * k / 6378137.0)
+        antenna.epoch(GnssEpoch(stamp, Fix(stamp, latitude, 11.0, 0.0, None, 0), Velocity(
+            stamp, np.array([0.0, speed, 0.0]), None) if velocity else None))
+        assert antenna.gravity_drift(stamp) == 0.0
+    t = np.linspace(0.0, 40.0, 4001)
+    density = [antenna.gravity_drift(second + round(1e9 * later)) for later in t]
+    variance = np.sum(np.square(density)) * (t[1] - t[0])
+    assert math.sqrt(variance) == pytest.approx(9.8 * speed * 40.0 ** 2 / 2 / 6378137.0, rel=0.01)
