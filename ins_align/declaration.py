@@ -182,7 +182,7 @@ class Declaration:
         if misfit > MAX_MISFIT:
             return (f'the residuals are {math.sqrt(misfit):.1f} times what the stated noise '
                     'allows: check the lever arm, the GNSS delay, the velocity frame, the IMU '
-                    'axes and signs')
+                    'axes and signs, the covariances that the receiver states')
         return ''
 
 
