@@ -413,7 +413,8 @@ class MapEstimator:
                                           else grown and not self.converged):
             self._fit()
 
-    def fitted_afresh(self, prior: Prior, intervals: Intervals) -> Solution:
+    def fitted_afresh(self, prior: Prior, intervals: Intervals,
+                      estimate_lever_arm: bool = False) -> Solution:
         """
         Fit the stored epochs once more, with another prior and other intervals; nothing changes.
 
@@ -425,10 +426,13 @@ class MapEstimator:
             Another one.
         intervals : Intervals
             Integrated with sensor errors of zero.
+        estimate_lever_arm : bool
+            Whether the lever arm is an unknown even where it is none here.
 
         """
         other = MapEstimator(prior, use_position=self.size == 9,
-                             estimate_lever_arm=LEVER_ARM.start in self.columns,
+                             estimate_lever_arm=(estimate_lever_arm
+                                                 or LEVER_ARM.start in self.columns),
                              estimate_delay=DELAY.start in self.columns,
                              estimate_gyro_scale=GYRO_SCALE.start in self.columns,
                              capacity=self.count, excess=self.excess)

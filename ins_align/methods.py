@@ -29,7 +29,7 @@ from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, Nav
 from ins_align.handover import prior_from_now
 from ins_align.preintegration import Noise, preintegrate, Steps
 from ins_align.rotation import Array, orthonormalized
-from ins_align.signs import SignCheck
+from ins_align.signs import LeverArmCheck, SignCheck, TOLD_STD
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
                                 Prior, SIZE, UNIFORM_ANGLE_STD, Unknowns)
 from ins_align.whitening import Measurements
@@ -155,7 +155,7 @@ class Method(Protocol):
         """Move t0 to the last epoch before the next one is taken, where a method can."""
 
     def unconfirmed(self) -> str:
-        """Return why the data do not show yet that the sensors' signs are right, or nothing."""
+        """Return what the data say against signs or lever arm, or do not say for them yet."""
 
     def nuisance(self) -> Nuisance:
         """Return biases, lever arm and delay."""
@@ -203,6 +203,7 @@ class MapMethod:
                                 np.array(config.lever_arm), config.lever_arm_std,
                                 0.0, config.gnss_delay_std, noise.gyro_scale_std)
         self._signs = SignCheck()
+        self._lever_arm = LeverArmCheck()
         self._ahead = 1
         self._offered = 0
         self._rejected = [0, 0]
@@ -285,6 +286,7 @@ class MapMethod:
         self._rejected = [fit.rejected_velocity, fit.rejected_position]
         self._past = PAST_DOF * fit.chi2 / max(fit.dof, 1), PAST_DOF
         self._signs.restart()
+        self._lever_arm.restart()
         self.moved += 1
         start = replace(self._last_epoch, v_n=None, position_measured=False)
         self._start(start, prior, self._estimator.excess)
@@ -326,8 +328,11 @@ class MapMethod:
         self._estimator.settle()
 
     def unconfirmed(self) -> str:
-        """Return why the data do not show yet that the sensors' signs are right, or nothing."""
-        return '' if self._config.trust_imu_axes else self._signs.doubt(self._estimator)
+        """Return what the data say against signs or lever arm, or do not say for them yet."""
+        doubt = '' if self._config.trust_imu_axes else self._signs.doubt(self._estimator)
+        if not doubt and self._config.lever_arm_std < TOLD_STD:
+            doubt = self._lever_arm.doubt(self._estimator)
+        return doubt
 
     def nuisance(self) -> Nuisance:
         """Return biases, lever arm and delay."""

@@ -26,6 +26,8 @@ import numpy as np
 
 # A heading is never known worse than uniform on the circle.
 UNIFORM_ANGLE_STD = math.pi / math.sqrt(3)
+# Of a lever arm that is not known, metres per axis.
+FREE_LEVER_STD = 2.0
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,16 @@ class Prior:
                        accel_bias=accel_sign * self.mean.accel_bias, start_velocity=zero,
                        start_position=zero)
         return prior_of(mean, covariance * np.outer(sign, sign), unknowns, False)
+
+    def with_free_lever_arm(self) -> 'Prior':
+        """Return what is known but for the lever arm, which is as good as unknown."""
+        known = np.flatnonzero(np.diag(self.information))
+        unknowns = np.union1d(known, np.r_[LEVER_ARM])
+        covariance = np.zeros((SIZE, SIZE))
+        covariance[np.ix_(known, known)] = inverse_spd(self.information[np.ix_(known, known)])
+        covariance[LEVER_ARM, LEVER_ARM] += FREE_LEVER_STD ** 2 * np.eye(3)
+        return prior_of(self.mean, covariance[np.ix_(unknowns, unknowns)], unknowns,
+                        self.heading_free)
 
     def at(self, point: Unknowns) -> tuple[Array, Array]:
         """

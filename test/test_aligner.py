@@ -509,6 +509,21 @@ def test_wrong_set_up_is_never_declared_wrong(wrong, scenario):
                 assert np.all(np.abs(error) < 5 * epoch.initial.sigma_deg), (seed, epoch.t_s)
 
 
+@pytest.mark.parametrize('scenario', ('car', 'flight', 'hover'))
+def test_a_told_lever_arm_with_the_wrong_signs_is_named_and_not_declared(scenario):
+    """It needs no more than one that is right does to be declared."""
+    told = (0.9, -0.6, 1.2)
+    s = simulated(scenario, imu_grade='tactical', seed=3, duration=60.0, lever_arm=told)
+    assert aligned(s, lever_arm_std=0.02)[1][-1].state is State.ALIGNED
+    wrong = tuple(-metres for metres in told)
+    aligner, epochs = aligned(s, lever_arm=wrong, lever_arm_std=0.02)
+    assert all(epoch.state is not State.ALIGNED for epoch in epochs)
+    reason = aligner.status().reason
+    assert 'lever arm of [' in reason and 'check lever_arm' in reason
+    found = np.array(reason.split('[')[1].split(']')[0].split(','), float)
+    assert np.allclose(found, told, atol=0.3)
+
+
 @pytest.mark.parametrize('scenario', ('static', 'straight'))
 def test_mems_that_holds_its_course_never_declares_a_heading(scenario):
     s = simulated(scenario, imu_grade='mems', duration=120.0, seed=2, gnss_rate=2.0, imu_rate=50.0)

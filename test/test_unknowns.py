@@ -17,8 +17,8 @@ from dataclasses import replace
 
 from alignment import LEVER
 from ins_align.rotation import exp_so3
-from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, GYRO_SCALE,
-                                inverse_spd, LEVER_ARM, Prior, prior_of, SIZE, START_POSITION,
+from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, FREE_LEVER_STD,
+                                GYRO_BIAS, GYRO_SCALE, inverse_spd, LEVER_ARM, Prior, prior_of, SIZE, START_POSITION,
                                 START_VELOCITY, Unknowns)
 import numpy as np
 import pytest
@@ -93,6 +93,17 @@ def test_prior_of_a_known_heading_is_about_axes_of_the_body(turn):
     assert turned @ there @ turned == pytest.approx(step @ here @ step, rel=1e-9)
     assert np.allclose(to_mean[ATTITUDE], [0.0, 0.0, -turn])
     assert np.allclose(to_mean[3:], 0.0)
+
+
+@pytest.mark.parametrize('lever_std', (0.0, 0.05))
+def test_prior_with_a_free_lever_arm_forgets_that_alone(lever_std):
+    prior = first_prior(1e-3, 0.05, LEVER, lever_std, 0.02, 0.1, 0.01)
+    free = prior.with_free_lever_arm()
+    before, after = np.diag(prior.information), np.diag(free.information)
+    assert np.allclose(after[LEVER_ARM], 1 / (FREE_LEVER_STD ** 2 + lever_std ** 2))
+    others = np.delete(np.arange(SIZE), np.r_[LEVER_ARM])
+    assert np.allclose(after[others], before[others], rtol=1e-9)
+    assert np.array_equal(free.mean.lever_b, prior.mean.lever_b)
 
 
 def test_inverse_of_rows_of_any_scale():
