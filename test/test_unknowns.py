@@ -18,8 +18,8 @@ from dataclasses import replace
 from alignment import LEVER
 from ins_align.rotation import exp_so3
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, FREE_LEVER_STD,
-                                GYRO_BIAS, GYRO_SCALE, inverse_spd, LEVER_ARM, Prior, prior_of, SIZE, START_POSITION,
-                                START_VELOCITY, Unknowns)
+                                GYRO_BIAS, GYRO_SCALE, inverse_spd, LEVER_ARM, Prior, prior_of,
+                                SIZE, START_POSITION, START_VELOCITY, Unknowns)
 import numpy as np
 import pytest
 
