@@ -56,7 +56,10 @@ def prior_from_now(estimator: MapEstimator, C_n0n: Array, shift_v: Array, shift_
     columns = estimator.columns
     heading_free = not estimator.heading_std < HEADING_RESOLVED_STD
     now, joint = _now(estimator, heading_free)
-    joint = scale * _turned(joint, C_n0n.T)
+    T = np.eye(joint.shape[0])
+    for block in range(3):
+        T[3 * block:3 * block + 3, 3 * block:3 * block + 3] = C_n0n.T
+    joint = scale * T @ joint @ T.T
     joint[9:, 9:] += np.diag(wander[columns])
     if heading_free:
         # The gyros cannot tell their biases from the Earth's rate seen under a heading that
@@ -82,58 +85,38 @@ def _now(estimator: MapEstimator, heading_free: bool) -> tuple[Unknowns, Array]:
     Return the unknowns as if the last epoch were t0, in the axes and origin of the present n0.
 
     Their attitude, start velocity and start position are those of the IMU now. The second result
-    is the joint covariance of (attitude, velocity, position, unknowns), shape (9 + n, 9 + n).
-
-    What the data have told about tilt, velocity and biases hangs together by the heading of the
-    linearisation point, so the derivatives are those of that heading, and the result is turned
-    with the step to the estimate's. With `heading_free` the attitude is told with the heading of
-    the point too, since any is as good.
+    is the joint covariance of (attitude, velocity, position, unknowns), shape (9 + n, 9 + n). It
+    belongs to the heading of the linearisation point; with `heading_free` the attitude is told
+    with that heading too, since any is as good.
     """
     s = estimator.solution
     if s is None:
         raise RuntimeError('no solution yet')
     x, step, time, chain = s.estimate, s.step(), estimator.time, s.chain
+    C = exp_so3([0.0, 0.0, -step[2]]) @ x.C if heading_free else x.C
     error = np.zeros(9)
     error[:estimator.size] = s.chain_errors()
     # The stored chain holds the biases of the point: their step is still to be applied.
     gyro, accel = step[GYRO], step[ACCEL_BIAS]
-    chain_v = chain.v + chain.v_g @ gyro + chain.v_a @ accel
-    chain_p = chain.p + chain.p_g @ gyro + chain.p_a @ accel
-
-    def derivatives(C: Array) -> Array:
-        """Of what is now to the unknowns, with one initial attitude."""
-        v, p = C @ chain_v, C @ chain_p
-        J = np.zeros((9, SIZE))
-        J[:3, ATTITUDE] = J[3:6, START_VELOCITY] = J[6:, START_POSITION] = np.eye(3)
-        J[3:6, ATTITUDE], J[6:, ATTITUDE] = -skew(v), -skew(p)
-        J[6:, START_VELOCITY] = time * np.eye(3)
-        J[:3, GYRO], J[3:6, GYRO], J[6:, GYRO] = C @ chain.R_g, C @ chain.v_g, C @ chain.p_g
-        J[3:6, ACCEL_BIAS], J[6:, ACCEL_BIAS] = C @ chain.v_a, C @ chain.p_a
-        return J
-
-    turn = exp_so3([0.0, 0.0, step[2]])
-    C_point = turn.T @ x.C
-    C = C_point if heading_free else x.C
-    # To attitude and start they are the derivatives to the errors of the chain too.
-    moved = derivatives(C)[:, START] @ error
+    v = C @ (chain.v + chain.v_g @ gyro + chain.v_a @ accel)
+    p = C @ (chain.p + chain.p_g @ gyro + chain.p_a @ accel)
+    # Derivatives of what is now to the unknowns; to attitude and start they are those to the
+    # errors of the chain too.
+    J = np.zeros((9, SIZE))
+    J[:3, ATTITUDE] = J[3:6, START_VELOCITY] = J[6:, START_POSITION] = np.eye(3)
+    J[3:6, ATTITUDE], J[6:, ATTITUDE] = -skew(v), -skew(p)
+    J[6:, START_VELOCITY] = time * np.eye(3)
+    E = J[:, START]
+    J[:3, GYRO], J[3:6, GYRO], J[6:, GYRO] = C @ chain.R_g, C @ chain.v_g, C @ chain.p_g
+    J[3:6, ACCEL_BIAS], J[6:, ACCEL_BIAS] = C @ chain.v_a, C @ chain.p_a
+    moved = E @ error
     now = replace(
         x, C=exp_so3(error[:3]) @ C @ exp_so3(chain.R_g @ gyro) @ chain.R,
-        start_velocity=x.start_velocity + C @ chain_v + moved[3:6],
-        start_position=x.start_position + time * x.start_velocity + C @ chain_p + moved[6:])
-    J = derivatives(C_point)
-    E = J[:, START[:estimator.size]]
+        start_velocity=x.start_velocity + v + moved[3:6],
+        start_position=x.start_position + time * x.start_velocity + p + moved[6:])
+    E = E[:, :estimator.size]
     total = np.vstack([J[:, estimator.columns] - E @ s.whitener.X[:, 1:],
                        np.eye(estimator.columns.size)])
     covariance = total @ s.P @ total.T
     covariance[:9, :9] += E @ s.whitener.P @ E.T
-    if not heading_free:
-        covariance = _turned(covariance, turn)
     return now, covariance
-
-
-def _turned(covariance: Array, C: Array) -> Array:
-    """Turn the axes of attitude, velocity and position in a joint covariance."""
-    T = np.eye(covariance.shape[0])
-    for block in (slice(0, 3), slice(3, 6), slice(6, 9)):
-        T[block, block] = C
-    return T @ covariance @ T.T
