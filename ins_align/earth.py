@@ -15,7 +15,7 @@
 The Earth: WGS-84 ellipsoid, normal gravity, and how the local level turns (C_n0n).
 
 Latitude and longitude are radians, altitude is metres above the ellipsoid; every function but
-`carried` works over leading axes.
+`carried` and `way` works over leading axes.
 """
 
 import math

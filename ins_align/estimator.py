@@ -32,7 +32,7 @@ from ins_align.solution import Course, Solution
 from ins_align.unknowns import (BODY_FIXED, DELAY, GYRO_BIAS, GYRO_SCALE, LEVER_ARM, Prior,
                                 prior_of, SIZE, START_POSITION, START_VELOCITY, Unknowns)
 from ins_align.whitening import (Chain, GATE, Gate, HEADING_RESOLVED_STD, Measurements, POSITION,
-                                 VELOCITY)
+                                 VELOCITY, Whitened)
 import numpy as np
 
 # Median of chi-square with three degrees of freedom.
@@ -277,12 +277,8 @@ class MapEstimator:
                  and self.free_axis_tilt < self.IDLE_AXIS_TILT)
         return bool(age >= (self.IDLE_TIME if still else self.MAX_IDLE_TIME))
 
-    def _run(self, s: Solution, gate: Gate | None) -> Array:
-        """
-        Take all stored epochs into an empty solution; without a gate those not refused.
-
-        Returns the normalised squares of the residuals, shape (K, kinds).
-        """
+    def _run(self, s: Solution, gate: Gate | None) -> Whitened:
+        """Take all stored epochs into an empty solution; without a gate those not refused."""
         epochs = slice(0, self.count)
         gnss = self._gnss.take(epochs)
         present = gnss.present[:, :s.kinds]
@@ -309,14 +305,15 @@ class MapEstimator:
         """Gauss-Newton over the store from a starting point."""
         for _ in range(self.MAX_ITERATIONS):
             s = self._start(point)
-            squares = self._run(s, None if P is None else Gate(s.dx, P))
+            whitened = self._run(s, None if P is None else Gate(s.dx, P))
             if sum(s.rejected) > self.MAX_REJECTED * self.count:
                 # Not a few outliers but a wrong picture: look at everything again.
                 s, P = self._start(point), None
                 self._refused[:] = False
-                squares = self._run(s, None)
+                whitened = self._run(s, None)
             if s.nonlinearity <= self.NONLINEARITY:
-                if not (self.gated and self._misfits(s) and self._refuse_wild(squares)):
+                if not (self.gated and self._misfits(s)
+                        and self._refuse_wild(s.residuals(whitened))):
                     break
                 P = None
             point = s.estimate
@@ -327,7 +324,7 @@ class MapEstimator:
         return s.chi2 > self.MISFIT * max(s.dof, 1)
 
     def _refuse_wild(self, squares: Array) -> bool:
-        """Refuse the outliers among residuals that the others make look wild; if there are few."""
+        """Refuse the residuals that are wild beside the others, if there are few."""
         wild = np.zeros(squares.shape, bool)
         for kind, of_kind in enumerate(squares.T):
             usual = np.median(of_kind[of_kind > 0.0]) if of_kind.any() else 0.0

@@ -372,22 +372,24 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     v, p = v_end[:, -1], p_end[:, -1]
     v_rest = v[:, None] - v_mid
     p_rest = p[:, None] - (p_end - 0.5 * p_step) - v_mid * remaining[..., None]
-    gyro_noise = _of_gyros(dt, v_rest, p_rest)
-    accel_noise = _of_accelerometers(dt, dt, remaining)
+    Q = Q_excess = np.zeros((dt.shape[0], 9, 9))
+    if any(np.any(density) for density in vars(noise).values()):
+        gyro_noise = _of_gyros(dt, v_rest, p_rest)
+        accel_noise = _of_accelerometers(dt, dt, remaining)
 
-    def covariance(gyro: ArrayLike, accel: ArrayLike) -> Array:
-        """Of the errors at the end, from densities in each step."""
-        gyro_least, gyro_more = _least_and_more(gyro)
-        accel_least, accel_more = _least_and_more(accel)
-        Q = gyro_least * gyro_noise + accel_least * accel_noise
-        if gyro_more.any():
-            Q += _of_gyros(gyro_more * dt, v_rest, p_rest)
-        if accel_more.any():
-            Q += _of_accelerometers(accel_more * dt, dt, remaining)
-        return Q
+        def covariance(gyro: ArrayLike, accel: ArrayLike) -> Array:
+            """Of the errors at the end, from densities in each step."""
+            gyro_least, gyro_more = _least_and_more(gyro)
+            accel_least, accel_more = _least_and_more(accel)
+            total = gyro_least * gyro_noise + accel_least * accel_noise
+            if gyro_more.any():
+                total += _of_gyros(gyro_more * dt, v_rest, p_rest)
+            if accel_more.any():
+                total += _of_accelerometers(accel_more * dt, dt, remaining)
+            return total
 
-    Q = covariance(noise.angle_random_walk, noise.velocity_random_walk)
-    Q_excess = covariance(noise.gyro_excess, noise.accel_excess)
+        Q = covariance(noise.angle_random_walk, noise.velocity_random_walk)
+        Q_excess = covariance(noise.gyro_excess, noise.accel_excess)
     # Intervals are chained for hours.
     R = orthonormalized(turned[:, -1])
     # Mean forces and rates of both halves of the window.

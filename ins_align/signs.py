@@ -27,11 +27,24 @@ WRONG = {
     (-1, 1): 'the angular rates reversed',
     (-1, -1): 'one IMU axis reversed (left-handed axes?)',
 }
-
-
 # A lever arm that is told to be known better than this (m) is in doubt when one that is free has
 # so much less chi-square: three unknowns, one in 100 000 by chance.
 TOLD_STD, LEVER_GAIN = 0.3, 26.0
+
+
+class _Occasions:
+    """When to judge again: not at every epoch, for it takes fits of all that is stored."""
+
+    def __init__(self) -> None:
+        """Judge at the next question."""
+        self._next = 0.0
+
+    def come(self, estimator: MapEstimator) -> bool:
+        """Whether it is time, and if so, set the next one."""
+        if estimator.count < max(self._next, estimator.FIRST_FIT):
+            return False
+        self._next = estimator.count * (1 + GROWTH[estimator.count > SOON])
+        return True
 
 
 class SignCheck:
@@ -45,16 +58,15 @@ class SignCheck:
     def __init__(self) -> None:
         """Start in doubt."""
         self._doubt = 'the signs of the IMU axes are not judged yet'
-        self._next = 0.0
+        self.restart()
 
     def restart(self) -> None:
         """Judge at the next question: the estimator is another one."""
-        self._next = 0.0
+        self._occasions = _Occasions()
 
     def doubt(self, estimator: MapEstimator) -> str:
         """Return why the data do not show yet that the signs are right, or nothing."""
-        if self._doubt and estimator.count >= max(self._next, estimator.FIRST_FIT):
-            self._next = estimator.count * (1 + GROWTH[estimator.count > SOON])
+        if self._doubt and self._occasions.come(estimator):
             chi2 = sign_evidence(estimator)
             right = chi2.pop(RIGHT)
             rival = min(chi2, key=chi2.__getitem__)
@@ -78,12 +90,11 @@ class LeverArmCheck:
     def restart(self) -> None:
         """Judge at the next question: the estimator is another one."""
         self._doubt = ''
-        self._next = 0.0
+        self._occasions = _Occasions()
 
     def doubt(self, estimator: MapEstimator) -> str:
         """Return what the data say against the told lever arm, or nothing."""
-        if estimator.count >= max(self._next, estimator.FIRST_FIT):
-            self._next = estimator.count * (1 + GROWTH[estimator.count > SOON])
+        if self._occasions.come(estimator):
             gain, lever = lever_arm_evidence(estimator)
             self._doubt = '' if gain < LEVER_GAIN else (
                 'the data fit better with a lever arm of '

@@ -142,16 +142,8 @@ class Solution:
         return 2 if self._size == 9 else 1
 
     def run(self, rows: Rows, present: np.ndarray, wanted: np.ndarray, gate: Gate | None,
-            gate_scale: float) -> Array:
-        """
-        Take what is wanted of epochs at one go; outliers by one gate for all.
-
-        Returns
-        -------
-        ndarray, shape (K, kinds)
-            Normalised squares of the residuals at the estimate, 0 where nothing was taken.
-
-        """
+            gate_scale: float) -> Whitened:
+        """Take what is wanted of epochs at one go; outliers by one gate for all."""
         whitened = self.whitener.whitened(rows, wanted)
         if gate is not None:
             nis, _ = gate.test(whitened.innovation, whitened.S)
@@ -160,6 +152,18 @@ class Solution:
         for kind, count in enumerate(np.count_nonzero(present & ~whitened.used, axis=0).tolist()):
             self.rejected[kind] += count
         self.move_to(self._course(rows, whitened, slice(-1, None)), 0)
+        return whitened
+
+    def residuals(self, whitened: Whitened) -> Array:
+        """
+        Return the normalised squares of the residuals at the estimate of what `run` took.
+
+        Returns
+        -------
+        ndarray, shape (K, kinds)
+            0 where nothing was taken.
+
+        """
         return Gate(self.dx, np.zeros_like(self.P)).test(whitened.innovation, whitened.S)[0]
 
     def course(self, rows: Rows, wanted: np.ndarray) -> Course:

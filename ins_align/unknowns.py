@@ -110,12 +110,16 @@ class Prior:
     information: Array
     heading_free: bool
 
+    def _known(self) -> tuple[Index, Array]:
+        """Unknowns of which something is known, and their covariance."""
+        known = np.flatnonzero(np.diag(self.information))
+        return known, inverse_spd(self.information[np.ix_(known, known)])
+
     def mirrored(self, gyro_sign: float, accel_sign: float) -> 'Prior':
         """Return what is known but for the attitude, were the signs of the sensors changed."""
-        known = np.flatnonzero(np.diag(self.information))
+        known, covariance = self._known()
         kept = np.isin(known, BODY_FIXED)
-        unknowns = known[kept]
-        covariance = inverse_spd(self.information[np.ix_(known, known)])[np.ix_(kept, kept)]
+        unknowns, covariance = known[kept], covariance[np.ix_(kept, kept)]
         # Biases that were learnt under the wrong signs hold the Earth's rate, seen upside down.
         gyro = np.isin(unknowns, np.r_[GYRO_BIAS])
         covariance[gyro, gyro] += (2 * EARTH_RATE) ** 2
@@ -130,10 +134,10 @@ class Prior:
 
     def with_free_lever_arm(self) -> 'Prior':
         """Return what is known but for the lever arm, which is as good as unknown."""
-        known = np.flatnonzero(np.diag(self.information))
+        known, of_known = self._known()
         unknowns = np.union1d(known, np.r_[LEVER_ARM])
         covariance = np.zeros((SIZE, SIZE))
-        covariance[np.ix_(known, known)] = inverse_spd(self.information[np.ix_(known, known)])
+        covariance[np.ix_(known, known)] = of_known
         covariance[LEVER_ARM, LEVER_ARM] += FREE_LEVER_STD ** 2 * np.eye(3)
         return prior_of(self.mean, covariance[np.ix_(unknowns, unknowns)], unknowns,
                         self.heading_free)
