@@ -34,6 +34,7 @@ from ins_align.methods import AntennaEpoch, ImuSteps, MapMethod, Method, NoteMet
 from ins_align.plausibility import ForceCheck, IMU_BEFORE, stuck, without_spikes
 from ins_align.prediction import Prediction
 from ins_align.preintegration import Noise, split_at_epochs, Steps, white_noise
+from ins_align.recent import recent_motion
 from ins_align.results import Attitude, Epoch, Status
 from ins_align.rotation import Array, Index
 from ins_align.unknowns import Prior
@@ -55,8 +56,8 @@ NOISE_EXCESS = 1.25
 DRY_INTERVAL_NS = 2_000_000_000
 # Positions alone are taken when no velocity came for this long (ns).
 NO_VELOCITY_NS = 2_000_000_000
-# The IMU samples of a run of epochs that are handled at one go.
-MAX_RUN_SAMPLES = 4096
+# The IMU samples of a run of epochs that are handled at one go, and what an epoch costs beside.
+MAX_RUN_SAMPLES, EPOCH_SAMPLES = 4096, 16
 _NOTHING_YET = Verdict(State.WAITING_FOR_IMU, 'no IMU sample yet')
 
 
@@ -291,7 +292,8 @@ class Aligner:
         method = self._method
         assert method is not None
         place = np.searchsorted(self._imu.stamps, [located.epoch.stamp_ns for located in run])
-        cuts = np.flatnonzero(np.diff((place - place[0]) // MAX_RUN_SAMPLES)) + 1
+        size = place - place[0] + EPOCH_SAMPLES * np.arange(len(run))
+        cuts = np.flatnonzero(np.diff(size // MAX_RUN_SAMPLES)) + 1
         for part in np.split(np.arange(len(run)), cuts):
             epochs = [run[k].epoch for k in part]
             imu, forces = self._imu_steps([epoch.stamp_ns for epoch in epochs],
@@ -350,13 +352,14 @@ class Aligner:
         steps = split_at_epochs(stamps, samples[:, :3], samples[:, 3:], ends_ns, unit=1e-9)
         noise = self._noise(stamps, samples, windows, ends[1:], steps,
                             np.array(gravity_drift)[:, None])
+        recent = recent_motion(stamps, samples[:, :3], samples[:, 3:], ends_ns[1:], unit=1e-9)
         magnitudes = np.sqrt(np.sum(np.square(samples[:, 3:]), axis=1))
         sums = np.diff(np.concatenate([[0.0], np.cumsum(magnitudes)])[ends - 2])
         forces = list(zip(sums.tolist(), np.diff(ends).tolist()))
         self._steps_ns = epochs_ns[-1]
         self._imu.forget_before(self._steps_ns - NOISE_WINDOW_NS)
         self._imu.used_ns = self._steps_ns
-        return ImuSteps(steps, noise), forces
+        return ImuSteps(steps, noise, recent), forces
 
     def _noise(self, stamps: Index, samples: Array, first: Index, last: Index,
                steps: Steps, gravity_drift: Array) -> Noise:

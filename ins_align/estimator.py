@@ -100,6 +100,10 @@ class MapEstimator:
     MAX_REJECTED = 0.3
     # Chi-square per degree of freedom from which on a fit looks for outliers among its residuals.
     MISFIT = 4.0
+    # From this chi-square per degree of freedom on the minimum may be a wrong one, as those are a
+    # step of a walker apart: others are looked for from these delays (s) on whenever the store has
+    # grown by this factor.
+    DOUBTFUL, OTHER_DELAYS, AFRESH_GROWTH = 2.0, (0.0, 0.1, 0.2), 2
     # Ages (s) at which t0 moves on: when no heading is known to within this (rad), though the
     # velocity is (m/s) and the unknown turn is about the vertical to within this (rad: a vehicle
     # that gathers speed soon shows its heading); when neither is; when both are. The first two
@@ -134,7 +138,7 @@ class MapEstimator:
         self._refused = np.zeros((capacity, 2), bool)
         self.count = 0
         self.solution: Solution | None = None
-        self._last_fit = self._last_tuned = 0
+        self._last_fit = self._last_tuned = self._last_afresh = 0
         self.excess = excess
         self.gated = True
         self._recent: deque[float] = deque(maxlen=self.GATE_WINDOW)
@@ -277,12 +281,12 @@ class MapEstimator:
                  and self.free_axis_tilt < self.IDLE_AXIS_TILT)
         return bool(age >= (self.IDLE_TIME if still else self.MAX_IDLE_TIME))
 
-    def _run(self, s: Solution, gate: Gate | None) -> Whitened:
+    def _run(self, s: Solution, gate: Gate | None, refused: np.ndarray) -> Whitened:
         """Take all stored epochs into an empty solution; without a gate those not refused."""
         epochs = slice(0, self.count)
         gnss = self._gnss.take(epochs)
         present = gnss.present[:, :s.kinds]
-        wanted = present if gate is not None else present & ~self._refused[epochs, :s.kinds]
+        wanted = present if gate is not None else present & ~refused[:, :s.kinds]
         return s.run(s.rows(gnss, self._corrected(epochs, s.point)), present, wanted, gate,
                      self._gate_scale)
 
@@ -301,19 +305,24 @@ class MapEstimator:
         """Return an empty solution at a linearisation point."""
         return Solution(point, self.prior, self.columns, self.size, self.excess)
 
-    def _converge(self, point: Unknowns, P: 'Array | None') -> Solution:
-        """Gauss-Newton over the store from a starting point."""
+    def _converge(self, point: Unknowns, P: 'Array | None', refused: np.ndarray) -> Solution:
+        """
+        Gauss-Newton over the store from a starting point.
+
+        What of the store is `refused`, shape (count, 2), is not taken where nothing gates; it is
+        changed to what the solution goes without.
+        """
         for _ in range(self.MAX_ITERATIONS):
             s = self._start(point)
-            whitened = self._run(s, None if P is None else Gate(s.dx, P))
+            whitened = self._run(s, None if P is None else Gate(s.dx, P), refused)
             if sum(s.rejected) > self.MAX_REJECTED * self.count:
                 # Not a few outliers but a wrong picture: look at everything again.
                 s, P = self._start(point), None
-                self._refused[:] = False
-                whitened = self._run(s, None)
+                refused[:] = False
+                whitened = self._run(s, None, refused)
             if s.nonlinearity <= self.NONLINEARITY:
                 if not (self.gated and self._misfits(s)
-                        and self._refuse_wild(s.residuals(whitened))):
+                        and self._refuse_wild(s.residuals(whitened), refused)):
                     break
                 P = None
             point = s.estimate
@@ -323,31 +332,40 @@ class MapEstimator:
         """Whether a solution leaves residuals that no noise makes."""
         return s.chi2 > self.MISFIT * max(s.dof, 1)
 
-    def _refuse_wild(self, squares: Array) -> bool:
+    def _refuse_wild(self, squares: Array, refused: np.ndarray) -> bool:
         """Refuse the residuals that are wild beside the others, if there are few."""
         wild = np.zeros(squares.shape, bool)
         for kind, of_kind in enumerate(squares.T):
             usual = np.median(of_kind[of_kind > 0.0]) if of_kind.any() else 0.0
             wild[:, kind] = of_kind > GATE * max(1.0, usual / MEDIAN_CHI2_3)
-        refused = self._refused[:self.count, :squares.shape[1]]
+        refused = refused[:, :squares.shape[1]]
         few = np.count_nonzero(refused | wild) <= self.MAX_REJECTED * self.count
         if few:
             refused |= wild
         return bool(few and wild.any())
 
     def _fit(self) -> None:
-        """Move the linearisation point; while the heading is not resolved, try the q-method."""
+        """Move the linearisation point from where it is; while that is doubtful, from others."""
         self._last_fit = self.count
         old = self.solution
         resolved = old is not None and self.heading_std < HEADING_RESOLVED_STD
         gate = old.P if old is not None and resolved and self.gated else None
-        here = self.estimate()
-        known = old is not None or self.prior.information[0, 0] > 0
-        starts = [here] if known else []
+        here, before = self.estimate(), self.prior.mean
+        starts = [here] if old is not None or self.prior.information[0, 0] > 0 else []
         if not resolved and self.count >= self.FIRST_FIT:
             starts.append(replace(here, C=self._rough_attitude(here)))
-        solutions = [self._converge(start, gate) for start in starts]
-        self.solution = min(solutions, key=lambda s: s.chi2)
+        elif (old is not None and old.chi2 > self.DOUBTFUL * max(old.dof, 1)
+                and self.count >= self.AFRESH_GROWTH * self._last_afresh):
+            self._last_afresh = self.count
+            delays = self.OTHER_DELAYS if DELAY.start in self.columns else (0.0,)
+            for other in (replace(before, delay=before.delay + delay) for delay in delays):
+                starts.append(replace(other, C=self._rough_attitude(other)))
+        fits = []
+        for start in starts:
+            refused = self._refused[:self.count].copy()
+            s = self._converge(start, gate if start is here else None, refused)
+            fits.append((s.chi2 + GATE * self._gate_scale * sum(s.rejected), s, refused))
+        _, self.solution, self._refused[:self.count] = min(fits, key=lambda fit: fit[0])
 
     def _tune(self) -> None:
         """
@@ -367,7 +385,7 @@ class MapEstimator:
                 continue
             self.excess = trial
             solution = self._start(old.estimate)
-            self._run(solution, None)
+            self._run(solution, None, self._refused[:self.count])
             if solution.log_likelihood > best + gain:
                 excess, best, gain = trial, solution.log_likelihood, 0.0
         self.excess = excess
@@ -386,7 +404,8 @@ class MapEstimator:
             use = gnss.present[:, kind]
             if np.count_nonzero(use) < self.FIRST_FIT - 1 or (kind and total > 0):
                 continue
-            lever = cross(interval.omega, point.lever_b) if kind == 0 else point.lever_b
+            omega = interval.omega * (1 - point.gyro_scale) - point.gyro_bias
+            lever = cross(omega, point.lever_b) if kind == 0 else point.lever_b
             integral = chain.v if kind == 0 else chain.p
             a = (integral + (chain.R @ np.broadcast_to(
                 lever, integral.shape)[..., None])[..., 0])[use]

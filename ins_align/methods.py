@@ -28,6 +28,7 @@ from ins_align.estimator import FIRST_EXCESS, Innovation, MapEstimator, NOTHING_
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
 from ins_align.handover import prior_from_now
 from ins_align.preintegration import Noise, preintegrate, Steps
+from ins_align.recent import Recent
 from ins_align.rotation import Array, orthonormalized
 from ins_align.signs import LeverArmCheck, SignCheck, TOLD_STD
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
@@ -75,14 +76,16 @@ class AntennaEpoch:
 
 @dataclass(frozen=True)
 class ImuSteps:
-    """IMU steps before each of K epochs and the white noise in them."""
+    """IMU steps before each of K epochs, the white noise in them and the motion at their ends."""
 
     steps: Steps
     noise: Noise
+    recent: Recent | None = None
 
     def take(self, index: slice) -> 'ImuSteps':
         """Return those of some epochs."""
-        return ImuSteps(self.steps.take(index), self.noise.take(index))
+        return ImuSteps(self.steps.take(index), self.noise.take(index),
+                        None if self.recent is None else self.recent.take(index))
 
 
 @dataclass(frozen=True)
@@ -269,7 +272,7 @@ class MapMethod:
                             track.gravity, -track.still_v)
         gyro_bias, accel_bias, gyro_scale = self._estimator.sensor_errors
         intervals = preintegrate(imu.steps, gyro_bias, accel_bias, imu.noise,
-                                 gyro_scale if self._scaled else None)
+                                 gyro_scale if self._scaled else None, imu.recent)
         for k, self._innovation in enumerate(self._estimator.add(intervals, gnss)):
             self._track, self._last_epoch = track.at(k), epochs[k]
             self._last_imu = imu.take(slice(k, k + 1))

@@ -21,13 +21,11 @@ interpolation. All samples of an interval, and all intervals of a batch, are han
 
 from dataclasses import dataclass, fields
 
+from ins_align.recent import Recent, RUNGS
 from ins_align.rotation import (Array, cross, cumulative_rotations, exp_and_left_jacobian, exp_so3,
                                 Index, orthonormalized, skew)
 import numpy as np
 from numpy.typing import ArrayLike
-
-
-LINE_WINDOW = 0.3       # s, before an epoch: as long as delays are
 
 
 @dataclass(frozen=True)
@@ -54,13 +52,9 @@ class Intervals:
     Q_excess : ndarray, shape (K, 9, 9)
         The same for the noise that was measured in excess of what is stated.
     omega : ndarray, shape (K, 3)
-        Angular rate at the end of the interval.
-    f, f_dot : ndarray, shape (K, 3)
-        Specific force at the end, in the body frame there, and its change per second as seen from
-        a frame that does not turn: of a line through the last `LINE_WINDOW`, since a single
-        sample holds all of the vibration.
-    rate, rate_dot : ndarray, shape (K, 3)
-        Angular rate at the end and its change per second, of such a line.
+        Angular rate at the end of the interval, as measured.
+    gained, turned : ndarray, shape (K, RUNGS, 3)
+        Before the end of the interval, as measured; see `Recent`.
 
     """
 
@@ -78,16 +72,14 @@ class Intervals:
     Q: Array
     Q_excess: Array
     omega: Array
-    f: Array
-    f_dot: Array
-    rate: Array
-    rate_dot: Array
+    gained: Array
+    turned: Array
 
     @staticmethod
     def empty(capacity: int) -> 'Intervals':
         """Room for `capacity` intervals, to be filled by `put`."""
-        shapes = {'duration': (), 'v': (3,), 'p': (3,), 'omega': (3,), 'f': (3,), 'f_dot': (3,),
-                  'rate': (3,), 'rate_dot': (3,), 'Q': (9, 9), 'Q_excess': (9, 9)}
+        shapes = {'duration': (), 'v': (3,), 'p': (3,), 'omega': (3,), 'Q': (9, 9),
+                  'Q_excess': (9, 9), 'gained': (RUNGS, 3), 'turned': (RUNGS, 3)}
         return Intervals(**{field.name: np.zeros((capacity,) + shapes.get(field.name, (3, 3)))
                             for field in fields(Intervals)})
 
@@ -115,15 +107,20 @@ class Intervals:
             'J_vg': accel_sign * self.J_vg, 'J_pg': accel_sign * self.J_pg,
             'J_Rs': gyro_sign * self.J_Rs, 'J_vs': gyro_sign * accel_sign * self.J_vs,
             'J_ps': gyro_sign * accel_sign * self.J_ps,
-            'omega': gyro_sign * self.omega, 'f': accel_sign * self.f,
-            'f_dot': accel_sign * self.f_dot, 'rate': gyro_sign * self.rate,
-            'rate_dot': gyro_sign * self.rate_dot})
+            'omega': gyro_sign * self.omega, 'gained': accel_sign * self.gained,
+            'turned': gyro_sign * self.turned})
 
     def corrected(self, gyro_bias: Array, accel_bias: Array, gyro_scale: Array) -> 'Intervals':
         """
-        First-order correction for a change of the sensors' errors, shape (3,) or (K, 3) each.
+        First-order correction of R, v and p for a change of the sensors' errors.
 
         Noise and derivatives are left as they are: they change in second order only.
+
+        Parameters
+        ----------
+        gyro_bias, accel_bias, gyro_scale : ndarray, shape (3,) or (K, 3)
+            By how much they are larger than those that the samples were integrated with.
+
         """
         def product(matrices: Array, vectors: Array) -> Array:
             return (matrices @ vectors[..., None])[..., 0]
@@ -134,9 +131,7 @@ class Intervals:
             'v': (self.v + product(self.J_vg, gyro_bias) + product(self.J_Rg, accel_bias)
                   + product(self.J_vs, gyro_scale)),
             'p': (self.p + product(self.J_pg, gyro_bias) + product(self.J_pa, accel_bias)
-                  + product(self.J_ps, gyro_scale)),
-            'omega': self.omega * (1 - gyro_scale) - gyro_bias, 'f': self.f - accel_bias,
-            'rate': self.rate * (1 - gyro_scale) - gyro_bias})
+                  + product(self.J_ps, gyro_scale))})
 
 
 @dataclass(frozen=True)
@@ -291,7 +286,7 @@ def white_noise(stamps: 'Array | Index', samples: Array, first: Index, last: Ind
 
 
 def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise,
-                 gyro_scale: 'Array | None' = None) -> Intervals:
+                 gyro_scale: 'Array | None' = None, recent: 'Recent | None' = None) -> Intervals:
     """
     Integrate the steps of K intervals.
 
@@ -310,6 +305,9 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     gyro_scale : ndarray, shape (3,), optional
         Scale factors less one: the true rate is ``omega (1 - gyro_scale) - gyro_bias``. Without
         it the derivatives to it are left out, that is zero.
+    recent : Recent, optional
+        Motion before the end of each interval. Without it force and rate at the end are taken to
+        have lasted.
 
     Returns
     -------
@@ -359,7 +357,8 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     turns = np.empty(dt.shape + (3, 3 * errors))
     turns[..., :3] = A @ jacobian * dt[..., None, None]
     if gyro_scale is not None:
-        turns[..., 3:] = turns[..., :3] * (0.5 * (omega0 + omega1))[..., None, :]
+        measured = 0.5 * (steps.omega[:, :-1] + steps.omega[:, 1:])
+        turns[..., 3:] = turns[..., :3] * measured[..., None, :]
     turned_by = np.cumsum(turns, axis=1)
     pushes = skew(u) @ (turned_by - 0.5 * turns)
     J_R, J_v = -turned_by[:, -1], np.sum(pushes, axis=1)
@@ -392,30 +391,10 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
         Q_excess = covariance(noise.gyro_excess, noise.accel_excess)
     # Intervals are chained for hours.
     R = orthonormalized(turned[:, -1])
-    # Mean forces and rates of both halves of the window.
-    half = 0.5 * np.minimum(duration, LINE_WINDOW)
-    parts = np.concatenate([u, theta], axis=-1)
-    sums = np.concatenate([v_end, np.cumsum(theta, axis=1)], axis=-1)
-    middle, start = (_at_time(duration - back, passed, dt, sums, parts)
-                     for back in (half, 2 * half))
-    half = np.maximum(half, 1e-9)[:, None]
-    late, early = (sums[:, -1] - middle) / half, (middle - start) / half
-    line = np.stack([1.5 * late - 0.5 * early, (late - early) / half], axis=-1)
-    f_end, f_dot = np.moveaxis(R.transpose(0, 2, 1) @ line[:, :3], -1, 0)
-    rate, rate_dot = np.moveaxis(line[:, 3:], -1, 0)
-    lasts = duration[:, None] > 0
+    if recent is None:
+        recent = Recent.steady(steps.f[:, -1], steps.omega[:, -1])
     return Intervals(duration, R, v, p, J_R[..., :3], J_v[..., :3], J_p[..., :3], J_pa, J_Rs, J_vs,
-                     J_ps, Q, Q_excess, omega[:, -1], np.where(lasts, f_end, f[:, -1]),
-                     np.where(lasts, f_dot, 0.0), np.where(lasts, rate, omega[:, -1]),
-                     np.where(lasts, rate_dot, 0.0))
-
-
-def _at_time(time: Array, passed: Array, dt: Array, sums: Array, parts: Array) -> Array:
-    """Return sums of parts at a time in each interval, linear within its steps, shape (K, m)."""
-    rows = np.arange(time.size)
-    step = np.argmax(passed >= time[:, None], axis=1)
-    ahead = (passed[rows, step] - time) / np.maximum(dt[rows, step], 1e-9)
-    return sums[rows, step] - ahead[:, None] * parts[rows, step]
+                     J_ps, Q, Q_excess, steps.omega[:, -1], recent.gained, recent.turned)
 
 
 def _least_and_more(density: ArrayLike) -> tuple[Array, Array]:

@@ -23,7 +23,9 @@ those unknowns. Measurement rows: velocity first, then position; both in n0.
 from dataclasses import dataclass
 
 from ins_align.preintegration import Intervals
-from ins_align.rotation import Array, cross, cumulative_rotations, Index, running_sum, skew
+from ins_align.recent import AGES, exact, smooth
+from ins_align.rotation import (Array, cross, cumulative_rotations, exp_so3, Index, running_sum,
+                                skew)
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO, GYRO_BIAS, GYRO_SCALE,
                                 LEVER_ARM, SIZE, START_POSITION, START_VELOCITY, Unknowns)
 import numpy as np
@@ -191,7 +193,7 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     gnss : Measurements
         The same K epochs.
     interval : Intervals
-        Those that end at the epochs, bias-corrected.
+        Those that end at the epochs, corrected for the sensors' errors of the point.
 
     Returns
     -------
@@ -203,21 +205,25 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     K = gnss.time.size
     C, lever = point.C, point.lever_b
     # On the way to the solution the delay may be absurd: from there on the model goes straight.
-    delay = min(max(point.delay, -MAX_DELAY), MAX_DELAY)
+    delay = min(max(float(point.delay), -MAX_DELAY), MAX_DELAY)
     beyond = point.delay - delay
     CR = C @ chain.R
     moved_v, moved_p = _turned(C, chain.v), _turned(C, chain.p)         # in n0
-    Ca_v = moved_v + _turned(CR, cross(interval.omega, lever))
-    Ca_p = moved_p + CR @ lever
-    # Over the delay the specific force is taken linear, and the acceleration of the antenna about
-    # the IMU constant: what both saw then.
-    force, jerk = _turned(CR, interval.f), _turned(CR, interval.f_dot)
-    rate_skew = skew(interval.rate)
-    swing = CR @ skew(interval.omega)
-    swing_dot = CR @ (skew(interval.rate_dot) + rate_skew @ rate_skew)
-    pushed = force + _turned(swing_dot, lever)
-    seen_v = Ca_v - delay * (pushed - delay / 2 * jerk)
-    seen_p = Ca_p - delay * (Ca_v - delay / 2 * (pushed - delay / 3 * jerk))
+    # What the receiver saw happened a delay before: there the motion before the epoch leads back.
+    gained = interval.gained - AGES[:, None] * point.accel_bias
+    _, gained_v, gained_p = exact(gained, delay)
+    measured_rate, measured_turn, _ = exact(interval.turned, delay)
+    rate = measured_rate * (1 - point.gyro_scale) - point.gyro_bias
+    turn = measured_turn * (1 - point.gyro_scale) - delay * point.gyro_bias
+    rate += 0.5 * cross(turn, rate)
+    # A lever arm swings with the vibration too.
+    vibration = interval.omega - exact(interval.turned, 0.0)[0]
+    omega = rate + vibration * (1 - point.gyro_scale)
+    CR_seen = CR @ exp_so3(-turn)
+    swing = CR_seen @ skew(omega)
+    swung = _turned(CR_seen, cross(omega, lever))
+    seen_v = moved_v - _turned(CR, gained_v) + swung
+    seen_p = moved_p - delay * moved_v + _turned(CR, gained_p) + CR_seen @ lever
     start_velocity = point.start_velocity + gnss.offset                 # over ground
     ground_velocity = start_velocity + seen_v - delay * gnss.gravity
     Y = np.zeros((K, 6, 1 + SIZE))
@@ -235,21 +241,24 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     H[:, VELOCITY, GYRO] = C_v_g - skew(seen_v - moved_v) @ C_R_g
     H[:, POSITION, GYRO] = (C @ chain.p_g - delay * C_v_g
                             - skew(seen_p - moved_p + delay * moved_v) @ C_R_g)
-    # And they are in the rates with which the lever arm swings, now and then.
-    arm = skew(lever)
-    now_g, dot_g = CR @ arm, CR @ (skew(cross(interval.rate, lever)) + rate_skew @ arm)
-    for errors, at_end, of_line in ((GYRO_BIAS, 1.0, 1.0), (
-            GYRO_SCALE, interval.omega[:, None, :], interval.rate[:, None, :])):
-        H[:, VELOCITY, errors] += now_g * at_end - delay * dot_g * of_line
-        H[:, POSITION, errors] -= delay * (now_g * at_end - delay / 2 * dot_g * of_line)
+    # And they are in the rates with which the lever arm swings, and turned since.
+    arm, turned_arm = CR_seen @ skew(lever), CR_seen @ skew(cross(omega, lever))
+    for errors, of_rate, of_turn in ((GYRO_BIAS, 1.0, delay), (
+            GYRO_SCALE, (measured_rate + vibration)[:, None, :], measured_turn[:, None, :])):
+        H[:, VELOCITY, errors] += arm * of_rate - turned_arm * of_turn
+        H[:, POSITION, errors] -= arm * of_turn
     H[:, VELOCITY, ACCEL_BIAS] = C_v_a + delay * CR
-    H[:, POSITION, ACCEL_BIAS] = C @ chain.p_a - delay * C_v_a
+    H[:, POSITION, ACCEL_BIAS] = C @ chain.p_a - delay * (C_v_a + delay / 2 * CR)
     H[:, VELOCITY, START_VELOCITY] = eye
     H[:, POSITION, START_VELOCITY] = (gnss.time - delay)[:, None, None] * eye
     H[:, POSITION, START_POSITION] = eye
-    H[:, VELOCITY, LEVER_ARM] = swing - delay * swing_dot
-    H[:, POSITION, LEVER_ARM] = CR - delay * (swing - delay / 2 * swing_dot)
-    H[:, VELOCITY, DELAY.start] = -(pushed - delay * jerk + gnss.gravity)
+    H[:, VELOCITY, LEVER_ARM] = swing
+    H[:, POSITION, LEVER_ARM] = CR_seen
+    # Vibration is no use in a derivative. The rate changes with time as it does not with age.
+    force = smooth(gained, delay)[0]
+    rate_change = smooth(interval.turned, delay)[1] * (1 - point.gyro_scale)
+    whirled = cross(rate, cross(omega, lever)) - cross(rate_change, lever)
+    H[:, VELOCITY, DELAY.start] = -(_turned(CR, force) + _turned(CR_seen, whirled) + gnss.gravity)
     H[:, POSITION, DELAY.start] = -ground_velocity
     Y[:, :, 0] -= beyond * H[:, :, DELAY.start]
     return Y

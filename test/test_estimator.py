@@ -17,6 +17,7 @@ from functools import partial
 
 from alignment import (aligned, config_for, error_of, estimator_of, LEVER, normalised_error,
                        simulated)
+from ins_align import scenarios
 from ins_align.config import PRESETS
 from ins_align.declaration import State
 from ins_align.estimator import MapEstimator
@@ -24,6 +25,8 @@ from ins_align.experiments.dense import bound, dense_solution
 from ins_align.methods import MapMethod
 from ins_align.preintegration import Noise, preintegrate, Steps
 from ins_align.rotation import log_so3
+from ins_align.scenarios import Motion
+from ins_align.simulation import simulate
 from ins_align.unknowns import (BODY_FIXED, DELAY, first_prior, SIZE, START_POSITION,
                                 START_VELOCITY, UNIFORM_ANGLE_STD)
 from ins_align.whitening import Measurements
@@ -238,6 +241,41 @@ def test_unknown_lever_arm_and_delay_are_found_within_their_sigmas():
     assert np.all(status.lever_arm_std < 1.0)
     assert abs(status.gnss_delay - 0.12) < 4 * status.gnss_delay_std < 0.04
     assert normalised_error(status.initial, s) < chi2.ppf(0.9999, 3)
+
+
+def walk(duration):
+    """Walk: the body heaves with every step and sways with every other one."""
+    def wave(t, amplitude, period):
+        return amplitude * np.sin(2 * np.pi * t / period)
+
+    def motion(t):
+        course = wave(t, 0.8, 40.0)
+        ahead, aside = 1.3 + wave(t, 0.15, 0.9), wave(t, 0.1, 1.1)
+        velocity = np.stack([ahead * np.cos(course) - aside * np.sin(course),
+                             ahead * np.sin(course) + aside * np.cos(course),
+                             wave(t, 0.25, 0.55)], axis=-1)
+        return Motion(velocity, np.stack([wave(t, 0.05, 1.1), wave(t, 0.05, 0.55),
+                                          course + wave(t, 0.08, 1.1)], axis=-1))
+
+    return motion
+
+
+@pytest.mark.parametrize('delay, seed', [(0.0, 0), (0.06, 1), (0.2, 1)])
+def test_unknown_delay_of_a_walker(delay, seed, monkeypatch):
+    """
+    A third of a step is a long time, and a whole one looks like none.
+
+    A line through the forces was 5 sigma of tilt and more off, the wrong one of several minima 60.
+    """
+    monkeypatch.setitem(scenarios.SCENARIOS, 'walk', scenarios.Scenario(walk, 120.0, 2.0))
+    s = simulate('walk', imu_grade='mems', duration=40.0, seed=seed, gnss_delay=delay,
+                 velocity_std=0.05, gnss_rate=20.0, lever_arm=(0.4, 0.6, -0.2),
+                 mount_rpy_deg=(-58.0, 77.0, -25.0), heading_deg=-70.0)
+    status = aligned(s, gnss_delay=0.0, gnss_delay_std=0.1, lever_arm_std=1.0)[0].status()
+    assert status.state is State.ALIGNED
+    assert abs(status.gnss_delay - delay) < 4 * status.gnss_delay_std < 0.01
+    for attitude in (status.initial, status.current):
+        assert normalised_error(attitude, s) < chi2.ppf(0.9999, 3)
 
 
 # Robustness

@@ -16,6 +16,7 @@
 from dataclasses import replace
 
 from ins_align.preintegration import Noise, preintegrate, Steps
+from ins_align.recent import AGES, Recent
 from ins_align.rotation import exp_so3
 from ins_align.unknowns import SIZE, Unknowns
 from ins_align.whitening import (Chain, chain_noise, GATE, Gate, Measurements, Rows,
@@ -42,7 +43,12 @@ def some_intervals(count=5, seed=0):
     shape = (count, n + 1, 3)
     steps = Steps(np.full((count, n), 0.05), r.standard_normal(shape),
                   r.standard_normal(shape) + [0.0, 0.0, 9.8], np.zeros(shape), np.zeros(shape))
-    return preintegrate(steps, ZERO, ZERO, Noise(1e-3, 1e-2), gyro_scale=ZERO)
+    # What was just before changes linearly with the age, which is interpolated without error.
+    before = (AGES[:, None] * values[:, -1:]
+              + AGES[:, None] ** 2 * r.standard_normal((count, 1, 3))
+              for values in (steps.f, steps.omega))
+    return preintegrate(steps, ZERO, ZERO, Noise(1e-3, 1e-2), gyro_scale=ZERO,
+                        recent=Recent(*before))
 
 
 def some_measurements(count=5, seed=0):

@@ -1,0 +1,188 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Recent motion: what the IMU saw just before a GNSS epoch, as a function of how long ago.
+
+A delayed receiver tells where the antenna was and how fast it went a moment before the stamp.
+What the specific force has added to the velocity since, and the rates to the rotation, lead from
+the epoch back to that moment. They are kept at a ladder of ages that follows a walker's steps.
+"""
+
+from dataclasses import dataclass
+import math
+
+from ins_align.rotation import Array, cross, exp_so3, Index
+import numpy as np
+
+# Seconds between the ages, and how many there are: all of them as long as delays are.
+RUNG, RUNGS = 0.025, 12
+AGES = RUNG * np.arange(1, RUNGS + 1)
+# So many rungs apart force and rate are calm of vibration.
+SMOOTH = 2
+# Coefficients of the cubics that are 1 at one of the places 0, 1, 2, 3 and 0 at the others.
+CUBIC = np.linalg.inv(np.vander(np.arange(4.0), increasing=True))
+
+
+@dataclass(frozen=True)
+class Recent:
+    """
+    Integrals from each of `AGES` before an epoch up to it, of K epochs.
+
+    Attributes
+    ----------
+    gained : ndarray, shape (K, RUNGS, 3)
+        Of the specific force, m/s, in the body frame at the epoch.
+    turned : ndarray, shape (K, RUNGS, 3)
+        Of the angular rate: rotation vector of the body, rad.
+
+    """
+
+    gained: Array
+    turned: Array
+
+    @staticmethod
+    def steady(force: Array, rate: Array) -> 'Recent':
+        """Return what forces and rates, shape (K, 3), would have made had they lasted."""
+        return Recent(*(AGES[:, None] * values[:, None] for values in (force, rate)))
+
+    def take(self, index: slice) -> 'Recent':
+        """Return those of some epochs."""
+        return Recent(self.gained[index], self.turned[index])
+
+
+def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'Array | Index',
+                  unit: float = 1.0) -> Recent:
+    """
+    Integrate samples over the time before each of K epochs.
+
+    Where the samples do not reach back far enough, because they begin there or are missing, it
+    goes on with their mean.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (N,)
+        Sample times, strictly increasing, first <= epochs, last >= epochs.
+    gyro, accel : ndarray, shape (N, 3)
+        Angular rate, rad/s; specific force, m/s^2.
+    epochs : ndarray, shape (K,)
+        Stamps of the epochs.
+    unit : float
+        Of stamps and epochs, seconds.
+
+    References
+    ----------
+    .. [1] J. E. Bortz, "A new mathematical formulation for strapdown inertial navigation", IEEE
+       Transactions on Aerospace and Electronic Systems 7(1), 1971.
+
+    """
+    ages = (AGES / unit).astype(stamps.dtype)
+    last = np.maximum(np.searchsorted(stamps, epochs), 1)
+    rungs = np.searchsorted(stamps, epochs[:, None] - ages, side='right') - 1
+    first = np.clip(rungs[:, -1], 0, last - 1)
+    step = first[:, None] + np.arange(np.max(last - first))
+    inside = step < last[:, None]
+    step = np.minimum(step, last[:, None] - 1)
+    begin, end = ((stamps[step + k] - epochs[:, None]) * unit for k in (0, 1))
+    # Nothing is known of a silence and what was before it.
+    heard = np.logical_and.accumulate((end - begin < AGES[-1])[:, ::-1], axis=1)[:, ::-1]
+    dt = np.where(inside & heard, np.minimum(end, 0.0) - begin, 0.0)[..., None]
+    rate, force = (0.5 * (samples[step] + samples[step + 1]) for samples in (gyro, accel))
+    turn = dt * rate
+    turned = np.cumsum(turn, axis=1)
+    # Rotation vector from the middle of a step to the epoch; rates that change their axis make it
+    # differ from their integral [1]_.
+    to_come = turned[:, -1:] - turned + 0.5 * turn
+    rate = rate - 0.5 * cross(to_come, rate)
+    turn = dt * rate
+    turned = np.cumsum(turn, axis=1)
+    force = (exp_so3(turned - 0.5 * turn - turned[:, -1:]) @ force[..., None])[..., 0]
+    both = np.concatenate([force, rate], axis=-1)
+    sums = np.cumsum(dt * both, axis=1)
+    # Up to a rung: the steps before its own, and of that what lies before.
+    own = np.clip(rungs - first[:, None], 0, step.shape[1] - 1)
+    rows = np.arange(epochs.size)[:, None]
+    before = (sums[rows, own]
+              + (-AGES - np.minimum(end, 0.0)[rows, own])[..., None] * both[rows, own])
+    span = np.sum(dt, axis=1)
+    at_end = np.concatenate([accel[last], gyro[last]], axis=-1)
+    mean = np.where(span > 0, sums[:, -1] / np.maximum(span, 1e-9), at_end)[:, None]
+    missing = (AGES - span)[..., None]
+    integrals = sums[:, -1:] + np.where(missing > 1e-6, missing * mean, -before)
+    return Recent(integrals[..., :3], integrals[..., 3:])
+
+
+def exact(integrals: Array, age: float) -> tuple[Array, Array, Array]:
+    """
+    Follow a force or rate back to an age.
+
+    Parameters
+    ----------
+    integrals : ndarray, shape (K, RUNGS, 3)
+        As in `Recent`.
+    age : float
+        Seconds before the epoch; negative ones are extrapolated.
+
+    Returns
+    -------
+    value, integral, double_integral : ndarray, shape (K, 3)
+        The force or rate at that age, and its integrals over the ages from 0 on.
+
+    """
+    there, value, _ = _cubic(age, 1)
+    rung = min(max(int(age / RUNG), 0), RUNGS - 1)
+    rest = age - rung * RUNG
+    trapezoids = 0.5 * rest * there
+    trapezoids[1:rung] += RUNG
+    trapezoids[rung] += 0.5 * ((RUNG if rung else 0.0) + rest)
+    value, integral, double_integral = (weights[1:] @ integrals
+                                        for weights in (value, there, trapezoids))
+    return value, integral, double_integral
+
+
+def smooth(integrals: Array, age: float) -> tuple[Array, Array]:
+    """
+    Return a force or rate at an age, calm of vibration, and its derivative to the age.
+
+    Parameters
+    ----------
+    integrals : ndarray, shape (K, RUNGS, 3)
+        As in `Recent`.
+    age : float
+        Seconds before the epoch; negative ones are extrapolated.
+
+    Returns
+    -------
+    value, change : ndarray, shape (K, 3)
+
+    """
+    _, value, change = _cubic(age, SMOOTH)
+    return value[1:] @ integrals, change[1:] @ integrals
+
+
+def _cubic(age: float, apart: int) -> tuple[Array, Array, Array]:
+    """
+    Weights of the rungs, the one at age 0 first, in a cubic and its two derivatives at an age.
+
+    The cubic goes through four rungs next to the age, so many of them apart; before age 0 no
+    further out than they are apart.
+    """
+    apart = min(max(math.ceil(-age / RUNG), apart), RUNGS // 3)
+    x = age / (apart * RUNG)
+    first = min(max(int(x) - 1, 0), RUNGS // apart - 3)
+    x -= first
+    weights = np.zeros((3, 1 + RUNGS))
+    weights[:, apart * first + apart * np.arange(4)] = np.array(
+        [[1, x, x * x, x ** 3], [0, 1, 2 * x, 3 * x * x], [0, 0, 2, 6 * x]]) @ CUBIC
+    change, bend = weights[1] / (apart * RUNG), weights[2] / (apart * RUNG) ** 2
+    return weights[0], change, bend

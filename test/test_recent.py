@@ -1,0 +1,137 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Motion just before an epoch against the integral of the motion itself."""
+
+from ins_align.recent import AGES, exact, Recent, recent_motion, smooth
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+MS = 1_000_000
+PERIOD = 0.55           # s, of a walker's steps
+
+
+def force(t):
+    """In the body frame, m/s^2, as a walker's."""
+    w = 2 * np.pi / PERIOD
+    return np.stack([2.0 + np.sin(3 * t), 3.0 * np.cos(w * t), 9.8 + 3.0 * np.sin(w * t)], axis=-1)
+
+
+def rate(t):
+    w = 2 * np.pi / PERIOD
+    return np.stack([0.5 * np.sin(w * t), 0.4 * np.cos(8 * t), 0.6 + 0.3 * np.sin(5 * t)], axis=-1)
+
+
+def before(epoch, age):
+    """Integral and double integral of the force over the ages, and the body's frame then."""
+    def change(s, x):
+        C = x[6:].reshape(3, 3)
+        skewed = np.cross(rate(np.array(epoch - s)), np.eye(3)).T
+        return np.concatenate([C @ force(np.array(epoch - s)), x[:3], (-C @ skewed).ravel()])
+
+    start = np.concatenate([np.zeros(6), np.eye(3).ravel()])
+    x = solve_ivp(change, (0.0, age), start, rtol=1e-10, atol=1e-12).y[:, -1]
+    return x[:3], x[3:6], x[6:].reshape(3, 3)
+
+
+def motion(first_ms, epochs_ms, step_ms=5):
+    stamps = np.arange(first_ms, 801, step_ms)
+    return recent_motion(stamps * MS, rate(stamps * 1e-3), force(stamps * 1e-3),
+                         np.array(epochs_ms) * MS, unit=1e-9)
+
+
+@pytest.mark.parametrize('age', (0.01, 0.06, 0.1, 0.2, 0.29))
+def test_it_leads_back_to_the_motion_of_a_moment_ago(age):
+    epochs_ms = [300, 423, 700]
+    recent = motion(-200, epochs_ms)
+    _, gained, moved = exact(recent.gained, age)
+    turning, turn, _ = exact(recent.turned, age)
+    calm = smooth(recent.gained, age)[0]
+    for k, epoch in enumerate(np.array(epochs_ms) * 1e-3):
+        velocity, distance, C = before(epoch, age)
+        assert np.allclose(gained[k], velocity, atol=2e-3)
+        assert np.allclose(moved[k], distance, atol=5e-4)
+        assert np.allclose(Rotation.from_rotvec(-turn[k]).as_matrix(), C, atol=1e-3)
+        # The change of a rotation vector is the rate but for its turn (Bortz).
+        found = turning[k] + 0.5 * np.cross(turn[k], turning[k])
+        assert np.allclose(found, rate(np.array(epoch - age)), atol=0.03)
+        assert np.allclose(calm[k], C @ force(np.array(epoch - age)), atol=0.25)
+
+
+def test_at_the_epoch_itself_nothing_has_been_gained():
+    recent = motion(-200, [300])
+    for integrals in (recent.gained, recent.turned):
+        value, gained, moved = exact(integrals, 0.0)
+        assert not np.any(gained) and not np.any(moved)
+    assert np.allclose(value, rate(np.array([0.3])), atol=0.03)
+
+
+def test_it_goes_on_a_little_beyond_the_epoch():
+    recent = motion(-200, [300])
+    for age in (-0.01, -0.02):
+        velocity, _, _ = before(0.3, age)
+        assert np.allclose(exact(recent.gained, age)[1][0], velocity, atol=0.1 * abs(age))
+
+
+def test_forces_and_rates_that_last():
+    recent = Recent.steady(np.array([[1.0, 2.0, 9.8]]), np.array([[0.1, 0.0, -0.2]]))
+    for age in (-0.1, 0.0, 0.07, 0.3):
+        value, gained, moved = exact(recent.gained, age)
+        assert np.allclose(value, [[1.0, 2.0, 9.8]])
+        assert np.allclose(gained, [[age, 2 * age, 9.8 * age]])
+        assert np.allclose(moved, [[age ** 2 / 2, age ** 2, 4.9 * age ** 2]])
+        assert np.allclose(exact(recent.turned, age)[1], [[0.1 * age, 0.0, -0.2 * age]])
+        calm, change = smooth(recent.gained, age)
+        assert np.allclose(calm, value) and np.allclose(change, 0.0, atol=1e-9)
+
+
+def test_where_samples_begin_or_were_silent_their_mean_goes_on():
+    whole, begun = motion(-200, [300]), motion(155, [300])
+    known = AGES < 0.146
+    assert np.allclose(begun.gained[0, known], whole.gained[0, known])
+    mean = begun.gained[0, known][-1] / AGES[known][-1]
+    assert np.allclose(np.diff(begun.gained[0, ~known], axis=0), 0.025 * mean, rtol=0.1, atol=0.02)
+    stamps = np.concatenate([np.arange(-900, -600, 5), np.arange(155, 801, 5)])
+    gap = recent_motion(stamps * MS, rate(stamps * 1e-3), force(stamps * 1e-3),
+                        np.array([300]) * MS, unit=1e-9)
+    assert np.allclose(gap.gained, begun.gained) and np.allclose(gap.turned, begun.turned)
+    at_first = motion(300, [300])
+    assert np.allclose(at_first.gained[0], AGES[:, None] * force(np.array(0.3)), rtol=0.02,
+                       atol=0.03)
+
+
+def test_vibration_hardly_reaches_the_smooth_force():
+    r = np.random.default_rng(3)
+    stamps = np.arange(-2, 63) * 0.005
+    shaken = 0.0
+    for _ in range(50):
+        phase = r.uniform(0, 2 * np.pi, 3)
+        accel = [0.0, 0.0, 9.8] + 5.0 * np.cos(2 * np.pi * 67.0 * stamps[:, None] + phase)
+        recent = recent_motion(stamps, np.zeros((stamps.size, 3)), accel, np.array([0.305]))
+        shaken = max(shaken, np.abs(smooth(recent.gained, 0.1)[0] - [0.0, 0.0, 9.8]).max())
+    # Of what a single sample shows, each 50 ms keep 2 / (2 pi 67 Hz 0.05 s) at most, and two
+    # parts of them count half each.
+    assert shaken < 5.0 * 2 / (2 * np.pi * 67.0 * 0.05)
+
+
+def test_one_epoch_is_the_same_with_others_to_the_bit():
+    together = motion(-200, [300, 423, 700])
+    alone = motion(-200, [423])
+    assert np.array_equal(together.gained[1], alone.gained[0])
+    assert np.array_equal(together.turned[1], alone.turned[0])
+    both = together.take(slice(1, 3))
+    for age in (0.0, 0.07, 0.2):
+        for ours, its in zip(exact(both.gained, age), exact(alone.gained, age)):
+            assert np.array_equal(ours[0], its[0])
