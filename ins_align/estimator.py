@@ -352,9 +352,10 @@ class MapEstimator:
         gate = old.P if old is not None and resolved and self.gated else None
         here, before = self.estimate(), self.prior.mean
         starts = [here] if old is not None or self.prior.information[0, 0] > 0 else []
-        if not resolved and self.count >= self.FIRST_FIT:
+        enough = self.count >= self.FIRST_FIT
+        if enough and not resolved:
             starts.append(replace(here, C=self._rough_attitude(here)))
-        elif (old is not None and old.chi2 > self.DOUBTFUL * max(old.dof, 1)
+        elif (enough and old is not None and old.chi2 > self.DOUBTFUL * max(old.dof, 1)
                 and self.count >= self.AFRESH_GROWTH * self._last_afresh):
             self._last_afresh = self.count
             delays = self.OTHER_DELAYS if DELAY.start in self.columns else (0.0,)
