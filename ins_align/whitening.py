@@ -35,8 +35,8 @@ HEADING_RESOLVED_STD = 0.35
 # Chi-square gate of three rows of innovation: one in 60 000 of good ones fails.
 GATE = 25.0
 VELOCITY, POSITION = slice(0, 3), slice(3, 6)
-# Derivatives are taken for a delay of at most this (s).
-MAX_DELAY = 0.3
+# Between these delays (s) the motion before the epoch leads back, or a little on.
+MIN_DELAY, MAX_DELAY = -0.1, AGES[-1]
 # The unknowns that the errors of the chain look like.
 START = np.r_[ATTITUDE, START_VELOCITY, START_POSITION]
 
@@ -205,7 +205,7 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     K = gnss.time.size
     C, lever = point.C, point.lever_b
     # On the way to the solution the delay may be absurd: from there on the model goes straight.
-    delay = min(max(float(point.delay), -MAX_DELAY), MAX_DELAY)
+    delay = min(max(float(point.delay), MIN_DELAY), MAX_DELAY)
     beyond = point.delay - delay
     CR = C @ chain.R
     moved_v, moved_p = _turned(C, chain.v), _turned(C, chain.p)         # in n0

@@ -18,7 +18,7 @@ from dataclasses import replace
 from ins_align.preintegration import Noise, preintegrate, Steps
 from ins_align.recent import AGES, Recent
 from ins_align.rotation import exp_so3
-from ins_align.unknowns import SIZE, Unknowns
+from ins_align.unknowns import DELAY, SIZE, Unknowns
 from ins_align.whitening import (Chain, chain_noise, GATE, Gate, Measurements, Rows,
                                  sensitivities, START, Whitener)
 import numpy as np
@@ -78,6 +78,15 @@ def test_sensitivities_are_the_derivatives_of_the_residual(column, delay):
     # The intervals' derivatives are those at the bias they were integrated with; how the change
     # of the force within an interval hangs together with the rest is of second order.
     assert np.allclose(H, numeric, atol=0.02 * np.max(np.abs(numeric)) + 1e-6)
+
+
+@pytest.mark.parametrize('delay, limit', [(0.5, 0.3), (-0.4, -0.1)])
+def test_with_an_absurd_delay_the_model_goes_straight_on(delay, limit):
+    x, intervals, gnss = some_unknowns(), some_intervals(), some_measurements()
+    at_limit, absurd = (residuals(replace(x, delay=d), intervals, gnss) for d in (limit, delay))
+    assert np.allclose(absurd[:, :, 1:], at_limit[:, :, 1:])
+    assert np.allclose(absurd[:, :, 0] - at_limit[:, :, 0],
+                       -(delay - limit) * at_limit[:, :, 1 + DELAY.start])
 
 
 @pytest.mark.parametrize('row', range(9))
