@@ -28,6 +28,8 @@ import numpy as np
 # Seconds between the ages, and how many there are: all of them as long as delays are.
 RUNG, RUNGS = 0.025, 12
 AGES = RUNG * np.arange(1, RUNGS + 1)
+# Steps of all epochs, each as many as the one with most, that are looked at in one go.
+MAX_STEPS = 65536
 # So many rungs apart force and rate are calm of vibration.
 SMOOTH = 2
 # Coefficients of the cubics that are 1 at one of the places 0, 1, 2, 3 and 0 at the others.
@@ -90,7 +92,13 @@ def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'A
     last = np.maximum(np.searchsorted(stamps, epochs), 1)
     rungs = np.searchsorted(stamps, epochs[:, None] - ages, side='right') - 1
     first = np.clip(rungs[:, -1], 0, last - 1)
-    step = first[:, None] + np.arange(np.max(last - first))
+    most = np.max(last - first)
+    if epochs.size > 1 and epochs.size * most > MAX_STEPS:
+        halves = [recent_motion(stamps, gyro, accel, half, unit)
+                  for half in np.array_split(epochs, 2)]
+        return Recent(*(np.concatenate(arrays) for arrays in zip(
+            *(vars(half).values() for half in halves))))
+    step = first[:, None] + np.arange(most)
     inside = step < last[:, None]
     step = np.minimum(step, last[:, None] - 1)
     begin, end = ((stamps[step + k] - epochs[:, None]) * unit for k in (0, 1))
