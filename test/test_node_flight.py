@@ -20,7 +20,7 @@ from node_harness import (
 import numpy as np
 import pytest
 
-RATE = 8.0  # times real time
+RATE = 3.0  # times real time: with coverage measured, a node keeps up on a busy machine
 # Faster than real time, the same delay on the way between processes is longer on the data's clock.
 LATENESS = 4.0  # s
 MINUTE_NS = 60_000_000_000
