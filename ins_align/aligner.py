@@ -25,6 +25,7 @@ import math
 from typing import NamedTuple
 
 from ins_align.antenna import Antenna
+from ins_align.axes import Axes, AxesNoise
 from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer, PAIR_NS
 from ins_align.config import Config, ConfigError, parameters
 from ins_align.declaration import Declaration, State, Verdict
@@ -115,6 +116,7 @@ class Aligner:
         self._declaration = Declaration(self.config)
         self._force_check = ForceCheck()
         self._antenna = Antenna(self.config, self.counts)
+        self._axes = Axes(self.config.imu_noise.gyro_scale_std)
         self._verdict = _NOTHING_YET
         self._first_t0_ns: int | None = None
         self._first_fix_ns: int | None = None
@@ -350,9 +352,10 @@ class Aligner:
         self.counts['imu_spike'] += int(np.count_nonzero(spikes[ends[0] - 2:ends[-1] - 2]))
         stamps, samples = stamps[:ends[-1]], samples[:ends[-1]]
         steps = split_at_epochs(stamps, samples[:, :3], samples[:, 3:], ends_ns, unit=1e-9)
-        noise = self._noise(stamps, samples, windows, ends[1:], steps,
-                            np.array(gravity_drift)[:, None])
         recent = recent_motion(stamps, samples[:, :3], samples[:, 3:], ends_ns[1:], unit=1e-9)
+        noise = self._noise(stamps, samples, windows, ends[1:], steps,
+                            np.array(gravity_drift)[:, None],
+                            self._axes.noise(np.diff(ends_ns) * 1e-9, recent))
         magnitudes = np.sqrt(np.sum(np.square(samples[:, 3:]), axis=1))
         sums = np.diff(np.concatenate([[0.0], np.cumsum(magnitudes)])[ends - 2])
         forces = list(zip(sums.tolist(), np.diff(ends).tolist()))
@@ -362,12 +365,12 @@ class Aligner:
         return ImuSteps(steps, noise, recent), forces
 
     def _noise(self, stamps: Index, samples: Array, first: Index, last: Index,
-               steps: Steps, gravity_drift: Array) -> Noise:
+               steps: Steps, gravity_drift: Array, axes: AxesNoise) -> Noise:
         """
-        White noise of each step: stated, measured, that of gravity, and what stamps do.
+        White noise of each step: stated, measured, of gravity, of axes, and what stamps do.
 
-        That is, what the motion can do in a gap and what it does to a sample whose stamp jitters:
-        its change per second times the jitter.
+        The last is what the motion can do in a gap and what it does to a sample whose stamp
+        jitters: its change per second times the jitter.
         """
         stated = self._stated_noise
         measured = white_noise(stamps, samples, first, last, unit=1e-9)
@@ -383,14 +386,15 @@ class Aligner:
         density = gap ** 1.5
         jittered = jitter * np.sqrt(steps.dt)
 
-        def of_stamps(in_gap: float, slope: Array) -> Array:
+        def with_stamps(other: Array, in_gap: float, slope: Array) -> Array:
             rms = np.sqrt(np.mean(np.square(slope[:, 1:]), axis=2))
-            return np.hypot(in_gap * density, jittered * rms)
+            return np.hypot(other, np.hypot(in_gap * density, jittered * rms))
 
-        return Noise(np.hypot(stated[0], of_stamps(GAP_ANGULAR_ACCELERATION, steps.omega_dot)),
-                     np.hypot(np.hypot(stated[1], gravity_drift),
-                              of_stamps(GAP_JERK, steps.f_dot)),
-                     excess[:, :1], excess[:, 1:])
+        return Noise(with_stamps(np.hypot(stated[0], axes.gyro), GAP_ANGULAR_ACCELERATION,
+                                 steps.omega_dot),
+                     with_stamps(np.hypot(np.hypot(stated[1], gravity_drift), axes.accel),
+                                 GAP_JERK, steps.f_dot),
+                     excess[:, :1], excess[:, 1:], axes.across)
 
     def _lose(self, why: str) -> None:
         """Start the alignment over; biases are kept."""

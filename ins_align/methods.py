@@ -296,7 +296,8 @@ class MapMethod:
         instant = Steps(np.zeros((1, 1)), *(np.repeat(array[:, -1:], 2, axis=1) for array in (
             steps.omega, steps.f, steps.omega_dot, steps.f_dot)))
         innovation = self._innovation
-        self._take_start(start, ImuSteps(instant, Noise(*np.zeros((4, 1, 1)))))
+        self._take_start(start, ImuSteps(instant, Noise(*np.zeros((4, 1, 1)),
+                                                        across=np.zeros((1, 3)))))
         self._innovation = innovation
 
     def initial(self) -> tuple[Array, Array] | None:

@@ -145,6 +145,9 @@ class Noise:
         rad/sqrt(s) and m/s/sqrt(s), as stated.
     gyro_excess, accel_excess : array_like
         What was measured beyond that, in the same units.
+    across : array_like, shape (3,) or (K, 3)
+        rad/sqrt(s), more of the gyros about the axes perpendicular to this vector, which is in the
+        body frame at the end of each interval.
 
     """
 
@@ -152,9 +155,10 @@ class Noise:
     velocity_random_walk: ArrayLike = 0.0
     gyro_excess: ArrayLike = 0.0
     accel_excess: ArrayLike = 0.0
+    across: ArrayLike = (0.0, 0.0, 0.0)
 
     def take(self, index: slice) -> 'Noise':
-        """Return the noise in the intervals of `index`; all fields are (K, n) or (K, 1)."""
+        """Return the noise in the intervals of `index`; all fields have an axis of K."""
         return Noise(*(np.asarray(array)[index] for array in vars(self).values()))
 
 
@@ -388,6 +392,11 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
             return total
 
         Q = covariance(noise.angle_random_walk, noise.velocity_random_walk)
+        # What this does to the velocity within the interval is little beside what it does later.
+        across = (turned[:, -1] @ np.atleast_2d(noise.across)[..., None])[..., 0]
+        Q[:, :3, :3] += duration[:, None, None] * (
+            np.sum(across * across, axis=1)[:, None, None] * np.eye(3)
+            - across[:, :, None] * across[:, None, :])
         Q_excess = covariance(noise.gyro_excess, noise.accel_excess)
     # Intervals are chained for hours.
     R = orthonormalized(turned[:, -1])
