@@ -25,8 +25,8 @@ import math
 from typing import NamedTuple
 
 from ins_align.antenna import Antenna
-from ins_align.axes import Axes, AxesNoise
 from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer, PAIR_NS
+from ins_align.calibration import CalibrationErrors, CalibrationNoise
 from ins_align.config import Config, ConfigError, parameters
 from ins_align.declaration import Declaration, State, Verdict
 from ins_align.earth import EARTH_RATE
@@ -116,7 +116,7 @@ class Aligner:
         self._declaration = Declaration(self.config)
         self._force_check = ForceCheck()
         self._antenna = Antenna(self.config, self.counts)
-        self._axes = Axes(self.config.imu_noise.gyro_scale_std)
+        self._calibration = CalibrationErrors(self.config.imu_noise.gyro_scale_std)
         self._verdict = _NOTHING_YET
         self._first_t0_ns: int | None = None
         self._first_fix_ns: int | None = None
@@ -355,7 +355,7 @@ class Aligner:
         recent = recent_motion(stamps, samples[:, :3], samples[:, 3:], ends_ns[1:], unit=1e-9)
         noise = self._noise(stamps, samples, windows, ends[1:], steps,
                             np.array(gravity_drift)[:, None],
-                            self._axes.noise(np.diff(ends_ns) * 1e-9, recent))
+                            self._calibration.noise(np.diff(ends_ns) * 1e-9, recent))
         magnitudes = np.sqrt(np.sum(np.square(samples[:, 3:]), axis=1))
         sums = np.diff(np.concatenate([[0.0], np.cumsum(magnitudes)])[ends - 2])
         forces = list(zip(sums.tolist(), np.diff(ends).tolist()))
@@ -365,9 +365,9 @@ class Aligner:
         return ImuSteps(steps, noise, recent), forces
 
     def _noise(self, stamps: Index, samples: Array, first: Index, last: Index,
-               steps: Steps, gravity_drift: Array, axes: AxesNoise) -> Noise:
+               steps: Steps, gravity_drift: Array, calibration: CalibrationNoise) -> Noise:
         """
-        White noise of each step: stated, measured, of gravity, of axes, and what stamps do.
+        White noise of each step: stated, measured, of gravity, of calibration and of stamps.
 
         The last is what the motion can do in a gap and what it does to a sample whose stamp
         jitters: its change per second times the jitter.
@@ -390,11 +390,11 @@ class Aligner:
             rms = np.sqrt(np.mean(np.square(slope[:, 1:]), axis=2))
             return np.hypot(other, np.hypot(in_gap * density, jittered * rms))
 
-        return Noise(with_stamps(np.hypot(stated[0], axes.gyro), GAP_ANGULAR_ACCELERATION,
+        return Noise(with_stamps(np.hypot(stated[0], calibration.gyro), GAP_ANGULAR_ACCELERATION,
                                  steps.omega_dot),
-                     with_stamps(np.hypot(np.hypot(stated[1], gravity_drift), axes.accel),
+                     with_stamps(np.hypot(np.hypot(stated[1], gravity_drift), calibration.accel),
                                  GAP_JERK, steps.f_dot),
-                     excess[:, :1], excess[:, 1:], axes.across)
+                     excess[:, :1], excess[:, 1:], calibration.across)
 
     def _lose(self, why: str) -> None:
         """Start the alignment over; biases are kept."""

@@ -12,12 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Sensors whose axes are not square to each other, as noise.
+What is left of an IMU's calibration errors beside biases and gyro scale factors, as noise.
 
-A gyro that is a little off its axis feels a part of the turns about the others, an accelerometer a
-part of the forces along them, and a force shakes a gyro's bias. What is steady in this looks like
-a bias and is estimated as one. What changes is taken for white noise with the spread that the
-errors have after some seconds; as unknowns they would be 24.
+A gyro whose axis is misaligned feels a part of the turns about the others, an accelerometer a part
+of the forces along them, and a force shifts a gyro's bias (g-sensitivity). What is steady in this
+looks like a bias and is estimated as one. What changes is taken for white noise that leaves the
+spread of these errors behind; as unknowns they would be 24.
 """
 
 import math
@@ -27,16 +27,16 @@ from ins_align.recent import AGES, Recent
 from ins_align.rotation import Array
 import numpy as np
 
-# Over the error of the gyros' scale factors: how far the axes of gyros and of accelerometers are
-# off, and what a force does to a gyro, rad/s per m/s^2.
-GYRO_AXES, ACCEL_AXES, G_SENSITIVITY = 0.2, 0.3, 0.01
+# Over the error of the gyros' scale factors: misalignment of the gyros, misalignment and scale
+# factors of the accelerometers, g-sensitivity of the gyros (rad/s per m/s^2).
+GYRO_MISALIGNMENT, ACCEL_ERRORS, G_SENSITIVITY = 0.2, 0.3, 0.01
 # Motion is averaged over this time (s): of what swings faster nothing remains.
 CALM_TIME = 3.0
 # What has been so since the start, or for this long (s), looks like a bias.
 STEADY_TIME = 60.0
 
 
-class AxesNoise(NamedTuple):
+class CalibrationNoise(NamedTuple):
     """
     Noise densities of K intervals.
 
@@ -54,14 +54,14 @@ class AxesNoise(NamedTuple):
     across: Array
 
 
-class Axes:
+class CalibrationErrors:
     """
-    The motion that has become steady, and what of it has not.
+    The noise that a motion makes of the errors of a calibration: how far it is from steady.
 
     Parameters
     ----------
     gyro_scale_std : float
-        Scale factor error of the gyros, 1 sigma; 0: axes are square.
+        Scale factor error of the gyros, 1 sigma, to which the others are in proportion.
 
     """
 
@@ -72,7 +72,7 @@ class Axes:
         self._steady = np.zeros(6)
         self._age = 0.0
 
-    def noise(self, spacing: Array, recent: Recent) -> AxesNoise:
+    def noise(self, spacing: Array, recent: Recent) -> CalibrationNoise:
         """
         Return what the motion makes of the sensors' errors.
 
@@ -89,10 +89,11 @@ class Axes:
             motion = np.concatenate([recent.turned[:, -1], recent.gained[:, -1]],
                                     axis=1) / AGES[-1]
             unsteady[:] = [self._step(*step) for step in zip(spacing.tolist(), motion)]
-        # With it a turn that is soon over leaves the very spread that wrong axes give its end.
+        # A turn that is soon over leaves the spread that misaligned axes give its end.
         density = self._scale_std * math.sqrt(2 * CALM_TIME) * unsteady
         force = np.sqrt(np.sum(np.square(density[:, 3:]), axis=1))[:, None]
-        return AxesNoise(G_SENSITIVITY * force, ACCEL_AXES * force, GYRO_AXES * density[:, :3])
+        return CalibrationNoise(G_SENSITIVITY * force, ACCEL_ERRORS * force,
+                                GYRO_MISALIGNMENT * density[:, :3])
 
     def _step(self, seconds: float, motion: Array) -> Array:
         """Take the motion at the end of an interval; return how far it is from steady."""
@@ -100,8 +101,9 @@ class Axes:
             self._calm = self._steady = motion
         else:
             self._age += seconds
-            self._calm = self._calm + (1 - math.exp(-seconds / CALM_TIME)) * (motion - self._calm)
-            # The mean since the start, then one that forgets.
-            share = max(seconds / (self._age + seconds), 1 - math.exp(-seconds / STEADY_TIME))
-            self._steady = self._steady + share * (motion - self._steady)
+            # Means since the start, then such as forget.
+            soon, late = (max(seconds / (self._age + seconds), 1 - math.exp(-seconds / time))
+                          for time in (CALM_TIME, STEADY_TIME))
+            self._calm = self._calm + soon * (motion - self._calm)
+            self._steady = self._steady + late * (motion - self._steady)
         return self._calm - self._steady
