@@ -295,9 +295,9 @@ class MapMethod:
         self._start(start, prior, self._estimator.excess)
         instant = Steps(np.zeros((1, 1)), *(np.repeat(array[:, -1:], 2, axis=1) for array in (
             steps.omega, steps.f, steps.omega_dot, steps.f_dot)))
-        innovation = self._innovation
-        self._take_start(start, ImuSteps(instant, Noise(*np.zeros((4, 1, 1)),
-                                                        across=np.zeros((1, 3)))))
+        innovation, none = self._innovation, np.zeros((1, 1))
+        self._take_start(start, ImuSteps(instant, Noise(none, none, none, none,
+                                                        np.zeros((1, 3)))))
         self._innovation = innovation
 
     def initial(self) -> tuple[Array, Array] | None:

@@ -11,7 +11,6 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Motion just before an epoch against the integral of the motion itself."""
 """What a calibration leaves: the noise that it becomes, and the sigma that it makes honest."""
 
 from dataclasses import replace
@@ -19,7 +18,7 @@ import math
 
 from alignment import normalised_error, simulated
 from ins_align.aligner import Aligner
-from ins_align.calibration import (ACCEL_ERRORS, CALM_TIME, CalibrationErrors, G_SENSITIVITY,
+from ins_align.calibration import (ACCEL_ERRORS, CalibrationErrors, CALM_TIME, G_SENSITIVITY,
                                    GYRO_MISALIGNMENT, STEADY_TIME)
 from ins_align.config import Config
 from ins_align.preintegration import Noise, preintegrate, Steps
