@@ -29,7 +29,7 @@ import numpy as np
 
 # Over the error of the gyros' scale factors: misalignment of the gyros, misalignment and scale
 # factors of the accelerometers, g-sensitivity of the gyros (rad/s per m/s^2).
-GYRO_MISALIGNMENT, ACCEL_ERRORS, G_SENSITIVITY = 0.2, 0.3, 0.01
+GYRO_MISALIGNMENT, ACCEL_ERRORS, G_SENSITIVITY = 0.1, 0.3, 0.01
 # Motion is averaged over this time (s): of what swings faster nothing remains.
 CALM_TIME = 3.0
 # What has been so since the start, or for this long (s), looks like a bias.
