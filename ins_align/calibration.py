@@ -68,8 +68,8 @@ class CalibrationErrors:
     def __init__(self, gyro_scale_std: float) -> None:
         """Nothing was seen yet."""
         self._scale_std = gyro_scale_std
-        self._calm: Array | None = None         # rate and force
-        self._steady = np.zeros(6)
+        # Of rate and force, shape (2, 6): the calm motion, and what is steady in it.
+        self._means: Array | None = None
         self._age = 0.0
 
     def noise(self, spacing: Array, recent: Recent) -> CalibrationNoise:
@@ -97,13 +97,13 @@ class CalibrationErrors:
 
     def _step(self, seconds: float, motion: Array) -> Array:
         """Take the motion at the end of an interval; return how far it is from steady."""
-        if self._calm is None:
-            self._calm = self._steady = motion
+        if self._means is None:
+            self._means = np.stack([motion, motion])
         else:
             self._age += seconds
             # Means since the start, then such as forget.
-            soon, late = (max(seconds / (self._age + seconds), 1 - math.exp(-seconds / time))
-                          for time in (CALM_TIME, STEADY_TIME))
-            self._calm = self._calm + soon * (motion - self._calm)
-            self._steady = self._steady + late * (motion - self._steady)
-        return self._calm - self._steady
+            share = np.maximum(seconds / (self._age + seconds),
+                               1 - np.exp(-seconds / np.array([[CALM_TIME], [STEADY_TIME]])))
+            self._means = self._means + share * (motion - self._means)
+        calm, steady = self._means
+        return calm - steady

@@ -393,10 +393,8 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
 
         Q = covariance(noise.angle_random_walk, noise.velocity_random_walk)
         # What this does to the velocity within the interval is little beside what it does later.
-        across = (turned[:, -1] @ np.atleast_2d(noise.across)[..., None])[..., 0]
-        Q[:, :3, :3] += duration[:, None, None] * (
-            np.sum(across * across, axis=1)[:, None, None] * np.eye(3)
-            - across[:, :, None] * across[:, None, :])
+        across = skew((turned[:, -1] @ np.atleast_2d(noise.across)[..., None])[..., 0])
+        Q[:, :3, :3] += duration[:, None, None] * (across @ across.transpose(0, 2, 1))
         Q_excess = covariance(noise.gyro_excess, noise.accel_excess)
     # Intervals are chained for hours.
     R = orthonormalized(turned[:, -1])

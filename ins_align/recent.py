@@ -68,9 +68,9 @@ def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'A
     """
     Integrate samples over the time before each of K epochs.
 
-    A rate that changes its axis makes the rotation vector differ from its integral [3]_. Where the
-    samples do not reach back far enough, because they begin there or are missing, it goes on with
-    their mean.
+    A rate that changes its axis makes the rotation vector differ from its integral [Bortz1971]_.
+    Where the samples do not reach back far enough, because they begin there or are missing, it
+    goes on with their mean.
 
     Parameters
     ----------
@@ -85,8 +85,8 @@ def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'A
 
     References
     ----------
-    .. [3] J. E. Bortz, "A new mathematical formulation for strapdown inertial navigation", IEEE
-       Transactions on Aerospace and Electronic Systems 7(1), 1971.
+    .. [Bortz1971] J. E. Bortz, "A new mathematical formulation for strapdown inertial
+       navigation", IEEE Transactions on Aerospace and Electronic Systems 7(1), 1971.
 
     """
     ages = (AGES / unit).astype(stamps.dtype)
@@ -110,7 +110,7 @@ def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'A
     turn = dt * rate
     turned = np.cumsum(turn, axis=1)
     # Rotation vector from the middle of a step to the epoch; rates that change their axis make it
-    # differ from their integral [3]_.
+    # differ from their integral [Bortz1971]_.
     to_come = turned[:, -1:] - turned + 0.5 * turn
     rate = rate - 0.5 * cross(to_come, rate)
     turn = dt * rate
