@@ -394,7 +394,7 @@ class Aligner:
                                  steps.omega_dot),
                      with_stamps(np.hypot(np.hypot(stated[1], gravity_drift), calibration.accel),
                                  GAP_JERK, steps.f_dot),
-                     excess[:, :1], excess[:, 1:], calibration.across)
+                     excess[:, :1], excess[:, 1:])
 
     def _lose(self, why: str) -> None:
         """Start the alignment over; biases are kept."""
@@ -471,10 +471,10 @@ class Aligner:
             return None
         self._imu.consolidate()
         if self._now is None:
-            gyro_bias, _, gyro_scale = method.sensor_errors()
+            gyro_bias, _, gyro_matrix = method.sensor_errors()
             bias_std = float(np.max(method.nuisance().gyro_bias_std))
             self._now = Prediction(
-                self._last_ns, current.C_nb, current.covariance, gyro_bias, 1 - gyro_scale,
+                self._last_ns, current.C_nb, current.covariance, gyro_bias, gyro_matrix,
                 self.config.imu_noise.angle_random_walk, bias_std ** 2 + EARTH_RATE ** 2)
         stamps = self._imu.stamps
         first = int(np.searchsorted(stamps, self._now.stamp_ns, side='right'))

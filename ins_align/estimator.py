@@ -29,7 +29,7 @@ from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals
 from ins_align.rotation import Array, cross
 from ins_align.solution import Course, Solution
-from ins_align.unknowns import (BODY_FIXED, DELAY, GYRO_BIAS, GYRO_SCALE, LEVER_ARM, Prior,
+from ins_align.unknowns import (BODY_FIXED, DELAY, GYRO_BIAS, GYRO_MATRIX, LEVER_ARM, Prior,
                                 prior_of, SIZE, START_POSITION, START_VELOCITY, Unknowns)
 from ins_align.whitening import (Chain, GATE, Gate, HEADING_RESOLVED_STD, Measurements, POSITION,
                                  VELOCITY, Whitened)
@@ -41,7 +41,7 @@ MEDIAN_CHI2_3 = 2.366
 FIRST_EXCESS = 1 / 27
 # Normalised innovation squared and normalised innovation by kind (velocity 0, position 1).
 Tests = dict[int, tuple[float, Array]]
-SensorErrors = tuple[Array, Array, Array]       # gyro bias, accelerometer bias, gyro scale factor
+SensorErrors = tuple[Array, Array, Array]       # gyro bias, accelerometer bias, gyro matrix
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class MapEstimator:
     prior : Prior
     use_position : bool
         Whether position rows will come.
-    estimate_lever_arm, estimate_delay, estimate_gyro_scale : bool
+    estimate_lever_arm, estimate_delay, estimate_gyro_matrix : bool
         Otherwise they stay at the prior's mean.
     capacity : int
         Epochs that are stored.
@@ -118,21 +118,21 @@ class MapEstimator:
 
     def __init__(self, prior: Prior, *, use_position: bool = False,
                  estimate_lever_arm: bool = False, estimate_delay: bool = False,
-                 estimate_gyro_scale: bool = False, capacity: int = 1000,
+                 estimate_gyro_matrix: bool = False, capacity: int = 1000,
                  excess: float = FIRST_EXCESS) -> None:
         """Start at t0."""
         wanted = np.ones(SIZE, bool)
         wanted[START_POSITION] = use_position
         wanted[LEVER_ARM] = estimate_lever_arm
         wanted[DELAY] = estimate_delay
-        wanted[GYRO_SCALE] = estimate_gyro_scale
+        wanted[GYRO_MATRIX] = estimate_gyro_matrix
         self.columns = np.flatnonzero(wanted)
         self.size = 9 if use_position else 6
         self.prior = prior
         self._capacity = capacity
         self._intervals = Intervals.empty(capacity)
         # With which the intervals were integrated.
-        self._sensor_errors = np.zeros((capacity, 3, 3))
+        self._sensor_errors = np.zeros((capacity, 5, 3))
         self._gnss = Measurements.empty(capacity)
         # Outliers when they came.
         self._refused = np.zeros((capacity, 2), bool)
@@ -150,7 +150,7 @@ class MapEstimator:
     def sensor_errors(self) -> SensorErrors:
         """Those of the linearisation point: integrate the next intervals with them."""
         x = self.prior.mean if self.solution is None else self.solution.point
-        return x.gyro_bias, x.accel_bias, x.gyro_scale
+        return x.gyro_bias, x.accel_bias, x.gyro_matrix
 
     def add(self, intervals: Intervals, gnss: Measurements) -> Iterator[Innovation]:
         """
@@ -182,7 +182,7 @@ class MapEstimator:
         count = min(gnss.time.size, self._capacity - self.count)
         places = slice(self.count, self.count + count)
         self._intervals.put(places, intervals.take(slice(0, count)))
-        self._sensor_errors[places] = self.sensor_errors
+        self._sensor_errors[places] = np.vstack(self.sensor_errors)
         self._gnss.put(places, gnss.take(slice(0, count)))
         s = self.solution
         if s is None:
@@ -292,12 +292,12 @@ class MapEstimator:
 
     def _corrected(self, epochs: slice, point: Unknowns) -> Intervals:
         """Return stored intervals as they would be with the sensor errors of a point."""
-        change = (np.stack([point.gyro_bias, point.accel_bias, point.gyro_scale])
+        change = (np.vstack([point.gyro_bias, point.accel_bias, point.gyro_matrix])
                   - self._sensor_errors[epochs])
         intervals = self._intervals.take(epochs)
         if not np.any(change):
             return intervals
-        return intervals.corrected(change[:, 0], change[:, 1], change[:, 2])
+        return intervals.corrected(change[:, 0], change[:, 1], change[:, 2:])
 
     # Solution
 
@@ -405,7 +405,7 @@ class MapEstimator:
             use = gnss.present[:, kind]
             if np.count_nonzero(use) < self.FIRST_FIT - 1 or (kind and total > 0):
                 continue
-            omega = interval.omega * (1 - point.gyro_scale) - point.gyro_bias
+            omega = point.aligned(interval.omega) - point.gyro_bias
             lever = cross(omega, point.lever_b) if kind == 0 else point.lever_b
             integral = chain.v if kind == 0 else chain.p
             a = (integral + (chain.R @ np.broadcast_to(
@@ -451,7 +451,7 @@ class MapEstimator:
                              estimate_lever_arm=(estimate_lever_arm
                                                  or LEVER_ARM.start in self.columns),
                              estimate_delay=DELAY.start in self.columns,
-                             estimate_gyro_scale=GYRO_SCALE.start in self.columns,
+                             estimate_gyro_matrix=GYRO_MATRIX.start in self.columns,
                              capacity=self.count, excess=self.excess)
         other._intervals, other._gnss = intervals, self._gnss.take(slice(0, self.count))
         other.count = self.count
@@ -466,7 +466,7 @@ class MapEstimator:
         zero = np.zeros(3)
         return self._corrected(slice(0, self.count),
                                replace(self.prior.mean, gyro_bias=zero, accel_bias=zero,
-                                       gyro_scale=zero))
+                                       gyro_matrix=np.zeros((3, 3))))
 
     # Results
 
@@ -486,7 +486,7 @@ class MapEstimator:
 
     @property
     def covariance(self) -> Array:
-        """Covariance of the 22 unknowns; zero where one is not estimated, shape (22, 22)."""
+        """Covariance of the 28 unknowns; zero where one is not estimated, shape (28, 28)."""
         full = np.zeros((SIZE, SIZE))
         if self.solution is not None:
             full[np.ix_(self.columns, self.columns)] = self.solution.P
@@ -494,7 +494,7 @@ class MapEstimator:
 
     @property
     def variances(self) -> Array:
-        """Diagonal of `covariance`, shape (22,)."""
+        """Diagonal of `covariance`, shape (28,)."""
         full = np.zeros(SIZE)
         if self.solution is not None:
             full[self.columns] = self.solution.P.diagonal()

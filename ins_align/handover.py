@@ -44,7 +44,7 @@ def prior_from_now(estimator: MapEstimator, C_n0n: Array, shift_v: Array, shift_
         in n0 axes.
     scale : float
         Factor on the covariance, for data that fit worse than stated.
-    wander : ndarray, shape (22,)
+    wander : ndarray, shape (28,)
         Variance by which the unknowns may have changed since t0.
 
     Raises

@@ -164,7 +164,7 @@ class Method(Protocol):
         """Return biases, lever arm and delay."""
 
     def sensor_errors(self) -> tuple[Array, Array, Array]:
-        """Return gyro bias, accelerometer bias and gyro scale factor errors."""
+        """Return gyro bias, accelerometer bias and gyro matrix."""
 
     def prior_without_attitude(self) -> Prior | None:
         """Return what a fresh start may keep."""
@@ -197,7 +197,7 @@ class MapMethod:
         self._capacity = capacity
         self.moved = 0
         noise = config.imu_noise
-        self._scaled = noise.gyro_scale_std > 0
+        self._estimates_matrix = noise.gyro_scale_std > 0
         self._wander = np.zeros(SIZE)
         self._wander[GYRO_BIAS] = (WANDER * noise.gyro_bias_std) ** 2 / WANDER_TIME
         self._wander[ACCEL_BIAS] = (WANDER * noise.accel_bias_std) ** 2 / WANDER_TIME
@@ -223,7 +223,7 @@ class MapMethod:
             prior, use_position=self._use_position,
             estimate_lever_arm=self._config.lever_arm_std > 0,
             estimate_delay=self._config.gnss_delay_std > 0, capacity=self._capacity,
-            estimate_gyro_scale=self._scaled, excess=excess)
+            estimate_gyro_matrix=self._estimates_matrix, excess=excess)
 
     def _take_start(self, epoch: AntennaEpoch, imu: ImuSteps) -> None:
         """Take the epoch at t0."""
@@ -270,9 +270,9 @@ class MapMethod:
         gnss = Measurements(track.time, np.hstack([track.s_v(v_n), track.s_p]),
                             C_n0n @ covariance @ C_n0n.transpose(0, 1, 3, 2), present,
                             track.gravity, -track.still_v)
-        gyro_bias, accel_bias, gyro_scale = self._estimator.sensor_errors
+        gyro_bias, accel_bias, gyro_matrix = self._estimator.sensor_errors
         intervals = preintegrate(imu.steps, gyro_bias, accel_bias, imu.noise,
-                                 gyro_scale if self._scaled else None, imu.recent)
+                                 gyro_matrix if self._estimates_matrix else None, imu.recent)
         for k, self._innovation in enumerate(self._estimator.add(intervals, gnss)):
             self._track, self._last_epoch = track.at(k), epochs[k]
             self._last_imu = imu.take(slice(k, k + 1))
@@ -296,8 +296,7 @@ class MapMethod:
         instant = Steps(np.zeros((1, 1)), *(np.repeat(array[:, -1:], 2, axis=1) for array in (
             steps.omega, steps.f, steps.omega_dot, steps.f_dot)))
         innovation, none = self._innovation, np.zeros((1, 1))
-        self._take_start(start, ImuSteps(instant, Noise(none, none, none, none,
-                                                        np.zeros((1, 3)))))
+        self._take_start(start, ImuSteps(instant, Noise(none, none, none, none)))
         self._innovation = innovation
 
     def initial(self) -> tuple[Array, Array] | None:
@@ -350,9 +349,9 @@ class MapMethod:
         return float(self._config.gnss_delay + x.delay)
 
     def sensor_errors(self) -> tuple[Array, Array, Array]:
-        """Return gyro bias, accelerometer bias and gyro scale factor errors."""
+        """Return gyro bias, accelerometer bias and gyro matrix."""
         x = self._estimator.estimate()
-        return x.gyro_bias, x.accel_bias, x.gyro_scale
+        return x.gyro_bias, x.accel_bias, x.gyro_matrix
 
     def prior_without_attitude(self) -> Prior | None:
         """Return what a fresh start may keep."""
@@ -496,7 +495,7 @@ class NoteMethod:
 
     def sensor_errors(self) -> tuple[Array, Array, Array]:
         """Return zeros."""
-        return self._zero, self._zero, self._zero
+        return self._zero, self._zero, np.zeros((3, 3))
 
     def prior_without_attitude(self) -> Prior | None:
         """Nothing but the attitude is estimated."""

@@ -46,8 +46,8 @@ class Prediction:
         Body to ENU at the epoch.
     covariance : ndarray, shape (3, 3)
         Of the small rotation about the axes of ENU at the epoch, rad^2.
-    gyro_bias, gyro_scale : array_like, shape (3,)
-        The rate is ``measured * gyro_scale - gyro_bias``, rad/s.
+    gyro_bias, gyro_matrix : array_like, shape (3,) and (3, 3)
+        The rate is ``measured - gyro_matrix @ measured - gyro_bias``, rad/s.
     angle_random_walk : float
         Of the gyroscopes, rad/sqrt(s).
     rate_variance : float
@@ -56,14 +56,14 @@ class Prediction:
     """
 
     def __init__(self, stamp_ns: int, C_nb: Array, covariance: Array, gyro_bias: Array,
-                 gyro_scale: Array, angle_random_walk: float, rate_variance: float) -> None:
+                 gyro_matrix: Array, angle_random_walk: float, rate_variance: float) -> None:
         """Stand at the epoch."""
         self.stamp_ns = stamp_ns
         x, y, z, w = quaternion_from_matrix(C_nb).tolist()
         self._quaternion = x, y, z, w
         self._covariance = tuple(np.asarray(covariance, float).ravel().tolist())
         self._bias = tuple(np.asarray(gyro_bias, float).tolist())
-        self._scale = tuple(np.asarray(gyro_scale, float).tolist())
+        self._matrix = (np.eye(3) - gyro_matrix).tolist()
         self._epoch_ns = stamp_ns
         self._white_variance = angle_random_walk ** 2
         self._rate_variance = rate_variance
@@ -91,9 +91,11 @@ class Prediction:
                 abs(x) < MAX_RATE and abs(y) < MAX_RATE and abs(z) < MAX_RATE):
             return False
         dt = (stamp_ns - self.stamp_ns) * 1e-9
-        (scale_x, scale_y, scale_z), (bias_x, bias_y, bias_z) = self._scale, self._bias
-        x, y, z = ((x * scale_x - bias_x) * dt, (y * scale_y - bias_y) * dt,
-                   (z * scale_z - bias_z) * dt)
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._matrix
+        bias_x, bias_y, bias_z = self._bias
+        x, y, z = ((xx * x + xy * y + xz * z - bias_x) * dt,
+                   (yx * x + yy * y + yz * z - bias_y) * dt,
+                   (zx * x + zy * y + zz * z - bias_z) * dt)
         angle = math.sqrt(x * x + y * y + z * z)
         half_sinc = math.sin(0.5 * angle) / angle if angle > _SMALL_ANGLE else 0.5
         x, y, z, w = x * half_sinc, y * half_sinc, z * half_sinc, math.cos(0.5 * angle)
@@ -110,7 +112,7 @@ class Prediction:
         if stamps_ns.size == 0:
             return
         dt = np.diff(stamps_ns, prepend=self.stamp_ns) * 1e-9
-        turns = (gyro * self._scale - self._bias) * dt[:, None]
+        turns = (gyro @ np.transpose(self._matrix) - self._bias) * dt[:, None]
         half = 0.5 * np.sqrt(np.einsum('ij,ij->i', turns, turns))
         # numpy's sinc is that of pi x.
         steps = np.column_stack([0.5 * turns * np.sinc(half / np.pi)[:, None], np.cos(half)])

@@ -45,8 +45,8 @@ class Intervals:
         Derivatives to the gyro bias (g) and accelerometer bias (a): of the rotation as a left
         error (``R <- exp_so3(J_Rg d) R``), of v, of p. That of v to the accelerometer bias is the
         same integral as J_Rg.
-    J_Rs, J_vs, J_ps : ndarray, shape (K, 3, 3)
-        Derivatives to the gyro scale factors.
+    J_Rm, J_vm, J_pm : ndarray, shape (K, 3, 9)
+        Derivatives to the gyros' matrix of scale factors and misalignment, row by row.
     Q : ndarray, shape (K, 9, 9)
         Covariance of the errors (rotation at the start, v, p) that the sensors' noise leaves.
     Q_excess : ndarray, shape (K, 9, 9)
@@ -66,9 +66,9 @@ class Intervals:
     J_vg: Array
     J_pg: Array
     J_pa: Array
-    J_Rs: Array
-    J_vs: Array
-    J_ps: Array
+    J_Rm: Array
+    J_vm: Array
+    J_pm: Array
     Q: Array
     Q_excess: Array
     omega: Array
@@ -79,7 +79,8 @@ class Intervals:
     def empty(capacity: int) -> 'Intervals':
         """Room for `capacity` intervals, to be filled by `put`."""
         shapes = {'duration': (), 'v': (3,), 'p': (3,), 'omega': (3,), 'Q': (9, 9),
-                  'Q_excess': (9, 9), 'gained': (RUNGS, 3), 'turned': (RUNGS, 3)}
+                  'Q_excess': (9, 9), 'gained': (RUNGS, 3), 'turned': (RUNGS, 3),
+                  'J_Rm': (3, 9), 'J_vm': (3, 9), 'J_pm': (3, 9)}
         return Intervals(**{field.name: np.zeros((capacity,) + shapes.get(field.name, (3, 3)))
                             for field in fields(Intervals)})
 
@@ -105,12 +106,12 @@ class Intervals:
         return Intervals(**{
             **vars(self), 'R': R, 'v': accel_sign * v, 'p': accel_sign * p,
             'J_vg': accel_sign * self.J_vg, 'J_pg': accel_sign * self.J_pg,
-            'J_Rs': gyro_sign * self.J_Rs, 'J_vs': gyro_sign * accel_sign * self.J_vs,
-            'J_ps': gyro_sign * accel_sign * self.J_ps,
+            'J_Rm': gyro_sign * self.J_Rm, 'J_vm': gyro_sign * accel_sign * self.J_vm,
+            'J_pm': gyro_sign * accel_sign * self.J_pm,
             'omega': gyro_sign * self.omega, 'gained': accel_sign * self.gained,
             'turned': gyro_sign * self.turned})
 
-    def corrected(self, gyro_bias: Array, accel_bias: Array, gyro_scale: Array) -> 'Intervals':
+    def corrected(self, gyro_bias: Array, accel_bias: Array, gyro_matrix: Array) -> 'Intervals':
         """
         First-order correction of R, v and p for a change of the sensors' errors.
 
@@ -118,20 +119,24 @@ class Intervals:
 
         Parameters
         ----------
-        gyro_bias, accel_bias, gyro_scale : ndarray, shape (3,) or (K, 3)
+        gyro_bias, accel_bias : ndarray, shape (3,) or (K, 3)
             By how much they are larger than those that the samples were integrated with.
+        gyro_matrix : ndarray, shape (3, 3) or (K, 3, 3)
+            So it is with the matrix.
 
         """
+        by_row = gyro_matrix.reshape(gyro_matrix.shape[:-2] + (9,))
+
         def product(matrices: Array, vectors: Array) -> Array:
             return (matrices @ vectors[..., None])[..., 0]
 
         return Intervals(**{
             **vars(self),
-            'R': exp_so3(product(self.J_Rg, gyro_bias) + product(self.J_Rs, gyro_scale)) @ self.R,
+            'R': exp_so3(product(self.J_Rg, gyro_bias) + product(self.J_Rm, by_row)) @ self.R,
             'v': (self.v + product(self.J_vg, gyro_bias) + product(self.J_Rg, accel_bias)
-                  + product(self.J_vs, gyro_scale)),
+                  + product(self.J_vm, by_row)),
             'p': (self.p + product(self.J_pg, gyro_bias) + product(self.J_pa, accel_bias)
-                  + product(self.J_ps, gyro_scale))})
+                  + product(self.J_pm, by_row))})
 
 
 @dataclass(frozen=True)
@@ -145,9 +150,6 @@ class Noise:
         rad/sqrt(s) and m/s/sqrt(s), as stated.
     gyro_excess, accel_excess : array_like
         What was measured beyond that, in the same units.
-    across : array_like, shape (3,) or (K, 3)
-        rad/sqrt(s), more of the gyros about the axes perpendicular to this vector, which is in the
-        body frame at the end of each interval.
 
     """
 
@@ -155,7 +157,6 @@ class Noise:
     velocity_random_walk: ArrayLike = 0.0
     gyro_excess: ArrayLike = 0.0
     accel_excess: ArrayLike = 0.0
-    across: ArrayLike = (0.0, 0.0, 0.0)
 
     def take(self, index: slice) -> 'Noise':
         """Return the noise in the intervals of `index`; all fields have an axis of K."""
@@ -290,7 +291,7 @@ def white_noise(stamps: 'Array | Index', samples: Array, first: Index, last: Ind
 
 
 def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise,
-                 gyro_scale: 'Array | None' = None, recent: 'Recent | None' = None) -> Intervals:
+                 gyro_matrix: 'Array | None' = None, recent: 'Recent | None' = None) -> Intervals:
     """
     Integrate the steps of K intervals.
 
@@ -306,9 +307,9 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
         Subtracted first.
     noise : Noise
         Of the sensors, in each step.
-    gyro_scale : ndarray, shape (3,), optional
-        Scale factors less one: the true rate is ``omega (1 - gyro_scale) - gyro_bias``. Without
-        it the derivatives to it are left out, that is zero.
+    gyro_matrix : ndarray, shape (3, 3), optional
+        Scale factors and misalignment: the true rate is ``omega - gyro_matrix @ omega -
+        gyro_bias``. Without it the derivatives to it are left out, that is zero.
     recent : Recent, optional
         Motion before the end of each interval. Without it force and rate at the end are taken to
         have lasted.
@@ -326,8 +327,8 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     """
     dt = steps.dt
     omega = steps.omega - gyro_bias
-    if gyro_scale is not None:
-        omega -= steps.omega * gyro_scale
+    if gyro_matrix is not None:
+        omega -= steps.omega @ gyro_matrix.T
     f = steps.f - accel_bias
     omega0, omega1 = omega[:, :-1], omega[:, 1:]
     f0, f1 = f[:, :-1], f[:, 1:]
@@ -355,22 +356,21 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     passed = np.cumsum(dt, axis=1)
     duration = passed[:, -1]
     remaining = duration[:, None] - passed + 0.5 * dt       # from the middle of each step on
-    # Derivatives: a gyro bias turns the rest of the interval by minus the integral of A; a scale
-    # factor is a bias in proportion to the rate of its axis.
-    errors = 1 if gyro_scale is None else 2
-    turns = np.empty(dt.shape + (3, 3 * errors))
-    turns[..., :3] = A @ jacobian * dt[..., None, None]
-    if gyro_scale is not None:
+    # Derivatives: a gyro bias turns the rest of the interval by minus the integral of A; an entry
+    # of the matrix is a bias in proportion to a rate.
+    turns = A @ jacobian * dt[..., None, None]
+    if gyro_matrix is not None:
         measured = 0.5 * (steps.omega[:, :-1] + steps.omega[:, 1:])
-        turns[..., 3:] = turns[..., :3] * measured[..., None, :]
+        by_row = turns[..., None] * measured[..., None, None, :]
+        turns = np.concatenate([turns, by_row.reshape(dt.shape + (3, 9))], axis=-1)
     turned_by = np.cumsum(turns, axis=1)
     pushes = skew(u) @ (turned_by - 0.5 * turns)
     J_R, J_v = -turned_by[:, -1], np.sum(pushes, axis=1)
     # What a step adds to the velocity moves the body for the time that remains.
     J_p = np.sum(remaining[..., None, None] * pushes, axis=1)
     J_pa = -np.sum(remaining[..., None, None] * turns[..., :3], axis=1)
-    no_scale = np.zeros((dt.shape[0], 3, 3))
-    J_Rs, J_vs, J_ps = (no_scale if gyro_scale is None else J[..., 3:] for J in (J_R, J_v, J_p))
+    none = np.zeros((dt.shape[0], 3, 9))
+    J_Rm, J_vm, J_pm = (none if gyro_matrix is None else J[..., 3:] for J in (J_R, J_v, J_p))
 
     v, p = v_end[:, -1], p_end[:, -1]
     v_rest = v[:, None] - v_mid
@@ -392,16 +392,13 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
             return total
 
         Q = covariance(noise.angle_random_walk, noise.velocity_random_walk)
-        # What this does to the velocity within the interval is little beside what it does later.
-        across = skew((turned[:, -1] @ np.atleast_2d(noise.across)[..., None])[..., 0])
-        Q[:, :3, :3] += duration[:, None, None] * (across @ across.transpose(0, 2, 1))
         Q_excess = covariance(noise.gyro_excess, noise.accel_excess)
     # Intervals are chained for hours.
     R = orthonormalized(turned[:, -1])
     if recent is None:
         recent = Recent.steady(steps.f[:, -1], steps.omega[:, -1])
-    return Intervals(duration, R, v, p, J_R[..., :3], J_v[..., :3], J_p[..., :3], J_pa, J_Rs, J_vs,
-                     J_ps, Q, Q_excess, steps.omega[:, -1], recent.gained, recent.turned)
+    return Intervals(duration, R, v, p, J_R[..., :3], J_v[..., :3], J_p[..., :3], J_pa, J_Rm, J_vm,
+                     J_pm, Q, Q_excess, steps.omega[:, -1], recent.gained, recent.turned)
 
 
 def _least_and_more(density: ArrayLike) -> tuple[Array, Array]:

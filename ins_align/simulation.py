@@ -177,7 +177,7 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
              duration: float | None = None, ideal: bool = False,
              imu_rate: float = 100.0, imu_jitter: float = 0.0,
              gyro_bias_std: float | None = None, accel_bias_std: float | None = None,
-             gyro_scale_std: float = 0.0,
+             gyro_scale_std: float = 0.0, gyro_misalignment_std: float = 0.0,
              lever_arm: Sequence[float] = (1.0, 1.0, 1.0),
              mount_rpy_deg: Sequence[float] = (0.0, 0.0, 0.0),
              gnss_rate: float = 5.0, gnss_phase: float = 0.0137,
@@ -215,8 +215,9 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
         tell the displaced instants.
     gyro_bias_std, accel_bias_std : float, optional
         rad/s and m/s^2 per axis in place of the grade's.
-    gyro_scale_std : float
-        Scale-factor error of each gyro (0.01 is one percent).
+    gyro_scale_std, gyro_misalignment_std : float
+        Scale factor error of each gyro (0.01 is one percent), and what it feels of the rate about
+        each of the other axes.
     lever_arm : three floats
         IMU to antenna in the IMU frame, m.
     mount_rpy_deg : three floats
@@ -284,12 +285,14 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
     truth_gyro, truth_accel = trajectory.gyro @ C_vb, trajectory.accel @ C_vb
     gyro_bias = scale * noise.gyro_bias_std * streams[0].standard_normal(3)
     accel_bias = scale * noise.accel_bias_std * streams[0].standard_normal(3)
-    gyro_scale = 1 + scale * gyro_scale_std * streams[0].standard_normal(3)
+    gyro_matrix = np.eye(3) + scale * gyro_scale_std * np.diag(streams[0].standard_normal(3))
+    gyro_matrix += (scale * gyro_misalignment_std * (1 - np.eye(3))
+                    * streams[0].standard_normal((3, 3)))
     gyro_std = scale * noise.angle_random_walk * math.sqrt(imu_rate)
     accel_std = scale * noise.velocity_random_walk * math.sqrt(imu_rate)
     sign = np.array(IMU_AXES[flip_axis])
     shape = truth_gyro.shape
-    gyro = sign * (truth_gyro * gyro_scale + gyro_bias
+    gyro = sign * (truth_gyro @ gyro_matrix.T + gyro_bias
                    + gyro_std * streams[1].standard_normal(shape))
     accel = accel_sign * sign * (truth_accel + accel_bias
                                  + accel_std * streams[2].standard_normal(shape))

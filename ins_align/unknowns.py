@@ -14,7 +14,7 @@
 """
 The unknowns of an alignment and what is known of them beforehand.
 
-All 22 of them have their place in one vector; an estimator takes those columns that it estimates.
+All 28 of them have their place in one vector; an estimator takes those columns that it estimates.
 """
 
 from dataclasses import dataclass, replace
@@ -28,6 +28,8 @@ import numpy as np
 UNIFORM_ANGLE_STD = math.pi / math.sqrt(3)
 # Of a lever arm that is not known, metres per axis.
 FREE_LEVER_STD = 2.0
+# Misalignment of the gyros, over the error of their scale factors.
+GYRO_MISALIGNMENT = 0.3
 
 
 @dataclass(frozen=True)
@@ -41,8 +43,9 @@ class Unknowns:
         Initial attitude ``C_nb(0)``.
     gyro_bias, accel_bias : ndarray, shape (3,)
         rad/s, m/s^2; measured minus true.
-    gyro_scale : ndarray, shape (3,)
-        Scale factor errors of the gyros.
+    gyro_matrix : ndarray, shape (3, 3)
+        Scale factor errors of the gyros on the diagonal, misalignment beside it: the true rate is
+        ``measured - gyro_matrix @ measured - gyro_bias``.
     start_velocity, start_position : ndarray, shape (3,)
         Of the IMU at t0 in n0, relative to the antenna's track (c_v, c_p of method.md).
     lever_b : ndarray, shape (3,)
@@ -54,7 +57,7 @@ class Unknowns:
 
     C: Array
     gyro_bias: Array
-    gyro_scale: Array
+    gyro_matrix: Array
     accel_bias: Array
     start_velocity: Array
     start_position: Array
@@ -62,16 +65,17 @@ class Unknowns:
     delay: float | Array
 
     def vector(self) -> Array:
-        """All but the attitude, which has three zeros, shape (22,)."""
-        return np.concatenate([np.zeros(3), self.gyro_bias, self.gyro_scale, self.accel_bias,
-                               self.start_velocity, self.start_position, self.lever_b,
-                               [self.delay]])
+        """All but the attitude, which has three zeros, shape (28,)."""
+        return np.concatenate([np.zeros(3), self.gyro_bias, self.gyro_matrix.ravel(),
+                               self.accel_bias, self.start_velocity, self.start_position,
+                               self.lever_b, [self.delay]])
 
     def moved(self, dx: Array) -> 'Unknowns':
-        """Return the point moved by `dx`, shape (..., 22)."""
+        """Return the point moved by `dx`, shape (..., 28)."""
         turned = exp_so3(dx[..., ATTITUDE]) @ self.C
+        matrix = dx[..., GYRO_MATRIX].reshape(dx.shape[:-1] + (3, 3))
         return Unknowns(turned, self.gyro_bias + dx[..., GYRO_BIAS],
-                        self.gyro_scale + dx[..., GYRO_SCALE],
+                        self.gyro_matrix + matrix,
                         self.accel_bias + dx[..., ACCEL_BIAS],
                         self.start_velocity + dx[..., START_VELOCITY],
                         self.start_position + dx[..., START_POSITION],
@@ -82,18 +86,22 @@ class Unknowns:
         return Unknowns(*(array[index] for array in vars(self).values()))
 
     def minus(self, other: 'Unknowns') -> Array:
-        """Return the step from `other` to this point, shape (22,)."""
+        """Return the step from `other` to this point, shape (28,)."""
         step = self.vector() - other.vector()
         step[:3] = log_so3(self.C @ other.C.T)
         return step
 
+    def aligned(self, measured: Array) -> Array:
+        """Return what gyros measured, shape (K, 3), without scale factor and misalignment."""
+        return measured - measured @ self.gyro_matrix.T
+
 
 # Places of the blocks in the full vector of unknowns.
-ATTITUDE, GYRO_BIAS, GYRO_SCALE, ACCEL_BIAS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-START_VELOCITY, START_POSITION = slice(12, 15), slice(15, 18)
-LEVER_ARM, DELAY = slice(18, 21), slice(21, 22)
-SIZE = 22
-GYRO = slice(3, 9)                      # bias and scale factor
+ATTITUDE, GYRO_BIAS, GYRO_MATRIX = slice(0, 3), slice(3, 6), slice(6, 15)
+ACCEL_BIAS, START_VELOCITY, START_POSITION = slice(15, 18), slice(18, 21), slice(21, 24)
+LEVER_ARM, DELAY = slice(24, 27), slice(27, 28)
+SIZE = 28
+GYRO = slice(3, 15)                     # bias and matrix
 # Unknowns that outlive a new t0 and do not depend on the heading.
 BODY_FIXED = np.r_[GYRO, ACCEL_BIAS, LEVER_ARM, DELAY]
 
@@ -101,7 +109,7 @@ BODY_FIXED = np.r_[GYRO, ACCEL_BIAS, LEVER_ARM, DELAY]
 @dataclass(frozen=True)
 class Prior:
     """
-    What is known of x before the data: a mean and an information matrix over all 22 unknowns.
+    What is known of x before the data: a mean and an information matrix over all 28 unknowns.
 
     With `heading_free` the heading of the mean is arbitrary and carries no information.
     """
@@ -177,20 +185,26 @@ def first_prior(gyro_bias_std: float, accel_bias_std: float, lever_b: Array,
     lever_std, delay, delay_std : float
         Metres per axis, seconds.
     gyro_scale_std : float
-        Per axis, 0.01 is one percent; 0: none.
+        Per axis, 0.01 is one percent, to which misalignment is in proportion; 0: neither.
 
     """
     std = np.full(SIZE, math.inf)
     std[GYRO_BIAS], std[ACCEL_BIAS] = gyro_bias_std, accel_bias_std
     if gyro_scale_std > 0:
-        std[GYRO_SCALE] = gyro_scale_std
+        std[GYRO_MATRIX] = gyro_matrix_std(gyro_scale_std).ravel()
     if lever_std > 0:
         std[LEVER_ARM] = lever_std
     if delay_std > 0:
         std[DELAY] = delay_std
-    mean = Unknowns(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
+    zero = np.zeros(3)
+    mean = Unknowns(np.eye(3), zero, np.zeros((3, 3)), zero, zero, zero,
                     np.asarray(lever_b, dtype=float), delay)
     return Prior(mean, np.diag(std ** -2.0), False)
+
+
+def gyro_matrix_std(gyro_scale_std: float) -> Array:
+    """Return sigma of scale factors and misalignment, shape (3, 3)."""
+    return gyro_scale_std * np.where(np.eye(3) > 0, 1.0, GYRO_MISALIGNMENT)
 
 
 def prior_of(mean: Unknowns, covariance: Array, unknowns: Index, heading_free: bool) -> Prior:

@@ -26,7 +26,7 @@ from ins_align.preintegration import Intervals
 from ins_align.recent import AGES, exact, smooth
 from ins_align.rotation import (Array, cross, cumulative_rotations, exp_so3, Index, running_sum,
                                 skew)
-from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO, GYRO_BIAS, GYRO_SCALE,
+from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO, GYRO_BIAS, GYRO_MATRIX,
                                 LEVER_ARM, SIZE, START_POSITION, START_VELOCITY, Unknowns)
 import numpy as np
 
@@ -92,7 +92,7 @@ class Chain:
     R: Array                # C_b0b
     v: Array                # int C_b0b f
     p: Array                # int int C_b0b f
-    R_g: Array              # left error of R to gyro bias and scale factor, (3, 6)
+    R_g: Array              # left error of R to gyro bias and matrix, (3, 12)
     v_g: Array
     v_a: Array
     p_g: Array
@@ -101,7 +101,7 @@ class Chain:
     @staticmethod
     def start() -> 'Chain':
         """Return the chain at t0."""
-        gyro, accel = np.zeros((3, 6)), np.zeros((3, 3))
+        gyro, accel = np.zeros((3, 12)), np.zeros((3, 3))
         return Chain(np.eye(3), np.zeros(3), np.zeros(3), gyro, gyro, accel, gyro, accel)
 
     def at(self, index: int | slice) -> 'Chain':
@@ -121,16 +121,16 @@ class Chain:
             after = running_sum(start, steps)
             return np.concatenate([start[None], after[:-1]]), after
 
-        def gyro(bias: Array, scale: Array) -> Array:
-            return R @ np.concatenate([bias, scale], axis=-1)
+        def gyro(bias: Array, matrix: Array) -> Array:
+            return R @ np.concatenate([bias, matrix], axis=-1)
 
-        RJ = gyro(interval.J_Rg, interval.J_Rs)
+        RJ = gyro(interval.J_Rg, interval.J_Rm)
         R_g, R_g_end = total(self.R_g, RJ)
-        v_g, v_g_end = total(self.v_g, gyro(interval.J_vg, interval.J_vs) - skew_u @ R_g)
+        v_g, v_g_end = total(self.v_g, gyro(interval.J_vg, interval.J_vm) - skew_u @ R_g)
         v_a, v_a_end = total(self.v_a, RJ[..., :3])
         v, v_end = total(self.v, u)
         p_end = total(self.p, w + interval.duration[:, None] * v)[1]
-        p_g_end = total(self.p_g, h * v_g + gyro(interval.J_pg, interval.J_ps) - skew_w @ R_g)[1]
+        p_g_end = total(self.p_g, h * v_g + gyro(interval.J_pg, interval.J_pm) - skew_w @ R_g)[1]
         p_a_end = total(self.p_a, h * v_a + R @ interval.J_pa)[1]
         return Chain(R_end, v_end, p_end, R_g_end, v_g_end, v_a_end, p_g_end, p_a_end)
 
@@ -197,7 +197,7 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
 
     Returns
     -------
-    ndarray, shape (K, 6, 23)
+    ndarray, shape (K, 6, 29)
         The residual ``s - model`` in the first column, then the derivative of the model to each
         unknown.
 
@@ -213,12 +213,12 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     gained = interval.gained - AGES[:, None] * point.accel_bias
     _, gained_v, gained_p = exact(gained, delay)
     measured_rate, measured_turn, _ = exact(interval.turned, delay)
-    rate = measured_rate * (1 - point.gyro_scale) - point.gyro_bias
-    turn = measured_turn * (1 - point.gyro_scale) - delay * point.gyro_bias
+    rate = point.aligned(measured_rate) - point.gyro_bias
+    turn = point.aligned(measured_turn) - delay * point.gyro_bias
     rate += 0.5 * cross(turn, rate)
     # A lever arm swings with the vibration too.
     vibration = interval.omega - exact(interval.turned, 0.0)[0]
-    omega = rate + vibration * (1 - point.gyro_scale)
+    omega = rate + point.aligned(vibration)
     CR_seen = CR @ exp_so3(-turn)
     swing = CR_seen @ skew(omega)
     swung = _turned(CR_seen, cross(omega, lever))
@@ -243,10 +243,11 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
                             - skew(seen_p - moved_p + delay * moved_v) @ C_R_g)
     # And they are in the rates with which the lever arm swings, and turned since.
     arm, turned_arm = CR_seen @ skew(lever), CR_seen @ skew(cross(omega, lever))
-    for errors, of_rate, of_turn in ((GYRO_BIAS, 1.0, delay), (
-            GYRO_SCALE, (measured_rate + vibration)[:, None, :], measured_turn[:, None, :])):
-        H[:, VELOCITY, errors] += arm * of_rate - turned_arm * of_turn
-        H[:, POSITION, errors] -= arm * of_turn
+    H[:, VELOCITY, GYRO_BIAS] += arm - delay * turned_arm
+    H[:, POSITION, GYRO_BIAS] -= delay * arm
+    measured_rate += vibration
+    H[:, VELOCITY, GYRO_MATRIX] += _by_row(arm, measured_rate) - _by_row(turned_arm, measured_turn)
+    H[:, POSITION, GYRO_MATRIX] -= _by_row(arm, measured_turn)
     H[:, VELOCITY, ACCEL_BIAS] = C_v_a + delay * CR
     H[:, POSITION, ACCEL_BIAS] = C @ chain.p_a - delay * (C_v_a + delay / 2 * CR)
     H[:, VELOCITY, START_VELOCITY] = eye
@@ -256,12 +257,17 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     H[:, POSITION, LEVER_ARM] = CR_seen
     # Vibration is no use in a derivative. The rate changes with time as it does not with age.
     force = smooth(gained, delay)[0]
-    rate_change = smooth(interval.turned, delay)[1] * (1 - point.gyro_scale)
+    rate_change = point.aligned(smooth(interval.turned, delay)[1])
     whirled = cross(rate, cross(omega, lever)) - cross(rate_change, lever)
     H[:, VELOCITY, DELAY.start] = -(_turned(CR, force) + _turned(CR_seen, whirled) + gnss.gravity)
     H[:, POSITION, DELAY.start] = -ground_velocity
     Y[:, :, 0] -= beyond * H[:, :, DELAY.start]
     return Y
+
+
+def _by_row(matrix: Array, vectors: Array) -> Array:
+    """Derive ``matrix @ X @ vector`` by X row by row, shape (K, 3, 9)."""
+    return (matrix[..., None] * vectors[:, None, None, :]).reshape(-1, 3, 9)
 
 
 @dataclass
@@ -366,7 +372,7 @@ class Whitener:
     Parameters
     ----------
     columns : ndarray of int, shape (n,)
-        Unknowns that are estimated, out of the 22.
+        Unknowns that are estimated, out of the 28.
     size : int
         9 when positions are used, 6 when velocities alone are.
 

@@ -19,11 +19,11 @@ import math
 from alignment import normalised_error, simulated
 from ins_align.aligner import Aligner
 from ins_align.calibration import (ACCEL_ERRORS, CalibrationErrors, CALM_TIME, G_SENSITIVITY,
-                                   GYRO_MISALIGNMENT, STEADY_TIME)
+                                   STEADY_TIME)
 from ins_align.config import Config
-from ins_align.preintegration import Noise, preintegrate, Steps
 from ins_align.recent import Recent
 from ins_align.simulation import feed
+from ins_align.unknowns import GYRO_MISALIGNMENT
 import numpy as np
 import pytest
 
@@ -32,69 +32,39 @@ DT = 0.02
 GRAVITY = np.array([0.0, 0.0, 9.8])
 
 
-def noise_of(rate, force, scale=SCALE):
-    """Noise of a motion given at steps of DT, shape (K, 3) each."""
-    return CalibrationErrors(scale).noise(np.r_[0.0, np.full(len(rate) - 1, DT)],
-                                          Recent.steady(force, rate))
+def noise_of(force, scale=SCALE):
+    """Noise of a force given at steps of DT, shape (K, 3)."""
+    return CalibrationErrors(scale).noise(np.r_[0.0, np.full(len(force) - 1, DT)],
+                                          Recent.steady(force, np.zeros_like(force)))
 
 
 def still(seconds):
     return np.zeros((round(seconds / DT), 3))
 
 
-def test_a_turn_that_is_soon_over_leaves_the_spread_of_its_error():
-    turn = np.array([0.3, -0.5, 1.1])
-    rate = np.concatenate([still(600.0), [turn / DT], still(300.0)])
-    noise = noise_of(rate, np.zeros_like(rate) + GRAVITY)
+def test_a_push_that_is_soon_over_leaves_the_spread_of_its_error():
+    push = np.array([4.0, 3.0, 0.0])            # m/s
+    noise = noise_of(GRAVITY + np.concatenate([still(600.0), [push / DT], still(300.0)]))
     a, b = 1 / CALM_TIME, 1 / STEADY_TIME
     # Integral of (a exp(-a t) - b exp(-b t))^2, times 2 / a.
     expected = 2 / a * (a / 2 - 2 * a * b / (a + b) + b / 2)
-    spread = GYRO_MISALIGNMENT * SCALE * np.linalg.norm(turn)
     assert 0.8 < expected < 1.0
-    assert np.sum(noise.across ** 2) * DT == pytest.approx(expected * spread ** 2, rel=0.02)
-    assert np.all(noise.gyro == 0.0) and np.all(noise.accel == 0.0)
-
-
-def test_a_push_is_felt_by_accelerometers_and_gyros():
-    push = np.array([4.0, 3.0, 0.0])            # m/s
-    force = GRAVITY + np.concatenate([still(600.0), [push / DT], still(300.0)])
-    noise = noise_of(np.zeros_like(force), force)
-    ratio = noise.accel[-1, 0] / noise.gyro[-1, 0]
-    assert ratio == pytest.approx(ACCEL_ERRORS / G_SENSITIVITY)
-    error = math.sqrt(np.sum(noise.accel ** 2) * DT)
-    assert error == pytest.approx(ACCEL_ERRORS * SCALE * 5.0, rel=0.1)
-    assert np.all(noise.across == 0.0)
+    for density, ratio in ((noise.accel, ACCEL_ERRORS), (noise.gyro, G_SENSITIVITY)):
+        assert np.sum(density ** 2) * DT == pytest.approx(expected * (ratio * SCALE * 5.0) ** 2,
+                                                          rel=0.02)
 
 
 @pytest.mark.parametrize('frequency', (0.0, 2.0, 10.0))
-def test_a_steady_circle_and_a_swing_leave_next_to_nothing(frequency):
+def test_a_steady_force_and_a_swing_leave_next_to_nothing(frequency):
     time = DT * np.arange(3000)[:, None]
-    rate = np.cos(2 * np.pi * frequency * time) * [0.1, 0.0, 0.5]
-    noise = noise_of(rate, GRAVITY + 3.0 * rate)
-    density = GYRO_MISALIGNMENT * SCALE * math.sqrt(2 * CALM_TIME) * 0.5
-    assert np.abs(noise.across).max() < 0.06 * density
+    noise = noise_of(GRAVITY + np.cos(2 * np.pi * frequency * time) * [0.3, 0.0, 1.5])
+    assert np.abs(noise.accel).max() < 0.06 * ACCEL_ERRORS * SCALE * math.sqrt(2 * CALM_TIME) * 1.5
 
 
 def test_nothing_is_added_where_scale_factors_are_exact():
-    rate = np.random.default_rng(0).standard_normal((50, 3))
-    for values in noise_of(rate, GRAVITY + rate, scale=0.0):
+    force = GRAVITY + np.random.default_rng(0).standard_normal((50, 3))
+    for values in noise_of(force, scale=0.0):
         assert np.all(values == 0.0)
-
-
-def test_the_noise_lies_across_the_turn():
-    turning = np.array([[0.0, 0.0, 2e-3], [1e-3, -2e-3, 0.0]])
-    n = 20
-    resting = np.zeros((2, n + 1, 3))
-    steps = Steps(np.full((2, n), 0.01), resting, resting + GRAVITY, resting, resting)
-    zero = np.zeros(3)
-    without = preintegrate(steps, zero, zero, Noise(1e-4, 1e-3)).Q
-    more = preintegrate(steps, zero, zero, Noise(1e-4, 1e-3, across=turning)).Q - without
-    for Q, axis in zip(more, turning):
-        assert np.allclose(Q[:3, :3] @ axis, 0.0, atol=1e-20)
-        across = np.cross(axis, [1.0, 2.0, 3.0])
-        assert across @ Q[:3, :3] @ across == pytest.approx(
-            0.2 * (axis @ axis) * (across @ across))
-        assert np.all(Q[3:, :] == 0.0) and np.all(Q[:, 3:] == 0.0)
 
 
 @pytest.mark.parametrize('scenario', ('car', 'launch'))

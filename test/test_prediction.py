@@ -19,7 +19,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 STEP_NS = 5_000_000
-BIAS, SCALE = np.array([0.02, -0.03, 0.01]), np.array([1.01, 0.99, 1.0])
+BIAS = np.array([0.02, -0.03, 0.01])
+MATRIX = np.array([[0.01, 2e-3, 0.0], [3e-3, -0.01, 1e-3], [-4e-3, 0.0, 5e-3]])
 RANDOM = np.random.default_rng(7)
 GYRO = RANDOM.normal(scale=2.0, size=(400, 3))
 STAMPS = np.cumsum(RANDOM.integers(1, 2 * STEP_NS, 400))
@@ -28,12 +29,12 @@ COVARIANCE = np.array([[4.0, 0.5, 0.2], [0.5, 3.0, -0.1], [0.2, -0.1, 9.0]]) * 1
 
 
 def prediction():
-    return Prediction(0, START.as_matrix(), COVARIANCE, BIAS, SCALE, 2e-3, 1e-6)
+    return Prediction(0, START.as_matrix(), COVARIANCE, BIAS, MATRIX, 2e-3, 1e-6)
 
 
 def truth(count):
     """Return the attitude after so many samples."""
-    turns = (GYRO * SCALE - BIAS) * (np.diff(STAMPS, prepend=0) * 1e-9)[:, None]
+    turns = (GYRO - GYRO @ MATRIX.T - BIAS) * (np.diff(STAMPS, prepend=0) * 1e-9)[:, None]
     attitude = START
     for turn in turns[:count]:
         attitude = attitude * Rotation.from_rotvec(turn)
@@ -94,7 +95,8 @@ def test_follower_knows_which_round_of_a_loop_it_is_in():
     for _ in range(2):
         for stamp_ns in range(STEP_NS, 100 * STEP_NS, STEP_NS):
             assert follower.follow(stamp_ns, (0.0, 0.0, 1.0)) is None
-    still = Prediction(90 * STEP_NS, np.eye(3), COVARIANCE, np.zeros(3), np.ones(3), 0.0, 0.0)
+    still = Prediction(90 * STEP_NS, np.eye(3), COVARIANCE, np.zeros(3), np.zeros((3, 3)), 0.0,
+                       0.0)
     follower.adopt(still)
     now = follower.follow(100 * STEP_NS, (0.0, 0.0, 1.0))
     assert Rotation.from_quat(now.quaternion_xyzw).as_rotvec() == pytest.approx([0, 0, 0.05])

@@ -59,10 +59,11 @@ def samples(duration, rate=RATE, jitter=0.0, seed=0):
     return stamps, omega_of(stamps), force_of(stamps)
 
 
-def integrated(epochs, rate=RATE, jitter=0.0, gyro_bias=ZERO, accel_bias=ZERO, gyro_scale=ZERO):
+def integrated(epochs, rate=RATE, jitter=0.0, gyro_bias=ZERO, accel_bias=ZERO,
+               gyro_matrix=np.zeros((3, 3))):
     stamps, gyro, accel = samples(epochs[-1], rate, jitter)
     steps = split_at_epochs(stamps, gyro, accel, np.asarray(epochs, float))
-    return preintegrate(steps, gyro_bias, accel_bias, NOISE, gyro_scale)
+    return preintegrate(steps, gyro_bias, accel_bias, NOISE, gyro_matrix)
 
 
 def chained(interval):
@@ -159,28 +160,28 @@ def test_jacobians_are_the_derivatives_of_the_integration(axis):
     step = 1e-5
     epochs = [0.0, 1.5]
     at = integrated(epochs)
-    for name, size in (('gyro_bias', step), ('accel_bias', step), ('gyro_scale', step)):
-        bias = size * np.eye(3)[axis]
-        plus, minus = (integrated(epochs, **{name: sign * bias}) for sign in (1, -1))
-        turn = Rotation.from_matrix(plus.R[0] @ minus.R[0].T).as_rotvec() / (2 * size)
-        J_v = (plus.v[0] - minus.v[0]) / (2 * size)
-        J_p = (plus.p[0] - minus.p[0]) / (2 * size)
-        if name == 'gyro_bias':
-            expected = at.J_Rg, at.J_vg, at.J_pg
-        elif name == 'gyro_scale':
-            expected = at.J_Rs, at.J_vs, at.J_ps
-        else:
-            expected = np.zeros((1, 3, 3)), at.J_Rg, at.J_pa
-        assert np.allclose(turn, expected[0][0][:, axis], atol=1e-4)
-        assert np.allclose(J_v, expected[1][0][:, axis], atol=2e-3)
-        assert np.allclose(J_p, expected[2][0][:, axis], atol=2e-3)
+    unit = step * np.eye(3)[axis]
+    entries = step * np.eye(9).reshape(9, 3, 3)[3 * axis:3 * axis + 3]
+    for errors, column, expected in (
+            ({'gyro_bias': unit}, axis, (at.J_Rg, at.J_vg, at.J_pg)),
+            ({'accel_bias': unit}, axis, (np.zeros((1, 3, 3)), at.J_Rg, at.J_pa)),
+            *(({'gyro_matrix': entry}, 3 * axis + k, (at.J_Rm, at.J_vm, at.J_pm))
+              for k, entry in enumerate(entries))):
+        plus, minus = (integrated(epochs, **{name: sign * error for name, error in errors.items()})
+                       for sign in (1, -1))
+        turn = Rotation.from_matrix(plus.R[0] @ minus.R[0].T).as_rotvec() / (2 * step)
+        J_v = (plus.v[0] - minus.v[0]) / (2 * step)
+        J_p = (plus.p[0] - minus.p[0]) / (2 * step)
+        assert np.allclose(turn, expected[0][0][:, column], atol=1e-4)
+        assert np.allclose(J_v, expected[1][0][:, column], atol=2e-3)
+        assert np.allclose(J_p, expected[2][0][:, column], atol=2e-3)
 
 
 def test_correction_is_re_integration_to_first_order():
     gyro_bias, accel_bias = np.array([2e-3, -1e-3, 1.5e-3]), np.array([0.05, -0.02, 0.03])
-    scale = np.array([1e-3, -2e-3, 2e-3])
-    corrected = integrated([0.0, 0.2]).corrected(gyro_bias, accel_bias, scale)
-    again = integrated([0.0, 0.2], gyro_bias=gyro_bias, accel_bias=accel_bias, gyro_scale=scale)
+    matrix = 1e-3 * np.array([[1.0, 0.5, -0.5], [0.3, -2.0, 0.2], [-0.4, 0.1, 2.0]])
+    corrected = integrated([0.0, 0.2]).corrected(gyro_bias, accel_bias, matrix)
+    again = integrated([0.0, 0.2], gyro_bias=gyro_bias, accel_bias=accel_bias, gyro_matrix=matrix)
     # Second order: 1/2 (2.7e-3 * 0.2)^2 for angles.
     assert angle(corrected.R[0], again.R[0]) < 3e-7
     assert np.allclose(corrected.v[0], again.v[0], atol=3e-6)
@@ -191,8 +192,8 @@ def test_correction_is_re_integration_to_first_order():
 
 def test_correction_from_absurd_errors_back():
     """A fit that has lost its way asks for scale factors of 0.4; the way back must not depend."""
-    bias, scale = np.array([0.02, -0.01, 0.01]), np.array([0.4, -0.3, 0.2])
-    corrected = integrated([0.0, 0.1], gyro_bias=bias, gyro_scale=scale).corrected(
+    bias, scale = np.array([0.02, -0.01, 0.01]), np.diag([0.4, -0.3, 0.2])
+    corrected = integrated([0.0, 0.1], gyro_bias=bias, gyro_matrix=scale).corrected(
         -bias, ZERO, -scale)
     again = integrated([0.0, 0.1])
     # Half the square of the angle that the errors make of 0.8 rad/s in 0.1 s.
@@ -203,10 +204,11 @@ def test_correction_from_absurd_errors_back():
 def test_correction_takes_errors_for_each_interval():
     interval = integrated([0.0, 0.2, 0.4])
     gyro, accel = np.array([[1e-3, 0, 0], [0, 2e-3, 0]]), np.array([[0, 0.1, 0], [0.1, 0, 0]])
-    scale = np.array([[0, 0.01, 0], [0, 0, 0.02]])
-    both = interval.corrected(gyro, accel, scale)
+    matrix = np.zeros((2, 3, 3))
+    matrix[0, 1, 1], matrix[1, 2, 0] = 0.01, 0.02
+    both = interval.corrected(gyro, accel, matrix)
     for k in range(2):
-        one = interval.take(slice(k, k + 1)).corrected(gyro[k], accel[k], scale[k])
+        one = interval.take(slice(k, k + 1)).corrected(gyro[k], accel[k], matrix[k])
         assert np.allclose(one.v[0], both.v[k]) and np.allclose(one.R[0], both.R[k])
 
 

@@ -164,6 +164,15 @@ def test_gyro_scale_factor():
     assert 1e-3 < np.abs(fitted).max() < 0.03
 
 
+def test_gyro_misalignment():
+    plain, s = (simulate('flight', imu_grade='tactical', gyro_misalignment_std=std, duration=100.0)
+                for std in (0.0, 0.003))
+    fitted = np.linalg.lstsq(s.truth_gyro, s.gyro - plain.gyro, rcond=None)[0].T
+    np.testing.assert_allclose(np.diag(fitted), 0.0, atol=1e-12)
+    beside = np.abs(fitted[~np.eye(3, dtype=bool)])
+    assert 1e-3 < beside.max() < 0.01 and beside.min() > 1e-5
+
+
 def test_gnss_noise():
     s = simulate('static', duration=2000.0, imu_rate=1.0, velocity_std=0.2,
                  velocity_std_vertical=0.3, position_std=2.0)

@@ -18,8 +18,8 @@ from dataclasses import replace
 from alignment import LEVER
 from ins_align.rotation import exp_so3
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, FREE_LEVER_STD,
-                                GYRO_BIAS, GYRO_SCALE, inverse_spd, LEVER_ARM, Prior, prior_of,
-                                SIZE, START_POSITION, START_VELOCITY, Unknowns)
+                                GYRO_BIAS, GYRO_MATRIX, GYRO_MISALIGNMENT, inverse_spd, LEVER_ARM,
+                                Prior, prior_of, SIZE, START_POSITION, START_VELOCITY, Unknowns)
 import numpy as np
 import pytest
 
@@ -27,7 +27,7 @@ import pytest
 def some_unknowns(seed=0):
     r = np.random.default_rng(seed)
     return Unknowns(C=exp_so3(r.standard_normal(3)), gyro_bias=1e-3 * r.standard_normal(3),
-                    gyro_scale=0.01 * r.standard_normal(3),
+                    gyro_matrix=0.01 * r.standard_normal((3, 3)),
                     accel_bias=0.01 * r.standard_normal(3),
                     start_velocity=r.standard_normal(3), start_position=r.standard_normal(3),
                     lever_b=r.standard_normal(3), delay=0.03)
@@ -45,7 +45,9 @@ def test_first_prior_knows_what_it_was_told():
     information, step = prior.at(x)
     known = np.diag(information)
     assert np.allclose(known[GYRO_BIAS], 1e6) and np.allclose(known[ACCEL_BIAS], 400.0)
-    assert np.allclose(known[GYRO_SCALE], 1e4)
+    matrix = known[GYRO_MATRIX].reshape(3, 3)
+    assert np.allclose(np.diag(matrix), 1e4)
+    assert np.allclose(matrix[~np.eye(3, dtype=bool)], 1e4 / GYRO_MISALIGNMENT ** 2)
     assert np.allclose(known[LEVER_ARM], 4.0) and np.allclose(known[DELAY], 100.0)
     for nothing in (ATTITUDE, START_VELOCITY, START_POSITION):
         assert np.all(known[nothing] == 0)
@@ -53,7 +55,7 @@ def test_first_prior_knows_what_it_was_told():
     assert np.allclose(step[DELAY], 0.02 - x.delay)
     fixed = np.diag(first_prior(1e-3, 0.05, LEVER, 0.0, 0.0, 0.0).information)
     assert np.all(fixed[LEVER_ARM] == 0) and np.all(fixed[DELAY] == 0)
-    assert np.all(fixed[GYRO_SCALE] == 0)
+    assert np.all(fixed[GYRO_MATRIX] == 0)
 
 
 @pytest.mark.parametrize('turn', (0.0, 0.5, 3.0))

@@ -32,8 +32,9 @@ from ins_align.config import ImuNoise
 from ins_align.messages import ENU_FROM_NED
 from ins_align.rotation import Array, skew
 from ins_align.simulation import Simulation
-from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO, GYRO_BIAS, GYRO_SCALE, Index,
-                                LEVER_ARM, SIZE, START_POSITION, START_VELOCITY)
+from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO, GYRO_BIAS, GYRO_MATRIX,
+                                gyro_matrix_std, Index, LEVER_ARM, SIZE, START_POSITION,
+                                START_VELOCITY)
 import numpy as np
 
 # Nothing more than "somewhere on the circle" is known of an angle (rad): keeps the information
@@ -73,10 +74,10 @@ class DenseSolution:
     ----------
     C : ndarray, shape (3, 3)
         ``C_nb(t0)``.
-    unknowns : ndarray, shape (22,)
+    unknowns : ndarray, shape (28,)
         Sensor errors, start, lever arm, delay in their places, the first three zero. The start is
         that of the IMU with respect to inertial space.
-    covariance : ndarray, shape (22, 22)
+    covariance : ndarray, shape (28, 28)
         Zero where something is not estimated.
     chi2 : float
         Sum of squares of the whitened residuals and the prior's.
@@ -207,8 +208,8 @@ class _Path:
     Integrals over the motion at K epochs, in n0 axes.
 
     U and P are the first and second integral of the specific force, S that of C; Theta, shape
-    (K, 3, 6), of C and of ``C diag(omega)``: what bias and scale factor of a gyro turn; Gamma that
-    of ``[U' x] Theta``; M holds the integrals of z z^T, z = (1, U, t U - P).
+    (K, 3, 12), of C and of C times each rate: what bias and matrix of the gyros turn; Gamma
+    that of ``[U' x] Theta``; M holds the integrals of z z^T, z = (1, U, t U - P).
     """
 
     time: Array
@@ -242,7 +243,7 @@ def _path(time: Array, C: Array, omega: Array, f: Array, at: Array, C_n0n: Array
     U = _cumulative(time, force)
     P = _cumulative(time, U)
     S = _cumulative(time, C)
-    Theta = np.concatenate([S, _cumulative(time, C * omega[:, None, :])], axis=-1)
+    Theta = np.concatenate([S, _cumulative(time, _by_row(C, omega))], axis=-1)
     Gamma = _cumulative(time, skew(force) @ Theta)
     z = np.hstack([np.ones((len(time), 1)), U, time[:, None] * U - P])
     M = _cumulative(time, z[:, :, None] * z[:, None, :])
@@ -251,6 +252,11 @@ def _path(time: Array, C: Array, omega: Array, f: Array, at: Array, C_n0n: Array
                  Gamma[at], _cumulative(time, Gamma)[at], M[at], omega[at],
                  _rate_of_change(time, omega)[at], force[at] + gravity,
                  np.einsum('nij,nj->ni', C_n0n, v_n), C_n0n)
+
+
+def _by_row(matrices: Array, vectors: Array) -> Array:
+    """Derive ``matrix @ X @ vector`` by X row by row, shape (K, 3, 9)."""
+    return np.einsum('nij,nk->nijk', matrices, vectors).reshape(-1, 3, 9)
 
 
 def _rate_of_change(time: Array, omega: Array) -> Array:
@@ -305,7 +311,7 @@ def _measured_path(simulation: Simulation, C: Array, x: Array) -> _Path:
     grid, at = _grid(simulation.imu_stamps_ns, epochs_ns)
     time = (grid - grid[0]) * 1e-9
     omega = _interpolated(simulation.imu_stamps_ns, simulation.gyro, grid)
-    omega = omega * (1 - x[GYRO_SCALE]) - x[GYRO_BIAS]
+    omega = omega - omega @ x[GYRO_MATRIX].reshape(3, 3).T - x[GYRO_BIAS]
     f = _interpolated(simulation.imu_stamps_ns, simulation.accel, grid) - x[ACCEL_BIAS]
     # Angle of each step with the coning term of a rate that is linear in time.
     h = np.diff(time)[:, None]
@@ -368,7 +374,7 @@ def _lever_terms(path: _Path, lever_b: Array) -> tuple[Array, Array]:
 
 
 def _design(path: _Path, lever_b: Array) -> Array:
-    """Derive the measurements by the 19 unknowns, shape (6 K, 22)."""
+    """Derive the measurements by the unknowns, shape (6 K, 28)."""
     lever_v, lever_p = _lever_terms(path, lever_b)
     time = path.time[:, None, None]
     H = np.zeros((len(path.time), 2, 3, SIZE))
@@ -378,7 +384,7 @@ def _design(path: _Path, lever_b: Array) -> Array:
     C_lever = path.C @ skew(lever_b)
     velocity[..., GYRO] = path.Gamma + skew(lever_v) @ path.Theta
     velocity[..., GYRO_BIAS] += C_lever
-    velocity[..., GYRO_SCALE] += C_lever * path.omega[:, None, :]
+    velocity[..., GYRO_MATRIX] += _by_row(C_lever, path.omega)
     position[..., GYRO] = path.int_Gamma + skew(lever_p) @ path.Theta
     velocity[..., ACCEL_BIAS] = -path.S
     position[..., ACCEL_BIAS] = -path.int_S
@@ -485,7 +491,8 @@ def _prior(noise: ImuNoise, use_position: bool, lever_arm_std: float,
     std[ATTITUDE] = _ATTITUDE_STD
     std[START_VELOCITY] = math.inf
     std[START_POSITION] = math.inf if use_position else 0.0
-    std[GYRO_BIAS], std[GYRO_SCALE] = noise.gyro_bias_std, noise.gyro_scale_std
+    std[GYRO_BIAS] = noise.gyro_bias_std
+    std[GYRO_MATRIX] = gyro_matrix_std(noise.gyro_scale_std).ravel()
     std[ACCEL_BIAS] = noise.accel_bias_std
     std[LEVER_ARM], std[DELAY] = lever_arm_std, delay_std
     wanted = std > 0
