@@ -26,33 +26,21 @@ from typing import NamedTuple
 
 from ins_align.antenna import Antenna
 from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer, PAIR_NS
-from ins_align.calibration import CalibrationErrors, CalibrationNoise
 from ins_align.config import Config, ConfigError, parameters
 from ins_align.declaration import Declaration, State, Verdict
 from ins_align.earth import EARTH_RATE
+from ins_align.imu_steps import ImuCutter
 from ins_align.messages import Fix, Velocity
-from ins_align.methods import AntennaEpoch, ImuSteps, MapMethod, Method, NoteMethod, Nuisance
+from ins_align.methods import AntennaEpoch, MapMethod, Method, NoteMethod, Nuisance
 from ins_align.plausibility import ForceCheck, IMU_BEFORE, stuck, without_spikes
 from ins_align.prediction import Prediction
-from ins_align.preintegration import Noise, split_at_epochs, Steps, white_noise
-from ins_align.recent import recent_motion
 from ins_align.results import Attitude, Epoch, Status
-from ins_align.rotation import Array, Index
+from ins_align.rotation import Array
 from ins_align.unknowns import Prior
 import numpy as np
 
 # The IMU may be silent for this long; then the attitude is lost and alignment starts over (ns).
 MAX_GAP_NS = 500_000_000
-# A step this many times the usual one holds lost samples; what the motion can do meanwhile
-# (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
-GAP_STEPS = 2.5
-GAP_ANGULAR_ACCELERATION, GAP_JERK = 2.0, 20.0
-# Standard deviation of stamps over the median of what the steps between them deviate.
-JITTER_OF_MEDIAN = 1.4826 / math.sqrt(2)
-# Noise is measured over the interval and this long before it (ns); it counts when it is this
-# many times the stated one.
-NOISE_WINDOW_NS = 500_000_000
-NOISE_EXCESS = 1.25
 # Without GNSS an epoch without measurement is made this often, which bounds the buffer (ns).
 DRY_INTERVAL_NS = 2_000_000_000
 # Positions alone are taken when no velocity came for this long (ns).
@@ -97,7 +85,6 @@ class Aligner:
         self._events: list[str] = []
         self._delay_ns = round(self.config.gnss_delay * 1e9)
         self._lateness_ns = (round(self.config.gnss_lateness * 1e9) + max(self._delay_ns, 0))
-        self._stated_noise = np.array(self.config.imu_noise[:2])
         self._done: list[Epoch] = []
         self._silences: list[_Silence] = []
         self._start_over(None)
@@ -116,12 +103,11 @@ class Aligner:
         self._declaration = Declaration(self.config)
         self._force_check = ForceCheck()
         self._antenna = Antenna(self.config, self.counts)
-        self._calibration = CalibrationErrors(self.config.imu_noise.gyro_scale_std)
+        self._cutter = ImuCutter(self.config.imu_noise, self._imu, self.counts)
         self._verdict = _NOTHING_YET
         self._first_t0_ns: int | None = None
         self._first_fix_ns: int | None = None
         self._last_ns: int | None = None            # the last epoch put into the run
-        self._steps_ns = 0                          # up to where the IMU is integrated
         self._run: list[_Located] = []
         self._initial: Attitude | None = None
         self._current: Attitude | None = None
@@ -230,7 +216,7 @@ class Aligner:
         self._dry_epochs(upto_ns if waiting_ns is None else min(upto_ns, waiting_ns))
         self._advance()
         if self._method is None:
-            self._imu.forget_before(upto_ns - NOISE_WINDOW_NS)
+            self._cutter.forget_before(upto_ns)
             if self._verdict is _NOTHING_YET:
                 self._set_verdict(Verdict(State.WAITING_FOR_GNSS, 'no GNSS position yet'))
         done, self._done = self._done, []
@@ -298,8 +284,8 @@ class Aligner:
         cuts = np.flatnonzero(np.diff(size // MAX_RUN_SAMPLES)) + 1
         for part in np.split(np.arange(len(run)), cuts):
             epochs = [run[k].epoch for k in part]
-            imu, forces = self._imu_steps([epoch.stamp_ns for epoch in epochs],
-                                          [run[k].gravity_drift for k in part])
+            imu, forces = self._cutter.cut([epoch.stamp_ns for epoch in epochs],
+                                           [run[k].gravity_drift for k in part])
             for k, epoch in enumerate(method.advance(epochs, imu)):
                 self._force_check.add(*forces[k])
                 done = self._judge(epoch, run[part[k]].fault)
@@ -332,69 +318,13 @@ class Aligner:
         if silence := self._silence(epoch.stamp_ns, epoch.stamp_ns):
             self._set_verdict(Verdict(State.WAITING_FOR_IMU, silence.why))
             return
-        self._last_ns = self._first_t0_ns = self._steps_ns = epoch.stamp_ns
-        imu, _ = self._imu_steps([epoch.stamp_ns], [0.0])
+        self._last_ns = self._first_t0_ns = epoch.stamp_ns
+        imu = self._cutter.start(epoch.stamp_ns)
         if self.config.method == 'map':
             self._method = MapMethod(self.config, epoch, imu, bool(use_position), self._prior)
         else:
             self._method = NoteMethod(self.config, epoch, imu, epoch.v_n is None)
         self._done.append(self._judge(epoch, self._antenna.fault))
-
-    def _imu_steps(self, epochs_ns: list[int], gravity_drift: list[float],
-                   ) -> tuple[ImuSteps, list[tuple[float, int]]]:
-        """IMU steps up to each epoch since the one before; sum and number of forces in them."""
-        stamps, start_ns = self._imu.stamps, self._steps_ns
-        ends_ns = np.array([start_ns, *epochs_ns])
-        ends = np.searchsorted(stamps, ends_ns, side='left') + 2
-        windows = np.searchsorted(stamps, ends_ns[:-1] - NOISE_WINDOW_NS)
-        stamps = stamps[:ends[-1] + 1]
-        samples, spikes = without_spikes(stamps, self._imu.samples[:stamps.size])
-        self.counts['imu_spike'] += int(np.count_nonzero(spikes[ends[0] - 2:ends[-1] - 2]))
-        stamps, samples = stamps[:ends[-1]], samples[:ends[-1]]
-        steps = split_at_epochs(stamps, samples[:, :3], samples[:, 3:], ends_ns, unit=1e-9)
-        recent = recent_motion(stamps, samples[:, :3], samples[:, 3:], ends_ns[1:], unit=1e-9)
-        noise = self._noise(stamps, samples, windows, ends[1:], steps,
-                            np.array(gravity_drift)[:, None],
-                            self._calibration.noise(np.diff(ends_ns) * 1e-9, recent))
-        magnitudes = np.sqrt(np.sum(np.square(samples[:, 3:]), axis=1))
-        sums = np.diff(np.concatenate([[0.0], np.cumsum(magnitudes)])[ends - 2])
-        forces = list(zip(sums.tolist(), np.diff(ends).tolist()))
-        self._steps_ns = epochs_ns[-1]
-        self._imu.forget_before(self._steps_ns - NOISE_WINDOW_NS)
-        self._imu.used_ns = self._steps_ns
-        return ImuSteps(steps, noise, recent), forces
-
-    def _noise(self, stamps: Index, samples: Array, first: Index, last: Index,
-               steps: Steps, gravity_drift: Array, calibration: CalibrationNoise) -> Noise:
-        """
-        White noise of each step: stated, measured, of gravity, of calibration and of stamps.
-
-        The last is what the motion can do in a gap and what it does to a sample whose stamp
-        jitters: its change per second times the jitter.
-        """
-        stated = self._stated_noise
-        measured = white_noise(stamps, samples, first, last, unit=1e-9)
-        excess = np.where(measured > NOISE_EXCESS * stated,
-                          np.sqrt(np.maximum(measured ** 2 - stated ** 2, 0.0)), 0.0)
-        between = np.diff(stamps) * 1e-9
-        usual = np.array([_median(between[i:j - 1]) for i, j in zip(first, last)])[:, None]
-        jitter = np.array([_median(np.abs(between[i:j - 1] - median)) for i, j, median
-                           in zip(first, last, usual)])[:, None] * JITTER_OF_MEDIAN
-        gap = np.where(steps.dt > GAP_STEPS * usual, steps.dt, 0.0)
-        self.counts['imu_gap'] += int(np.count_nonzero(gap))
-        # An error of acceleration * dt^2 over the step, as a density: squared, over dt.
-        density = gap ** 1.5
-        jittered = jitter * np.sqrt(steps.dt)
-
-        def with_stamps(other: Array, in_gap: float, slope: Array) -> Array:
-            rms = np.sqrt(np.mean(np.square(slope[:, 1:]), axis=2))
-            return np.hypot(other, np.hypot(in_gap * density, jittered * rms))
-
-        return Noise(with_stamps(np.hypot(stated[0], calibration.gyro), GAP_ANGULAR_ACCELERATION,
-                                 steps.omega_dot),
-                     with_stamps(np.hypot(np.hypot(stated[1], gravity_drift), calibration.accel),
-                                 GAP_JERK, steps.f_dot),
-                     excess[:, :1], excess[:, 1:])
 
     def _lose(self, why: str) -> None:
         """Start the alignment over; biases are kept."""
@@ -505,9 +435,3 @@ class Aligner:
             counts['epochs_used'] = (fit.offered - fit.rejected_velocity - fit.rejected_position)
             counts['rebases'] = self._method.moved
         return counts
-
-
-def _median(values: Array) -> float:
-    """Upper median."""
-    half = values.size // 2
-    return float(np.partition(values, half)[half])

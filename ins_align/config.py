@@ -132,7 +132,8 @@ class Config:
     gyro_scale_std: float = _parameter(
         0.0, 'scale factor error of the gyroscopes, 1 sigma per axis, 0.01 is one percent; 0: the '
         "preset's; where that is above 0 it is estimated, as is misalignment (3 tenths of it); "
-        'errors of the accelerometers and g-sensitivity count as noise', '1', minimum=0.0, maximum=0.5)
+        'errors of the accelerometers and g-sensitivity count as noise', '1',
+        minimum=0.0, maximum=0.5)
     velocity_std: float = _parameter(
         0.3, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none', 'm/s',
         minimum=1e-4, maximum=100.0)

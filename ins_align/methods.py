@@ -27,8 +27,8 @@ from ins_align.config import Config
 from ins_align.estimator import FIRST_EXCESS, Innovation, MapEstimator, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
 from ins_align.handover import prior_from_now
-from ins_align.preintegration import Noise, preintegrate, Steps
-from ins_align.recent import Recent
+from ins_align.imu_steps import ImuSteps
+from ins_align.preintegration import Noise, preintegrate
 from ins_align.rotation import Array, orthonormalized
 from ins_align.signs import LeverArmCheck, SignCheck, TOLD_STD
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
@@ -72,20 +72,6 @@ class AntennaEpoch:
     velocity_covariance: Array
     position_measured: bool
     position_covariance: Array
-
-
-@dataclass(frozen=True)
-class ImuSteps:
-    """IMU steps before each of K epochs, the white noise in them and the motion at their ends."""
-
-    steps: Steps
-    noise: Noise
-    recent: Recent | None = None
-
-    def take(self, index: slice) -> 'ImuSteps':
-        """Return those of some epochs."""
-        return ImuSteps(self.steps.take(index), self.noise.take(index),
-                        None if self.recent is None else self.recent.take(index))
 
 
 @dataclass(frozen=True)
@@ -282,7 +268,7 @@ class MapMethod:
     def _move_start(self) -> None:
         """Move t0 to the last epoch; what was learnt becomes the prior."""
         self._estimator.settle(last=True)
-        track, steps = self._track, self._last_imu.steps
+        track = self._track
         fit = self.fit()
         prior = prior_from_now(self._estimator, track.C_n0n, -track.still_v, -track.s_p,
                                fit.significant_scale, self._wander * track.time)
@@ -293,10 +279,8 @@ class MapMethod:
         self.moved += 1
         start = replace(self._last_epoch, v_n=None, position_measured=False)
         self._start(start, prior, self._estimator.excess)
-        instant = Steps(np.zeros((1, 1)), *(np.repeat(array[:, -1:], 2, axis=1) for array in (
-            steps.omega, steps.f, steps.omega_dot, steps.f_dot)))
-        innovation, none = self._innovation, np.zeros((1, 1))
-        self._take_start(start, ImuSteps(instant, Noise(none, none, none, none)))
+        innovation = self._innovation
+        self._take_start(start, self._last_imu.end())
         self._innovation = innovation
 
     def initial(self) -> tuple[Array, Array] | None:

@@ -1,0 +1,182 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+IMU samples that have arrived → steps between GNSS epochs, with the white noise that they have.
+
+Noise is what is stated, what is measured, and what makes the samples miss the motion: gaps, stamps
+that jitter, an incomplete calibration, gravity at a place that is not known.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import reduce
+import math
+
+from ins_align.buffers import ImuBuffer
+from ins_align.calibration import CalibrationErrors
+from ins_align.config import ImuNoise
+from ins_align.plausibility import without_spikes
+from ins_align.preintegration import Noise, split_at_epochs, Steps, white_noise
+from ins_align.recent import Recent, recent_motion
+from ins_align.rotation import Array, Index
+import numpy as np
+
+# A step this many times the usual one holds lost samples; what the motion can do meanwhile
+# (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
+GAP_STEPS = 2.5
+GAP_ANGULAR_ACCELERATION, GAP_JERK = 2.0, 20.0
+# Standard deviation of stamps over the median of what the steps between them deviate.
+JITTER_OF_MEDIAN = 1.4826 / math.sqrt(2)
+# Noise is measured over the interval and this long before it (ns); it counts when it is this
+# many times the stated one.
+NOISE_WINDOW_NS = 500_000_000
+NOISE_EXCESS = 1.25
+
+
+@dataclass(frozen=True)
+class ImuSteps:
+    """IMU steps before each of K epochs, the white noise in them and the motion at their ends."""
+
+    steps: Steps
+    noise: Noise
+    recent: Recent | None = None
+
+    def take(self, index: slice) -> 'ImuSteps':
+        """Return those of some epochs."""
+        return ImuSteps(self.steps.take(index), self.noise.take(index),
+                        None if self.recent is None else self.recent.take(index))
+
+    def end(self) -> 'ImuSteps':
+        """Return the end of a single epoch's steps, of no length and without noise."""
+        steps, none = self.steps, np.zeros((1, 1))
+        instant = (np.repeat(array[:, -1:], 2, axis=1)
+                   for array in (steps.omega, steps.f, steps.omega_dot, steps.f_dot))
+        return ImuSteps(Steps(none, *instant), Noise(none, none, none, none))
+
+
+class ImuCutter:
+    """
+    Cuts what is buffered of the IMU at epochs, one run of them after the other.
+
+    Parameters
+    ----------
+    stated : ImuNoise
+    buffer : ImuBuffer
+        What is not needed any more is forgotten there.
+    counts : Counter
+        Where ``imu_spike`` and ``imu_gap`` are counted.
+
+    """
+
+    def __init__(self, stated: ImuNoise, buffer: ImuBuffer, counts: Counter[str]) -> None:
+        """Wait for the first epoch."""
+        self._stated = np.array(stated[:2])
+        self._buffer = buffer
+        self._counts = counts
+        self._calibration = CalibrationErrors(stated.gyro_scale_std)
+        self._upto_ns = 0
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Keep what an epoch at or after a stamp wants to look back at."""
+        self._buffer.forget_before(stamp_ns - NOISE_WINDOW_NS)
+
+    def start(self, stamp_ns: int) -> ImuSteps:
+        """Return the steps of no length at the first epoch."""
+        self._upto_ns = stamp_ns
+        return self.cut([stamp_ns], [0.0])[0]
+
+    def cut(self, epochs_ns: list[int],
+            gravity_drift: list[float]) -> tuple[ImuSteps, list[tuple[float, int]]]:
+        """
+        Return the steps up to each epoch since the one before.
+
+        Parameters
+        ----------
+        epochs_ns : list of int
+            Increasing.
+        gravity_drift : list of float
+            Noise of gravity for want of a place, m/s/sqrt(s), before each.
+
+        Returns
+        -------
+        ImuSteps
+        list of (float, int)
+            Sum and number of the magnitudes of the specific force before each epoch.
+
+        """
+        stamps = self._buffer.stamps
+        ends_ns = np.array([self._upto_ns, *epochs_ns])
+        ends = np.searchsorted(stamps, ends_ns, side='left') + 2
+        first = np.searchsorted(stamps, ends_ns[:-1] - NOISE_WINDOW_NS)
+        stamps = stamps[:ends[-1] + 1]
+        samples, spikes = without_spikes(stamps, self._buffer.samples[:stamps.size])
+        self._counts['imu_spike'] += int(np.count_nonzero(spikes[ends[0] - 2:ends[-1] - 2]))
+        stamps, samples = stamps[:ends[-1]], samples[:ends[-1]]
+        gyro, accel = samples[:, :3], samples[:, 3:]
+        steps = split_at_epochs(stamps, gyro, accel, ends_ns, unit=1e-9)
+        recent = recent_motion(stamps, gyro, accel, ends_ns[1:], unit=1e-9)
+        excess = self._excess(stamps, samples, first, ends[1:])
+        gap, jitter = self._of_stamps(stamps, first, ends[1:], steps.dt)
+        calibration = self._calibration.noise(np.diff(ends_ns) * 1e-9, recent)
+        noise = Noise(
+            _together(self._stated[0], calibration.gyro, GAP_ANGULAR_ACCELERATION * gap,
+                      jitter * _rms(steps.omega_dot)),
+            _together(self._stated[1], calibration.accel, GAP_JERK * gap,
+                      jitter * _rms(steps.f_dot), np.array(gravity_drift)[:, None]),
+            excess[:, :1], excess[:, 1:])
+        magnitudes = np.sqrt(np.sum(np.square(accel), axis=1))
+        sums = np.diff(np.concatenate([[0.0], np.cumsum(magnitudes)])[ends - 2])
+        forces = list(zip(sums.tolist(), np.diff(ends).tolist()))
+        self._upto_ns = self._buffer.used_ns = epochs_ns[-1]
+        self.forget_before(self._upto_ns)
+        return ImuSteps(steps, noise, recent), forces
+
+    def _excess(self, stamps: Index, samples: Array, first: Index, last: Index) -> Array:
+        """Densities measured beyond the stated ones in K windows, shape (K, 2)."""
+        measured = white_noise(stamps, samples, first, last, unit=1e-9)
+        beyond = np.sqrt(np.maximum(measured ** 2 - self._stated ** 2, 0.0))
+        return np.where(measured > NOISE_EXCESS * self._stated, beyond, 0.0)
+
+    def _of_stamps(self, stamps: Index, first: Index, last: Index,
+                   dt: Array) -> tuple[Array, Array]:
+        """
+        Return what becomes of steps, shape (K, n), with lost samples and with jittering stamps.
+
+        The first is to be multiplied with what the motion can do in a gap, the second with what
+        it does to a sample whose stamp jitters: its change per second. Densities then.
+        """
+        between = np.diff(stamps) * 1e-9
+        usual = np.array([_median(between[i:j - 1]) for i, j in zip(first, last)])[:, None]
+        jitter = np.array([_median(np.abs(between[i:j - 1] - median))
+                           for i, j, median in zip(first, last, usual)])[:, None]
+        gap = np.where(dt > GAP_STEPS * usual, dt, 0.0)
+        self._counts['imu_gap'] += int(np.count_nonzero(gap))
+        # An error of acceleration * dt^2 over the step, as a density: squared, over dt.
+        return gap ** 1.5, JITTER_OF_MEDIAN * jitter * np.sqrt(dt)
+
+
+def _together(*densities: 'Array | float') -> Array:
+    """Density of noises that are independent of each other."""
+    return reduce(np.hypot, densities)
+
+
+def _rms(slope: Array) -> Array:
+    """Of the three axes at the end of each step, shape (K, n)."""
+    return np.sqrt(np.mean(np.square(slope[:, 1:]), axis=2))
+
+
+def _median(values: Array) -> float:
+    """Upper median."""
+    half = values.size // 2
+    return float(np.partition(values, half)[half])
