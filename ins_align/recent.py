@@ -106,17 +106,8 @@ def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'A
     # Nothing is known of a silence and what was before it.
     heard = np.logical_and.accumulate((end - begin < AGES[-1])[:, ::-1], axis=1)[:, ::-1]
     dt = np.where(inside & heard, np.minimum(end, 0.0) - begin, 0.0)[..., None]
-    rate, force = (0.5 * (samples[step] + samples[step + 1]) for samples in (gyro, accel))
-    turn = dt * rate
-    turned = np.cumsum(turn, axis=1)
-    # Rotation vector from the middle of a step to the epoch; rates that change their axis make it
-    # differ from their integral [Bortz1971]_.
-    to_come = turned[:, -1:] - turned + 0.5 * turn
-    rate = rate - 0.5 * cross(to_come, rate)
-    turn = dt * rate
-    turned = np.cumsum(turn, axis=1)
-    force = (exp_so3(turned - 0.5 * turn - turned[:, -1:]) @ force[..., None])[..., 0]
-    both = np.concatenate([force, rate], axis=-1)
+    both = _seen_from_epoch(dt, *(0.5 * (samples[step] + samples[step + 1])
+                                  for samples in (gyro, accel)))
     sums = np.cumsum(dt * both, axis=1)
     # Up to a rung: the steps before its own, and of that what lies before.
     own = np.clip(rungs - first[:, None], 0, step.shape[1] - 1)
@@ -129,6 +120,35 @@ def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'A
     missing = (AGES - span)[..., None]
     integrals = sums[:, -1:] + np.where(missing > 1e-6, missing * mean, -before)
     return Recent(integrals[..., :3], integrals[..., 3:])
+
+
+def _seen_from_epoch(dt: Array, rate: Array, force: Array) -> Array:
+    """
+    Return forces in the axes of the body at the epoch, and what changes the rotation up to it.
+
+    Parameters
+    ----------
+    dt : ndarray, shape (K, n, 1)
+        Seconds of the steps before each epoch.
+    rate, force : ndarray, shape (K, n, 3)
+        In the body frame of the step.
+
+    Returns
+    -------
+    ndarray, shape (K, n, 6)
+        Force, then rate.
+
+    """
+    turn = dt * rate
+    turned = np.cumsum(turn, axis=1)
+    # Rotation vector from the middle of a step to the epoch; rates that change their axis make it
+    # differ from their integral [Bortz1971]_.
+    to_come = turned[:, -1:] - turned + 0.5 * turn
+    rate = rate - 0.5 * cross(to_come, rate)
+    turn = dt * rate
+    turned = np.cumsum(turn, axis=1)
+    force = (exp_so3(turned - 0.5 * turn - turned[:, -1:]) @ force[..., None])[..., 0]
+    return np.concatenate([force, rate], axis=-1)
 
 
 def exact(integrals: Array, age: float) -> tuple[Array, Array, Array]:
