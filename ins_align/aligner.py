@@ -92,6 +92,7 @@ class Aligner:
     def _start_over(self, prior: Prior | None) -> None:
         """Forget everything but the counts and the prior."""
         self._imu = ImuBuffer(self._lateness_ns, self.counts)
+        self._cutter = ImuCutter(self.config.imu_noise, self._imu, self.counts)
         self._gnss = GnssBuffer(self._lateness_ns, self.counts,
                                 0 if self.config.use_velocity is False else PAIR_NS)
         self._forget_alignment(prior)
@@ -103,7 +104,6 @@ class Aligner:
         self._declaration = Declaration(self.config)
         self._force_check = ForceCheck()
         self._antenna = Antenna(self.config, self.counts)
-        self._cutter = ImuCutter(self.config.imu_noise, self._imu, self.counts)
         self._verdict = _NOTHING_YET
         self._first_t0_ns: int | None = None
         self._first_fix_ns: int | None = None
@@ -208,7 +208,7 @@ class Aligner:
         # Interpolation at an epoch wants two samples after it, and whether they are spikes shows
         # in the next one.
         upto_ns = min(upto_ns, int(stamps[-3]))
-        self._silences = self._find_silences()
+        self._silences = self._find_silences(upto_ns)
         for message in self._gnss.release(upto_ns, last):
             self._dry_epochs(message.stamp_ns)
             self._line_up(message)
@@ -251,7 +251,7 @@ class Aligner:
                                       self._antenna.gravity_drift(epoch.stamp_ns), dry))
             self._last_ns = epoch.stamp_ns
 
-    def _find_silences(self) -> list[_Silence]:
+    def _find_silences(self, upto_ns: int) -> list[_Silence]:
         """When the IMU says nothing, in what is buffered."""
         stamps = self._imu.stamps
         last = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
@@ -263,6 +263,9 @@ class Aligner:
         silences += [_Silence(max(start, known - self._lateness_ns), end, 'imu_stuck',
                               'the IMU sends the same values again and again')
                      for start, end, known in stuck(stamps, self._imu.samples)]
+        silences += [_Silence(blind - 1, blind, 'imu_blind', 'the gyros are at the end of their '
+                              'range: let the driver set a larger one')
+                     for blind in self._cutter.look(upto_ns)]
         return silences
 
     def _silence(self, start_ns: int, end_ns: int) -> '_Silence | None':

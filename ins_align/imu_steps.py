@@ -15,7 +15,8 @@
 IMU samples that have arrived → steps between GNSS epochs, with the white noise that they have.
 
 Noise is what is stated, what is measured, and what makes the samples miss the motion: gaps, stamps
-that jitter, an incomplete calibration, gravity at a place that is not known.
+that jitter, the end of the sensors' range, an incomplete calibration, gravity at a place that is
+not known.
 """
 
 from collections import Counter
@@ -26,7 +27,7 @@ import math
 from ins_align.buffers import ImuBuffer
 from ins_align.calibration import CalibrationErrors
 from ins_align.config import ImuNoise
-from ins_align.plausibility import without_spikes
+from ins_align.plausibility import IMU_BEFORE, RangeCheck, without_spikes
 from ins_align.preintegration import Noise, split_at_epochs, Steps, white_noise
 from ins_align.recent import Recent, recent_motion
 from ins_align.rotation import Array, Index
@@ -75,24 +76,41 @@ class ImuCutter:
     buffer : ImuBuffer
         What is not needed any more is forgotten there.
     counts : Counter
-        Where ``imu_spike`` and ``imu_gap`` are counted.
+        Where ``imu_spike``, ``imu_gap`` and ``imu_saturated`` are counted.
 
     """
 
     def __init__(self, stated: ImuNoise, buffer: ImuBuffer, counts: Counter[str]) -> None:
-        """Wait for the first epoch."""
+        """Wait for `start`."""
         self._stated = np.array(stated[:2])
         self._buffer = buffer
         self._counts = counts
-        self._calibration = CalibrationErrors(stated.gyro_scale_std)
-        self._upto_ns = 0
+        self._scale_std = stated.gyro_scale_std
+        self._range = RangeCheck()
+        self._upto_ns = 0                   # up to where the IMU is cut
+        self._seen_ns = 0                   # and looked at
 
     def forget_before(self, stamp_ns: int) -> None:
         """Keep what an epoch at or after a stamp wants to look back at."""
         self._buffer.forget_before(stamp_ns - NOISE_WINDOW_NS)
+        self._range.forget_before(stamp_ns)
+
+    def look(self, upto_ns: int) -> list[int]:
+        """Look at the samples up to a stamp; return when the gyros have missed too much."""
+        stamps = self._buffer.stamps
+        first, last = np.searchsorted(stamps, [self._seen_ns, upto_ns], side='right').tolist()
+        context = max(first - IMU_BEFORE, 0)
+        around = slice(context, last + 1)
+        samples, _ = without_spikes(stamps[around], self._buffer.samples[around])
+        before = self._range.stamps.size
+        self._range.add(stamps[first:last], samples[first - context:last - context])
+        self._counts['imu_saturated'] += self._range.stamps.size - before
+        self._seen_ns = max(self._seen_ns, upto_ns)
+        return self._range.blind
 
     def start(self, stamp_ns: int) -> ImuSteps:
-        """Return the steps of no length at the first epoch."""
+        """Return the steps of no length at the first epoch of an alignment."""
+        self._calibration = CalibrationErrors(self._scale_std)
         self._upto_ns = stamp_ns
         return self.cut([stamp_ns], [0.0])[0]
 
@@ -128,12 +146,13 @@ class ImuCutter:
         recent = recent_motion(stamps, gyro, accel, ends_ns[1:], unit=1e-9)
         excess = self._excess(stamps, samples, first, ends[1:])
         gap, jitter = self._of_stamps(stamps, first, ends[1:], steps.dt)
+        beyond = self._beyond_range(stamps, ends_ns, steps.dt)
         calibration = self._calibration.noise(np.diff(ends_ns) * 1e-9, recent)
         noise = Noise(
             _together(self._stated[0], calibration.gyro, GAP_ANGULAR_ACCELERATION * gap,
-                      jitter * _rms(steps.omega_dot)),
+                      jitter * _rms(steps.omega_dot), beyond[0]),
             _together(self._stated[1], calibration.accel, GAP_JERK * gap,
-                      jitter * _rms(steps.f_dot), np.array(gravity_drift)[:, None]),
+                      jitter * _rms(steps.f_dot), beyond[1], np.array(gravity_drift)[:, None]),
             excess[:, :1], excess[:, 1:])
         magnitudes = np.sqrt(np.sum(np.square(accel), axis=1))
         sums = np.diff(np.concatenate([[0.0], np.cumsum(magnitudes)])[ends - 2])
@@ -164,6 +183,19 @@ class ImuCutter:
         self._counts['imu_gap'] += int(np.count_nonzero(gap))
         # An error of acceleration * dt^2 over the step, as a density: squared, over dt.
         return gap ** 1.5, JITTER_OF_MEDIAN * jitter * np.sqrt(dt)
+
+    def _beyond_range(self, stamps: Index, ends_ns: Index, dt: Array) -> Array:
+        """Return densities for what gyros and accelerometers missed, shape (2, K, n)."""
+        beyond = np.zeros((2,) + dt.shape)
+        inside = slice(*np.searchsorted(self._range.stamps, ends_ns[[0, -1]]))
+        saturated = self._range.stamps[inside]
+        if saturated.size:
+            interval = np.searchsorted(ends_ns, saturated, side='right') - 1
+            # An interval's first step begins at its start, at a sample or between two.
+            first = np.searchsorted(stamps, ends_ns[:-1], side='right') - 1
+            step = np.searchsorted(stamps, saturated) - first[interval]
+            beyond[:, interval, step] = self._range.densities[inside].T
+        return beyond
 
 
 def _together(*densities: 'Array | float') -> Array:

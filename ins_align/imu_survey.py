@@ -22,7 +22,7 @@ from ins_align.config import PRESETS
 from ins_align.decoding import ImuSamples
 from ins_align.earth import EARTH_RATE
 from ins_align.motion_survey import GRID, Series
-from ins_align.plausibility import FORCE_RANGE
+from ins_align.plausibility import FORCE_RANGE, RangeCheck
 from ins_align.rotation import Array
 import numpy as np
 
@@ -55,6 +55,7 @@ class ImuFacts:
     rest_force_error: float | None  # magnitude there less gravity, m/s^2
     turn_ratio: float | None  # rate about the vertical over that of the course
     faults: tuple[str, ...]
+    too_small: tuple[str, ...]  # sensors at the end of their range, in words
     grade: str  # preset whose figures cover these
     grade_is_sure: bool  # noise and biases have been seen at rest
 
@@ -118,7 +119,20 @@ def survey_imu(samples: ImuSamples, times: Array, velocities: Series | None,
         mean_force, tuple(up.tolist()), math.degrees(max_rate), walk, force_walk,
         len(rest) * GRID if rest else 0.0,
         None if rest_rate is None else tuple(np.degrees(rest_rate).tolist()), rest_force, ratio,
-        tuple(faults), grade, rest_rate is not None)
+        tuple(faults), _at_end_of_range(samples), grade, rest_rate is not None)
+
+
+def _at_end_of_range(samples: ImuSamples) -> tuple[str, ...]:
+    """Say which sensors were at the end of their range, and where that is."""
+    check = RangeCheck()
+    check.add(samples.stamps_ns, np.hstack([samples.gyro, samples.accel]))
+    gyro, accel = np.count_nonzero(check.densities, axis=0)
+    return tuple(
+        f'{name} at the end of their range, {np.abs(values).max():.4g} {unit}, in {count} '
+        'samples: let the driver set a larger one'
+        for name, values, unit, count in (('gyroscopes', samples.gyro, 'rad/s', gyro),
+                                          ('accelerometers', samples.accel, 'm/s^2', accel))
+        if count)
 
 
 def _random_walk(values: Array, interval: float, quiet: float) -> float:

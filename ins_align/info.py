@@ -245,6 +245,7 @@ class _Survey:
         if imu is None or imu.imu is None:
             return
         facts, timing = imu.imu, imu.timing
+        self._notes.extend(facts.too_small)
         if timing.longest_gap is not None and timing.longest_gap.duration_s > RESTART_GAP:
             self._notes.append(
                 f'the IMU is silent for {timing.longest_gap.duration_s:.1f} s at '

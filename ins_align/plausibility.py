@@ -39,6 +39,14 @@ SPIKE_RATIO = 12.0
 SPIKE_BEFORE, SPIKE_RANK = 12, 7
 # An IMU that has sent the same six values this often and for this long (ns) measures nothing.
 STUCK_SAMPLES, STUCK_NS = 8, 250_000_000
+# A value that is the largest of its axis, and not of an IMU at rest (rad/s, m/s^2), is
+# the end of the range once it has come so often while so many other values change; the motion may
+# go beyond it by this share.
+END_RATE, END_FORCE = 0.5, 15.0
+END_TIMES, END_CHANGING = 5, 3
+BEYOND_END = 0.5
+# An attitude is lost when the gyros may have missed this angle (rad).
+BLIND_ANGLE = 0.35
 # Samples that both checks want to see before those that they judge.
 IMU_BEFORE = SPIKE_BEFORE + 2
 
@@ -112,6 +120,92 @@ def stuck(stamps: Index, samples: Array) -> list[tuple[int, int, int]]:
     long = (last - first >= STUCK_SAMPLES) & (stamps[last] - stamps[first] >= STUCK_NS)
     return [(start, int(stamps[j]), max(start + STUCK_NS, int(stamps[i + STUCK_SAMPLES])))
             for i, j in zip(first[long], last[long]) for start in [int(stamps[i])]]
+
+
+class RangeCheck:
+    """
+    Notices that an IMU is at the end of its range: the same extreme comes again and again.
+
+    Attributes
+    ----------
+    stamps : ndarray of int, shape (M,)
+        Samples at the end of the range, ns.
+    densities : ndarray, shape (M, 2)
+        What the motion may have been beyond it from each to the next, as noise of gyros and
+        accelerometers, rad/sqrt(s) and m/s/sqrt(s).
+    blind : list of int
+        Stamps at which the gyros may have missed another `BLIND_ANGLE` since they were within
+        their range.
+
+    """
+
+    def __init__(self) -> None:
+        """Start with no samples."""
+        # Of each value and its negative.
+        self._ends = np.repeat([END_RATE, END_FORCE], 3)[None].repeat(2, axis=0)
+        self._times = np.zeros((2, 6), int)
+        self._last = np.zeros(6)
+        # The last sample within the range, of gyros and accelerometers, ns.
+        self._within_ns = np.zeros(2, np.int64)
+        self._angles = 0.0                  # so many times the blind angle
+        self.stamps, self.densities = np.zeros(0, np.int64), np.zeros((0, 2))
+        self.blind: list[int] = []
+
+    def add(self, stamps: Index, samples: Array) -> None:
+        """
+        Take samples that follow those before.
+
+        Parameters
+        ----------
+        stamps : ndarray of int, shape (N,)
+            Increasing, ns.
+        samples : ndarray, shape (N, 6)
+            Angular rate, rad/s, and specific force, m/s^2.
+
+        """
+        if not stamps.size:
+            return
+        at_end = self._at_end(samples).reshape(-1, 2, 3)
+        self._last = samples[-1]
+        beyond = np.any(at_end, axis=2)
+        within = np.maximum.accumulate(np.where(beyond, self._within_ns, stamps[:, None]))
+        self._within_ns = within[-1]
+        k = np.flatnonzero(np.any(beyond, axis=1))
+        if not k.size:
+            return
+        missed = BEYOND_END * np.max(np.abs(samples[k].reshape(-1, 2, 3)) * at_end[k], axis=2)
+        seconds = (stamps[k, None] - within[k]) * 1e-9
+        self.stamps = np.concatenate([self.stamps, stamps[k]])
+        # The error lasts: the angle or velocity grows with the time, not with its root.
+        self.densities = np.concatenate([self.densities, missed * np.sqrt(2 * seconds)])
+        angles = np.concatenate([[self._angles], missed[:, 0] * seconds[:, 0] // BLIND_ANGLE])
+        self.blind += stamps[k[angles[1:] > angles[:-1]]].tolist()
+        self._angles = angles[-1]
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop what was found before a stamp."""
+        if self.stamps.size:
+            kept = self.stamps >= stamp_ns
+            self.stamps, self.densities = self.stamps[kept], self.densities[kept]
+            self.blind = [blind_ns for blind_ns in self.blind if blind_ns >= stamp_ns]
+
+    def _at_end(self, samples: Array) -> np.ndarray:
+        """Which values are at the end of the range, shape (N, 6)."""
+        at_end = np.zeros(samples.shape, bool)
+        signed = np.stack([samples, -samples])
+        reached = np.argwhere(signed.max(axis=1) >= self._ends)
+        if reached.size:
+            changed = np.diff(np.vstack([self._last, samples]), axis=0) != 0.0
+            changing = np.count_nonzero(changed, axis=1)
+        for sign, axis in reached.tolist():
+            values = signed[sign, :, axis]
+            so_far = np.maximum(np.maximum.accumulate(values), self._ends[sign, axis])
+            for k in np.flatnonzero(values == so_far).tolist():
+                if values[k] > self._ends[sign, axis]:
+                    self._ends[sign, axis], self._times[sign, axis] = values[k], 0
+                self._times[sign, axis] += changing[k] - changed[k, axis] >= END_CHANGING
+                at_end[k, axis] |= self._times[sign, axis] >= END_TIMES
+        return at_end
 
 
 class ForceCheck:

@@ -21,6 +21,7 @@ from ins_align.config import Config, ConfigError
 from ins_align.declaration import State
 from ins_align.experiments.declare import largest, run_trial, trial
 from ins_align.rotation import matrix_from_quaternion, roll_pitch_yaw
+from ins_align.scenarios import Motion, Scenario, SCENARIOS
 from ins_align.simulation import feed
 import numpy as np
 import pytest
@@ -295,8 +296,9 @@ def test_while_the_imu_is_stuck_that_is_the_reason(flight):
 
 
 @pytest.mark.parametrize('lateness', (0.0, 0.1, 1.0))
-def test_when_somebody_looks_does_not_matter_to_a_stuck_or_spiky_imu(flight, lateness):
+def test_when_somebody_looks_does_not_matter_to_a_stuck_spiky_or_small_imu(flight, lateness):
     s = stick(flight, 10.0, 10.8)
+    s.gyro[2000:2080, 1] = 1.5
     random = np.random.default_rng(2)
     s.gyro[np.r_[100:900:80, 1200:2900:150]] += 3.0
     told = []
@@ -315,7 +317,39 @@ def test_when_somebody_looks_does_not_matter_to_a_stuck_or_spiky_imu(flight, lat
                       else e.current.quaternion_xyzw.tolist()) for e in epochs])
         assert aligner.status().counts['imu_spike'] == 22
         assert aligner.status().counts['imu_stuck'] == 1
+        assert aligner.status().counts['imu_saturated'] == 76
+        assert aligner.status().counts['imu_blind'] == 1
     assert told[0] == told[1] == told[2] and len(told[0]) > 100
+
+
+@pytest.mark.parametrize('scenario, share', [('launch', 0.65), ('whirl', 0.8), ('whirl', 0.4)])
+def test_gyros_with_too_small_a_range_do_not_lead_astray(scenario, share, monkeypatch):
+    monkeypatch.setitem(SCENARIOS, 'whirl', Scenario(whirling, 60.0, 2.0))
+    aligned = 0
+    for seed in range(2):
+        s = simulated(scenario, imu_grade='mems', imu_rate=200.0, seed=seed)
+        end = share * np.abs(s.gyro).max()
+        s = replace(s, gyro=np.clip(s.gyro, -end, end))
+        aligner = Aligner(Config(lever_arm=tuple(s.lever_arm)))
+        epochs = [epoch for epoch in feed(aligner, s) if epoch.state is State.ALIGNED]
+        aligned += len(epochs)
+        # 20 to 30 sigma in each where nothing is known of ranges.
+        assert max((normalised_error(epoch.current, s) for epoch in epochs),
+                   default=0.0) < chi2.ppf(1 - 1e-6, 3)
+        assert aligner.status().counts['imu_saturated'] > 50
+    assert aligned > 0
+
+
+def whirling(duration):
+    """Drive in circles and spin around within 2 s now and then."""
+    def motion(time):
+        course = 0.3 * time
+        speed = 8.0 + 2.0 * np.sin(0.3 * time)
+        spin = sum(7.5 / (1 + np.exp(-(time - start) / 0.3)) for start in (20.0, 40.0))
+        velocity = np.stack([speed * np.cos(course), speed * np.sin(course), 0.0 * time], axis=-1)
+        swing = 0.1 * np.sin(1.9 * time)
+        return Motion(velocity, np.stack([swing, 0.8 * swing, course + spin], axis=-1))
+    return motion
 
 
 def test_gnss_clock_that_is_off_is_named_and_not_declared():

@@ -211,6 +211,17 @@ def test_units_and_signs_of_the_imu(changed, factors, word):
     assert word in info.obstacles[0]
 
 
+def test_range_that_is_too_small(changed):
+    def change(name, time, message):
+        if name == '/imu/data_raw':
+            message.linear_acceleration.z = min(1.6 * message.linear_acceleration.z, 15.5)
+        return [(name, time, message)]
+
+    info = inspect(changed(change))
+    said, = by_name(info, '/imu/data_raw').imu.too_small
+    assert 'accelerometers' in said and ', 15.5 m/s^2' in said and said in info.notes
+
+
 def test_late_messages(changed):
     info = inspect(changed(lambda name, time, message: [
         (name, time + (2_000_000_000 if name != '/imu/data_raw' else 0), message)]))

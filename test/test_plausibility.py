@@ -13,7 +13,8 @@
 # limitations under the License.
 """Checks on units and frames that need no alignment."""
 
-from ins_align.plausibility import ForceCheck, stuck, VelocityCheck, without_spikes
+from ins_align.plausibility import (BEYOND_END, BLIND_ANGLE, END_TIMES, ForceCheck, RangeCheck,
+                                    stuck, VelocityCheck, without_spikes)
 import numpy as np
 import pytest
 
@@ -232,3 +233,74 @@ def test_an_imu_at_rest_that_repeats_some_values_is_not_stuck():
     assert stuck(10 * MS * np.arange(20_000), samples) == []
     _, samples, _ = shaken()
     assert stuck(2 * MS * np.arange(1600), np.repeat(samples, 4, axis=0)) == []
+
+
+STEP_NS = 5_000_000
+
+
+def swinging(count=2000, noise=0.01):
+    """Rates up to 4 rad/s about z and forces up to 30 m/s^2 along x, with noise."""
+    stamps = STEP_NS * np.arange(1, count + 1)
+    samples = noise * np.random.default_rng(3).standard_normal((count, 6))
+    samples[:, 2] += 4.0 * np.sin(2e-9 * np.pi * stamps)
+    samples[:, 3] += 30.0 * np.sin(3e-9 * np.pi * stamps)
+    samples[:, 5] += 9.8
+    return stamps, samples
+
+
+def checked(stamps, samples, block=None):
+    check = RangeCheck()
+    for k in range(0, stamps.size, block or stamps.size):
+        part = slice(k, k + (block or stamps.size))
+        check.add(stamps[part], samples[part])
+    return check
+
+
+@pytest.mark.parametrize('axis, end', [(2, 3.0), (3, 20.0)])
+@pytest.mark.parametrize('block', (1, 7, None))
+def test_end_of_a_range_is_found(axis, end, block):
+    stamps, samples = swinging()
+    clipped = samples.copy()
+    clipped[:, axis] = np.clip(samples[:, axis], -end, 0.9 * end)
+    there = np.flatnonzero(clipped[:, axis] != samples[:, axis])
+    check = checked(stamps, clipped, block)
+    # The first ones of either end might be chance.
+    assert np.isin(check.stamps, stamps[there]).all()
+    assert check.stamps.size == there.size - 2 * (END_TIMES - 1)
+    sensor = axis // 3
+    assert np.all(check.densities[:, sensor] > 0) and np.all(check.densities[:, 1 - sensor] == 0)
+    # One run from its first sample on: the error that grows with its time.
+    last = np.flatnonzero(np.diff(check.stamps) > STEP_NS)
+    run = slice(last[-2] + 1, last[-1] + 1)
+    seconds = STEP_NS * 1e-9 * (run.stop - run.start)
+    size = np.abs(clipped[stamps == check.stamps[run.start], axis])[0]
+    assert np.sum(check.densities[run, sensor] ** 2) * STEP_NS * 1e-9 == pytest.approx(
+        (BEYOND_END * size * seconds) ** 2, rel=0.1)
+    assert bool(check.blind) == (sensor == 0)
+    if sensor == 0:
+        per_run = BEYOND_END * size * seconds // BLIND_ANGLE
+        assert per_run == np.count_nonzero((np.array(check.blind) >= check.stamps[run][0])
+                                           & (np.array(check.blind) <= check.stamps[run][-1]))
+
+
+def test_what_is_not_the_end_of_a_range():
+    stamps, samples = swinging()
+    resting = np.round(samples / 0.01) * 0.01
+    resting[:, 2:4] = 0.0
+    steady = swinging(noise=1e-4)[1]
+    steady[:, 2:4] = 2.0, 0.0
+    for values in (samples, resting,
+                   np.round(samples / 1e-3) * 1e-3,               # steps of a converter
+                   np.repeat(samples[::4], 4, axis=0),            # sent more often than measured
+                   np.round(steady / 0.1) * 0.1):                 # coarse, and calm
+        assert checked(stamps, values).stamps.size == 0
+
+
+def test_range_check_forgets():
+    stamps, samples = swinging()
+    samples[:, 2] = np.clip(2.0 * samples[:, 2], -3.0, 3.0)
+    check = checked(stamps, samples)
+    middle = int(stamps[1000])
+    check.forget_before(middle)
+    assert check.stamps.size == len(check.densities) > 0 and check.blind
+    assert check.stamps.min() >= middle and min(check.blind) >= middle
