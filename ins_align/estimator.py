@@ -405,7 +405,7 @@ class MapEstimator:
             use = gnss.present[:, kind]
             if np.count_nonzero(use) < self.FIRST_FIT - 1 or (kind and total > 0):
                 continue
-            omega = point.aligned(interval.omega) - point.gyro_bias
+            omega = point.undistorted(interval.omega) - point.gyro_bias
             lever = cross(omega, point.lever_b) if kind == 0 else point.lever_b
             integral = chain.v if kind == 0 else chain.p
             a = (integral + (chain.R @ np.broadcast_to(

@@ -91,7 +91,7 @@ class Unknowns:
         step[:3] = log_so3(self.C @ other.C.T)
         return step
 
-    def aligned(self, measured: Array) -> Array:
+    def undistorted(self, measured: Array) -> Array:
         """Return what gyros measured, shape (K, 3), without scale factor and misalignment."""
         return measured - measured @ self.gyro_matrix.T
 

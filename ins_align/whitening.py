@@ -213,12 +213,12 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     gained = interval.gained - AGES[:, None] * point.accel_bias
     _, gained_v, gained_p = exact(gained, delay)
     measured_rate, measured_turn, _ = exact(interval.turned, delay)
-    rate = point.aligned(measured_rate) - point.gyro_bias
-    turn = point.aligned(measured_turn) - delay * point.gyro_bias
+    rate = point.undistorted(measured_rate) - point.gyro_bias
+    turn = point.undistorted(measured_turn) - delay * point.gyro_bias
     rate += 0.5 * cross(turn, rate)
     # A lever arm swings with the vibration too.
     vibration = interval.omega - exact(interval.turned, 0.0)[0]
-    omega = rate + point.aligned(vibration)
+    omega = rate + point.undistorted(vibration)
     CR_seen = CR @ exp_so3(-turn)
     swing = CR_seen @ skew(omega)
     swung = _turned(CR_seen, cross(omega, lever))
@@ -257,7 +257,7 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     H[:, POSITION, LEVER_ARM] = CR_seen
     # Vibration is no use in a derivative. The rate changes with time as it does not with age.
     force = smooth(gained, delay)[0]
-    rate_change = point.aligned(smooth(interval.turned, delay)[1])
+    rate_change = point.undistorted(smooth(interval.turned, delay)[1])
     whirled = cross(rate, cross(omega, lever)) - cross(rate_change, lever)
     H[:, VELOCITY, DELAY.start] = -(_turned(CR, force) + _turned(CR_seen, whirled) + gnss.gravity)
     H[:, POSITION, DELAY.start] = -ground_velocity
