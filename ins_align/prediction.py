@@ -112,7 +112,8 @@ class Prediction:
         if stamps_ns.size == 0:
             return
         dt = np.diff(stamps_ns, prepend=self.stamp_ns) * 1e-9
-        turns = (gyro @ np.transpose(self._matrix) - self._bias) * dt[:, None]
+        rates = (np.array(self._matrix) @ gyro[..., None])[..., 0]
+        turns = (rates - self._bias) * dt[:, None]
         half = 0.5 * np.sqrt(np.einsum('ij,ij->i', turns, turns))
         # numpy's sinc is that of pi x.
         steps = np.column_stack([0.5 * turns * np.sinc(half / np.pi)[:, None], np.cos(half)])

@@ -328,7 +328,8 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     dt = steps.dt
     omega = steps.omega - gyro_bias
     if gyro_matrix is not None:
-        omega -= steps.omega @ gyro_matrix.T
+        # Vector by vector: products of many depend, in the last bit, on how many they are.
+        omega -= (gyro_matrix @ steps.omega[..., None])[..., 0]
     f = steps.f - accel_bias
     omega0, omega1 = omega[:, :-1], omega[:, 1:]
     f0, f1 = f[:, :-1], f[:, 1:]

@@ -93,7 +93,7 @@ class Unknowns:
 
     def undistorted(self, measured: Array) -> Array:
         """Return what gyros measured, shape (K, 3), without scale factor and misalignment."""
-        return measured - measured @ self.gyro_matrix.T
+        return measured - (self.gyro_matrix @ measured[..., None])[..., 0]
 
 
 # Places of the blocks in the full vector of unknowns.
