@@ -28,6 +28,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 
+# So many steps of the IMU are one to the derivatives.
+DERIVATIVE_STEPS = 4
+
+
 @dataclass(frozen=True)
 class Intervals:
     """
@@ -357,19 +361,8 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     passed = np.cumsum(dt, axis=1)
     duration = passed[:, -1]
     remaining = duration[:, None] - passed + 0.5 * dt       # from the middle of each step on
-    # Derivatives: a gyro bias turns the rest of the interval by minus the integral of A; an entry
-    # of the matrix is a bias in proportion to a rate.
-    turns = A @ jacobian * dt[..., None, None]
-    if gyro_matrix is not None:
-        measured = 0.5 * (steps.omega[:, :-1] + steps.omega[:, 1:])
-        by_row = turns[..., None] * measured[..., None, None, :]
-        turns = np.concatenate([turns, by_row.reshape(dt.shape + (3, 9))], axis=-1)
-    turned_by = np.cumsum(turns, axis=1)
-    pushes = skew(u) @ (turned_by - 0.5 * turns)
-    J_R, J_v = -turned_by[:, -1], np.sum(pushes, axis=1)
-    # What a step adds to the velocity moves the body for the time that remains.
-    J_p = np.sum(remaining[..., None, None] * pushes, axis=1)
-    J_pa = -np.sum(remaining[..., None, None] * turns[..., :3], axis=1)
+    measured = None if gyro_matrix is None else 0.5 * (steps.omega[:, :-1] + steps.omega[:, 1:])
+    J_R, J_v, J_p, J_pa = _derivatives(dt, A @ jacobian * dt[..., None, None], u, measured)
     none = np.zeros((dt.shape[0], 3, 9))
     J_Rm, J_vm, J_pm = (none if gyro_matrix is None else J[..., 3:] for J in (J_R, J_v, J_p))
 
@@ -400,6 +393,49 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
         recent = Recent.steady(steps.f[:, -1], steps.omega[:, -1])
     return Intervals(duration, R, v, p, J_R[..., :3], J_v[..., :3], J_p[..., :3], J_pa, J_Rm, J_vm,
                      J_pm, Q, Q_excess, steps.omega[:, -1], recent.gained, recent.turned)
+
+
+def _derivatives(dt: Array, turns: Array, u: Array,
+                 rate: 'Array | None') -> tuple[Array, Array, Array, Array]:
+    """
+    Derive rotation, v and p by gyro bias and matrix, and p by accelerometer bias.
+
+    A gyro bias turns the rest of the interval by minus the integral of the attitude; an entry of
+    the matrix is a bias in proportion to a rate. A few steps are taken as one: what the motion
+    does within them is of second order in something that is small.
+
+    Parameters
+    ----------
+    dt : ndarray, shape (K, n)
+    turns : ndarray, shape (K, n, 3, 3)
+        Integral of the attitude over each step.
+    u : ndarray, shape (K, n, 3)
+        Velocity gained in it.
+    rate : ndarray, shape (K, n, 3), optional
+        As measured. Without it there are no derivatives to the matrix.
+
+    Returns
+    -------
+    J_R, J_v, J_p : ndarray, shape (K, 3, 3) or (K, 3, 12)
+    J_pa : ndarray, shape (K, 3, 3)
+
+    """
+    def together(values: Array) -> Array:
+        return np.add.reduceat(values, np.arange(0, dt.shape[1], DERIVATIVE_STEPS), axis=1)
+
+    seconds = together(dt)
+    turns, u = together(turns), together(u)
+    if rate is not None:
+        mean = together(rate * dt[..., None]) / np.maximum(seconds, 1e-9)[..., None]
+        by_row = turns[..., None] * mean[..., None, None, :]
+        turns = np.concatenate([turns, by_row.reshape(seconds.shape + (3, 9))], axis=-1)
+    turned_by = np.cumsum(turns, axis=1)
+    pushes = skew(u) @ (turned_by - 0.5 * turns)
+    # What a step adds to the velocity moves the body for the time that remains.
+    passed = np.cumsum(seconds, axis=1)
+    remaining = (passed[:, -1:] - passed + 0.5 * seconds)[..., None, None]
+    return (-turned_by[:, -1], np.sum(pushes, axis=1), np.sum(remaining * pushes, axis=1),
+            -np.sum(remaining * turns[..., :3], axis=1))
 
 
 def _least_and_more(density: ArrayLike) -> tuple[Array, Array]:
