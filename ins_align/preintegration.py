@@ -407,6 +407,7 @@ def _derivatives(dt: Array, turns: Array, u: Array,
     Parameters
     ----------
     dt : ndarray, shape (K, n)
+        Seconds of the steps.
     turns : ndarray, shape (K, n, 3, 3)
         Integral of the attitude over each step.
     u : ndarray, shape (K, n, 3)
