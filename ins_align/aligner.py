@@ -208,7 +208,7 @@ class Aligner:
         # Interpolation at an epoch wants two samples after it, and whether they are spikes shows
         # in the next one.
         upto_ns = min(upto_ns, int(stamps[-3]))
-        self._silences = self._find_silences(upto_ns)
+        self._silences = self._find_silences(self._cutter.look(upto_ns))
         for message in self._gnss.release(upto_ns, last):
             self._dry_epochs(message.stamp_ns)
             self._line_up(message)
@@ -251,8 +251,8 @@ class Aligner:
                                       self._antenna.gravity_drift(epoch.stamp_ns), dry))
             self._last_ns = epoch.stamp_ns
 
-    def _find_silences(self, upto_ns: int) -> list[_Silence]:
-        """When the IMU says nothing, in what is buffered."""
+    def _find_silences(self, blind: list[int]) -> list[_Silence]:
+        """When the IMU says nothing, in what is buffered; `blind`: too much was missed (ns)."""
         stamps = self._imu.stamps
         last = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
         why = f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s'
@@ -263,9 +263,9 @@ class Aligner:
         silences += [_Silence(max(start, known - self._lateness_ns), end, 'imu_stuck',
                               'the IMU sends the same values again and again')
                      for start, end, known in stuck(stamps, self._imu.samples)]
-        silences += [_Silence(blind - 1, blind, 'imu_blind', 'the gyros are at the end of their '
+        silences += [_Silence(stamp - 1, stamp, 'imu_blind', 'the gyros are at the end of their '
                               'range: let the driver set a larger one')
-                     for blind in self._cutter.look(upto_ns)]
+                     for stamp in blind]
         return silences
 
     def _silence(self, start_ns: int, end_ns: int) -> '_Silence | None':

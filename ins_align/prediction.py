@@ -24,7 +24,7 @@ import copy
 import math
 
 from ins_align.buffers import MAX_RATE
-from ins_align.rotation import Array, matrix_from_quaternion, quaternion_from_matrix
+from ins_align.rotation import apply, Array, matrix_from_quaternion, quaternion_from_matrix
 import numpy as np
 
 # An attitude is lost when samples are missing for longer (ns).
@@ -112,8 +112,7 @@ class Prediction:
         if stamps_ns.size == 0:
             return
         dt = np.diff(stamps_ns, prepend=self.stamp_ns) * 1e-9
-        rates = (np.array(self._matrix) @ gyro[..., None])[..., 0]
-        turns = (rates - self._bias) * dt[:, None]
+        turns = (apply(np.array(self._matrix), gyro) - self._bias) * dt[:, None]
         half = 0.5 * np.sqrt(np.einsum('ij,ij->i', turns, turns))
         # numpy's sinc is that of pi x.
         steps = np.column_stack([0.5 * turns * np.sinc(half / np.pi)[:, None], np.cos(half)])

@@ -22,8 +22,8 @@ interpolation. All samples of an interval, and all intervals of a batch, are han
 from dataclasses import dataclass, fields
 
 from ins_align.recent import Recent, RUNGS
-from ins_align.rotation import (Array, cross, cumulative_rotations, exp_and_left_jacobian, exp_so3,
-                                Index, orthonormalized, skew)
+from ins_align.rotation import (apply, Array, by_row, cross, cumulative_rotations,
+                                exp_and_left_jacobian, exp_so3, Index, orthonormalized, skew)
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -106,7 +106,7 @@ class Intervals:
         R, v, p = self.R, self.v, self.p
         if gyro_sign < 0:
             back = R.transpose(0, 2, 1)
-            R, v, p = back, (back @ v[..., None])[..., 0], (back @ p[..., None])[..., 0]
+            R, v, p = back, apply(back, v), apply(back, p)
         return Intervals(**{
             **vars(self), 'R': R, 'v': accel_sign * v, 'p': accel_sign * p,
             'J_vg': accel_sign * self.J_vg, 'J_pg': accel_sign * self.J_pg,
@@ -129,18 +129,14 @@ class Intervals:
             So it is with the matrix.
 
         """
-        by_row = gyro_matrix.reshape(gyro_matrix.shape[:-2] + (9,))
-
-        def product(matrices: Array, vectors: Array) -> Array:
-            return (matrices @ vectors[..., None])[..., 0]
-
+        matrix = gyro_matrix.reshape(gyro_matrix.shape[:-2] + (9,))
         return Intervals(**{
             **vars(self),
-            'R': exp_so3(product(self.J_Rg, gyro_bias) + product(self.J_Rm, by_row)) @ self.R,
-            'v': (self.v + product(self.J_vg, gyro_bias) + product(self.J_Rg, accel_bias)
-                  + product(self.J_vm, by_row)),
-            'p': (self.p + product(self.J_pg, gyro_bias) + product(self.J_pa, accel_bias)
-                  + product(self.J_pm, by_row))})
+            'R': exp_so3(apply(self.J_Rg, gyro_bias) + apply(self.J_Rm, matrix)) @ self.R,
+            'v': (self.v + apply(self.J_vg, gyro_bias) + apply(self.J_Rg, accel_bias)
+                  + apply(self.J_vm, matrix)),
+            'p': (self.p + apply(self.J_pg, gyro_bias) + apply(self.J_pa, accel_bias)
+                  + apply(self.J_pm, matrix))})
 
 
 @dataclass(frozen=True)
@@ -332,8 +328,7 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     dt = steps.dt
     omega = steps.omega - gyro_bias
     if gyro_matrix is not None:
-        # Vector by vector: products of many depend, in the last bit, on how many they are.
-        omega -= (gyro_matrix @ steps.omega[..., None])[..., 0]
+        omega -= apply(gyro_matrix, steps.omega)
     f = steps.f - accel_bias
     omega0, omega1 = omega[:, :-1], omega[:, 1:]
     f0, f1 = f[:, :-1], f[:, 1:]
@@ -344,18 +339,18 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     coning = h2_12 * cross(omega0, omega1)
     sculling = h2_12 * (cross(omega0, f1) + cross(f0, omega1))
     turn, jacobian = exp_and_left_jacobian(theta + coning)
-    step_v = (jacobian @ force[..., None])[..., 0] + sculling
+    step_v = apply(jacobian, force) + sculling
     step_p = h * h / 6 * (2 * f0 + f1) + h ** 3 / 6 * cross(omega0, 0.5 * (f0 + f1))
 
     turned = cumulative_rotations(turn)
     A = np.empty_like(turned)                     # from the start of each step to the interval's
     A[:, 0] = np.eye(3)
     A[:, 1:] = turned[:, :-1]
-    u = (A @ step_v[..., None])[..., 0]
+    u = apply(A, step_v)
     v_end = np.cumsum(u, axis=1)
     v_start = v_end - u
     v_mid = 0.5 * (v_start + v_end)
-    p_step = h * v_start + (A @ step_p[..., None])[..., 0]
+    p_step = h * v_start + apply(A, step_p)
     p_end = np.cumsum(p_step, axis=1)
 
     passed = np.cumsum(dt, axis=1)
@@ -428,8 +423,7 @@ def _derivatives(dt: Array, turns: Array, u: Array,
     turns, u = together(turns), together(u)
     if rate is not None:
         mean = together(rate * dt[..., None]) / np.maximum(seconds, 1e-9)[..., None]
-        by_row = turns[..., None] * mean[..., None, None, :]
-        turns = np.concatenate([turns, by_row.reshape(seconds.shape + (3, 9))], axis=-1)
+        turns = np.concatenate([turns, by_row(turns, mean)], axis=-1)
     turned_by = np.cumsum(turns, axis=1)
     pushes = skew(u) @ (turned_by - 0.5 * turns)
     # What a step adds to the velocity moves the body for the time that remains.

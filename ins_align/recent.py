@@ -22,7 +22,7 @@ the epoch back to that moment. They are kept at a ladder of ages that follows a 
 from dataclasses import dataclass
 import math
 
-from ins_align.rotation import Array, cross, exp_so3, Index
+from ins_align.rotation import apply, Array, cross, exp_so3, Index
 import numpy as np
 
 # Seconds between the ages, and how many there are: all of them as long as delays are.
@@ -147,7 +147,7 @@ def _seen_from_epoch(dt: Array, rate: Array, force: Array) -> Array:
     rate = rate - 0.5 * cross(to_come, rate)
     turn = dt * rate
     turned = np.cumsum(turn, axis=1)
-    force = (exp_so3(turned - 0.5 * turn - turned[:, -1:]) @ force[..., None])[..., 0]
+    force = apply(exp_so3(turned - 0.5 * turn - turned[:, -1:]), force)
     return np.concatenate([force, rate], axis=-1)
 
 

@@ -32,6 +32,47 @@ Index = NDArray[np.integer[Any]]
 _SERIES_ANGLE, _SMALL_ANGLE = 0.05, 1e-3
 
 
+def apply(matrix: Array, vectors: Array) -> Array:
+    """
+    Products of matrices and vectors.
+
+    Each on its own: those of one matrix with many vectors at a time depend, in the last bit, on
+    how many they are.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (..., m, n)
+        One, or one for each vector.
+    vectors : ndarray, shape (..., n)
+        Many of them.
+
+    Returns
+    -------
+    ndarray, shape (..., m)
+
+    """
+    return (matrix @ vectors[..., None])[..., 0]
+
+
+def by_row(matrix: Array, vectors: Array) -> Array:
+    """
+    Derive ``matrix @ X @ vector`` by X, row by row.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (..., 3, 3)
+        The left factor.
+    vectors : ndarray, shape (..., 3)
+        The right factor.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 9)
+
+    """
+    return (matrix[..., None] * vectors[..., None, None, :]).reshape(matrix.shape[:-1] + (9,))
+
+
 def skew(vector: ArrayLike) -> Array:
     """
     Cross-product matrix ``[v x]``.

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import math
 
 from ins_align.preintegration import Intervals
-from ins_align.rotation import Array, exp_so3, Index
+from ins_align.rotation import apply, Array, exp_so3, Index
 from ins_align.unknowns import (ATTITUDE, GYRO, GYRO_BIAS, inverse_spd, Prior, SIZE,
                                 START_POSITION, START_VELOCITY, UNIFORM_ANGLE_STD, Unknowns)
 from ins_align.whitening import (Chain, chain_noise, GATE, Gate, Measurements, Rows, sensitivities,
@@ -194,7 +194,7 @@ class Solution:
         prior = self.information @ self._mean_step
         right = normal[:, 1:, 0] + prior
         P = inverse_spd(self.information + normal[:, 1:, 1:] + self._weak)
-        dx = _turned(P, right)
+        dx = apply(P, right)
         column = P[:, :, 2]
         feigned = np.minimum(whitened.spurious + FITTED_DIRECTIONS,
                              1 / column[:, 2] - 1 / UNIFORM_ANGLE_STD ** 2)
@@ -209,8 +209,8 @@ class Solution:
         J[:, :, ATTITUDE] += np.eye(3)
         J[:, :, self._gyro] += (estimate.C @ chain.R_g)[
             :, :, self._columns[self._gyro] - GYRO.start]
-        errors = X[:, :3, 0] - _turned(X[:, :3, 1:], dx)
-        before, after = exp_so3(np.stack([errors, _turned(chain.R_g, step[:, GYRO])]))
+        errors = X[:, :3, 0] - apply(X[:, :3, 1:], dx)
+        before, after = exp_so3(np.stack([errors, apply(chain.R_g, step[:, GYRO])]))
         C = before @ estimate.C @ after @ chain.R
         return Course(chain, whitened, time, dx, P, estimate,
                       normal[:, 0, 0] + self._mean_step @ prior - np.sum(right * dx, axis=1),
@@ -233,11 +233,6 @@ class Solution:
         """Log likelihood at the best overall scale of all covariances, but for a constant."""
         scale = max(self.chi2 / max(self.dof, 1), 1.0)
         return -0.5 * (self.whitener.log_det + self.dof * math.log(scale) + self.chi2 / scale)
-
-
-def _turned(matrix: Array, vectors: Array) -> Array:
-    """Products of K matrices and K vectors, each on its own."""
-    return (matrix @ vectors[..., None])[..., 0]
 
 
 def _nonlinearity(step: Array, P: Array, time: Array) -> Array:

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import math
 
 from ins_align.earth import EARTH_RATE
-from ins_align.rotation import Array, exp_so3, Index, log_so3
+from ins_align.rotation import apply, Array, exp_so3, Index, log_so3
 import numpy as np
 
 # A heading is never known worse than uniform on the circle.
@@ -93,7 +93,7 @@ class Unknowns:
 
     def undistorted(self, measured: Array) -> Array:
         """Return what gyros measured, shape (K, 3), without scale factor and misalignment."""
-        return measured - (self.gyro_matrix @ measured[..., None])[..., 0]
+        return measured - apply(self.gyro_matrix, measured)
 
 
 # Places of the blocks in the full vector of unknowns.

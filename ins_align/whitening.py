@@ -24,8 +24,8 @@ from dataclasses import dataclass
 
 from ins_align.preintegration import Intervals
 from ins_align.recent import AGES, exact, smooth
-from ins_align.rotation import (Array, cross, cumulative_rotations, exp_so3, Index, running_sum,
-                                skew)
+from ins_align.rotation import (apply, Array, by_row, cross, cumulative_rotations, exp_so3, Index,
+                                running_sum, skew)
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO, GYRO_BIAS, GYRO_MATRIX,
                                 LEVER_ARM, SIZE, START_POSITION, START_VELOCITY, Unknowns)
 import numpy as np
@@ -113,7 +113,7 @@ class Chain:
         turned = cumulative_rotations(np.concatenate([self.R[None], interval.R]))
         R, R_end = turned[:-1], turned[1:]
         h = interval.duration[:, None, None]
-        u, w = _turned(R, interval.v), _turned(R, interval.p)
+        u, w = apply(R, interval.v), apply(R, interval.p)
         skew_u, skew_w = skew(u), skew(w)
 
         def total(start: Array, steps: Array) -> tuple[Array, Array]:
@@ -133,11 +133,6 @@ class Chain:
         p_g_end = total(self.p_g, h * v_g + gyro(interval.J_pg, interval.J_pm) - skew_w @ R_g)[1]
         p_a_end = total(self.p_a, h * v_a + R @ interval.J_pa)[1]
         return Chain(R_end, v_end, p_end, R_g_end, v_g_end, v_a_end, p_g_end, p_a_end)
-
-
-def _turned(matrix: Array, vectors: Array) -> Array:
-    """Products of 3 x 3 matrices and vectors, shape (K, 3), each on its own."""
-    return (matrix @ vectors[..., None])[..., 0]
 
 
 def chain_noise(C: Array, time: Array, chain: Chain, interval: Intervals, size: int,
@@ -167,12 +162,12 @@ def chain_noise(C: Array, time: Array, chain: Chain, interval: Intervals, size: 
     """
     turn = (C @ chain.R) @ interval.R.transpose(0, 2, 1)       # from the interval's start to n0
     spread = np.zeros((time.size, size, size))
-    arm = skew(_turned(C, chain.v))
+    arm = skew(apply(C, chain.v))
     spread[:, :3, :3] = spread[:, 3:6, 3:6] = turn
     spread[:, 3:6, :3] = arm @ turn
     if size == 9:
         t = time[:, None, None]
-        spread[:, 6:, :3] = (skew(_turned(C, chain.p)) - t * arm) @ turn
+        spread[:, 6:, :3] = (skew(apply(C, chain.p)) - t * arm) @ turn
         spread[:, 6:, 3:6] = -t * turn
         spread[:, 6:, 6:] = turn
     Q = interval.Q[:, :size, :size] + excess * interval.Q_excess[:, :size, :size]
@@ -208,7 +203,7 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     delay = min(max(float(point.delay), MIN_DELAY), MAX_DELAY)
     beyond = point.delay - delay
     CR = C @ chain.R
-    moved_v, moved_p = _turned(C, chain.v), _turned(C, chain.p)         # in n0
+    moved_v, moved_p = apply(C, chain.v), apply(C, chain.p)         # in n0
     # What the receiver saw happened a delay before: there the motion before the epoch leads back.
     gained = interval.gained - AGES[:, None] * point.accel_bias
     _, gained_v, gained_p = exact(gained, delay)
@@ -221,9 +216,9 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     omega = rate + point.undistorted(vibration)
     CR_seen = CR @ exp_so3(-turn)
     swing = CR_seen @ skew(omega)
-    swung = _turned(CR_seen, cross(omega, lever))
-    seen_v = moved_v - _turned(CR, gained_v) + swung
-    seen_p = moved_p - delay * moved_v + _turned(CR, gained_p) + CR_seen @ lever
+    swung = apply(CR_seen, cross(omega, lever))
+    seen_v = moved_v - apply(CR, gained_v) + swung
+    seen_p = moved_p - delay * moved_v + apply(CR, gained_p) + CR_seen @ lever
     start_velocity = point.start_velocity + gnss.offset                 # over ground
     ground_velocity = start_velocity + seen_v - delay * gnss.gravity
     Y = np.zeros((K, 6, 1 + SIZE))
@@ -246,8 +241,8 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     H[:, VELOCITY, GYRO_BIAS] += arm - delay * turned_arm
     H[:, POSITION, GYRO_BIAS] -= delay * arm
     measured_rate += vibration
-    H[:, VELOCITY, GYRO_MATRIX] += _by_row(arm, measured_rate) - _by_row(turned_arm, measured_turn)
-    H[:, POSITION, GYRO_MATRIX] -= _by_row(arm, measured_turn)
+    H[:, VELOCITY, GYRO_MATRIX] += by_row(arm, measured_rate) - by_row(turned_arm, measured_turn)
+    H[:, POSITION, GYRO_MATRIX] -= by_row(arm, measured_turn)
     H[:, VELOCITY, ACCEL_BIAS] = C_v_a + delay * CR
     H[:, POSITION, ACCEL_BIAS] = C @ chain.p_a - delay * (C_v_a + delay / 2 * CR)
     H[:, VELOCITY, START_VELOCITY] = eye
@@ -259,15 +254,10 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     force = smooth(gained, delay)[0]
     rate_change = point.undistorted(smooth(interval.turned, delay)[1])
     whirled = cross(rate, cross(omega, lever)) - cross(rate_change, lever)
-    H[:, VELOCITY, DELAY.start] = -(_turned(CR, force) + _turned(CR_seen, whirled) + gnss.gravity)
+    H[:, VELOCITY, DELAY.start] = -(apply(CR, force) + apply(CR_seen, whirled) + gnss.gravity)
     H[:, POSITION, DELAY.start] = -ground_velocity
     Y[:, :, 0] -= beyond * H[:, :, DELAY.start]
     return Y
-
-
-def _by_row(matrix: Array, vectors: Array) -> Array:
-    """Derive ``matrix @ X @ vector`` by X row by row, shape (K, 3, 9)."""
-    return (matrix[..., None] * vectors[:, None, None, :]).reshape(-1, 3, 9)
 
 
 @dataclass
@@ -321,7 +311,7 @@ class Gate:
 
         """
         columns = innovation[..., 1:]
-        residual = innovation[..., 0] - (columns @ self.dx[..., None])[..., 0]
+        residual = innovation[..., 0] - apply(columns, self.dx)
         spread = columns @ self.P @ columns.swapaxes(-1, -2)
         # A large error of heading shows along the motion too, not only across.
         free = np.asarray(self.P[..., 2, 2] > HEADING_RESOLVED_STD ** 2)
