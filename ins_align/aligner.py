@@ -208,7 +208,7 @@ class Aligner:
         # Interpolation at an epoch wants two samples after it, and whether they are spikes shows
         # in the next one.
         upto_ns = min(upto_ns, int(stamps[-3]))
-        self._silences = self._find_silences(self._cutter.look(upto_ns))
+        self._silences = self._find_silences(self._cutter.check_range(upto_ns))
         for message in self._gnss.release(upto_ns, last):
             self._dry_epochs(message.stamp_ns)
             self._line_up(message)
@@ -368,6 +368,8 @@ class Aligner:
         if fault:
             self._declaration.levelled = self._declaration.aligned = False
             verdict = Verdict(State.FAULT, fault)
+        method.judged(self._declaration.contradicted or bool(fault),
+                      verdict.state in (State.LEVELLED, State.ALIGNED))
         if verdict.state is State.ALIGNED and self.declared is None:
             self.declared = self._initial
             self._time_to_align_s = time_s
@@ -375,9 +377,9 @@ class Aligner:
             self.declared = self._time_to_align_s = None
             self.counts['withdrawals'] += 1
         self._set_verdict(verdict)
-        gyro_bias, accel_bias, _ = method.sensor_errors()
+        sensors = method.sensor_errors()
         return Epoch(stamp_ns, time_s, verdict.state, self._initial, self._current,
-                     fit.innovation.normalised, gyro_bias, accel_bias)
+                     fit.innovation.normalised, sensors.gyro_bias, sensors.accel_bias)
 
     def _set_verdict(self, verdict: Verdict) -> None:
         if verdict.state is not self._verdict.state:
@@ -404,10 +406,11 @@ class Aligner:
             return None
         self._imu.consolidate()
         if self._now is None:
-            gyro_bias, _, gyro_matrix = method.sensor_errors()
+            sensors = method.sensor_errors()
             bias_std = float(np.max(method.nuisance().gyro_bias_std))
             self._now = Prediction(
-                self._last_ns, current.C_nb, current.covariance, gyro_bias, gyro_matrix,
+                self._last_ns, current.C_nb, current.covariance, sensors.gyro_bias,
+                sensors.gyro_matrix,
                 self.config.imu_noise.angle_random_walk, bias_std ** 2 + EARTH_RATE ** 2)
         stamps = self._imu.stamps
         first = int(np.searchsorted(stamps, self._now.stamp_ns, side='right'))

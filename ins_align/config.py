@@ -58,7 +58,7 @@ def _imu_noise(arw: float, vrw: float, gyro_bias: float, accel_bias: float,
 
 PRESETS = {
     'navigation': _imu_noise(0.002, 0.003, 0.01 / 3600.0, 50e-6 * STANDARD_GRAVITY),
-    'tactical': _imu_noise(0.05, 0.03, 1.0 / 3600.0, 1e-3 * STANDARD_GRAVITY),
+    'tactical': _imu_noise(0.05, 0.03, 1.0 / 3600.0, 1e-3 * STANDARD_GRAVITY, 0.0005),
     'mems': _imu_noise(0.3, 0.09, 0.1, 0.05, 0.01),
 }
 
@@ -131,8 +131,8 @@ class Config:
         minimum=0.0, maximum=10.0)
     gyro_scale_std: float = _parameter(
         0.0, 'scale factor error of the gyroscopes, 1 sigma per axis, 0.01 is one percent; 0: the '
-        "preset's; where that is above 0 it is estimated, as is misalignment (3 tenths of it); "
-        'errors of the accelerometers and g-sensitivity count as noise', '1',
+        "preset's; where that is above 0 it is estimated, as are, 3 tenths of it, misalignment "
+        'and the errors of the accelerometers; g-sensitivity counts as noise', '1',
         minimum=0.0, maximum=0.5)
     velocity_std: float = _parameter(
         0.3, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none', 'm/s',

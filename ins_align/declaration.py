@@ -69,6 +69,15 @@ class Declaration:
     config : Config
         ``heading_std_threshold``, ``tilt_std_threshold`` and ``hold_time``.
 
+    Attributes
+    ----------
+    levelled, aligned : bool
+        What is declared.
+    later_start : bool
+        Whether t0 had better move.
+    contradicted : bool
+        Whether the data contradict the model.
+
     """
 
     def __init__(self, config: Config) -> None:
@@ -79,6 +88,7 @@ class Declaration:
         self.levelled = False
         self.aligned = False
         self.later_start = False
+        self.contradicted = False
         self._recent_nis = 1.0
         self._rejected = 0
 
@@ -108,6 +118,7 @@ class Declaration:
         if math.isfinite(nis):
             self._recent_nis += (min(nis, 10.0) - self._recent_nis) / RECENT
         contradiction = self._contradiction(fit)
+        self.contradicted = bool(contradiction)
         factor = fit.factor
         tilt, tilt_now = (math.degrees(_largest_std(P)) * factor for P in (initial, current))
         heading, heading_now = (math.degrees(math.sqrt(P[2, 2])) * factor

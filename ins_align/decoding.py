@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from ins_align.bag_files import Topic
 from ins_align.messages import imu_from_msg, MessageError, stamp_from_msg
@@ -47,6 +47,14 @@ class Orientations(NamedTuple):
     stamps_ns: np.ndarray  # (N,) int64
     quaternions: np.ndarray  # (N, 4), (x, y, z, w)
     covariances: np.ndarray  # (N, 9), rad^2
+
+
+Columns = TypeVar('Columns', ImuSamples, Orientations)
+
+
+def joined(parts: Sequence[Columns]) -> Columns:
+    """Put columns one behind the other."""
+    return type(parts[0])(*map(np.concatenate, zip(*parts)))
 
 
 @lru_cache(maxsize=None)

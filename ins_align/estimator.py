@@ -26,11 +26,11 @@ from dataclasses import dataclass, replace
 import math
 
 from ins_align.formula import attitude_from_moments
-from ins_align.preintegration import Intervals
+from ins_align.preintegration import Intervals, SensorErrors
 from ins_align.rotation import Array, cross
 from ins_align.solution import Course, Solution
-from ins_align.unknowns import (BODY_FIXED, DELAY, GYRO_BIAS, GYRO_MATRIX, LEVER_ARM, Prior,
-                                prior_of, SIZE, START_POSITION, START_VELOCITY, Unknowns)
+from ins_align.unknowns import (ACCEL_MATRIX, BODY_FIXED, DELAY, GYRO_BIAS, GYRO_MATRIX, LEVER_ARM,
+                                Prior, prior_of, SIZE, START_POSITION, START_VELOCITY, Unknowns)
 from ins_align.whitening import (Chain, GATE, Gate, HEADING_RESOLVED_STD, Measurements, POSITION,
                                  VELOCITY, Whitened)
 import numpy as np
@@ -41,7 +41,6 @@ MEDIAN_CHI2_3 = 2.366
 FIRST_EXCESS = 1 / 27
 # Normalised innovation squared and normalised innovation by kind (velocity 0, position 1).
 Tests = dict[int, tuple[float, Array]]
-SensorErrors = tuple[Array, Array, Array]       # gyro bias, accelerometer bias, gyro matrix
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ class MapEstimator:
     prior : Prior
     use_position : bool
         Whether position rows will come.
-    estimate_lever_arm, estimate_delay, estimate_gyro_matrix : bool
+    estimate_lever_arm, estimate_delay, estimate_matrices : bool
         Otherwise they stay at the prior's mean.
     capacity : int
         Epochs that are stored.
@@ -118,21 +117,21 @@ class MapEstimator:
 
     def __init__(self, prior: Prior, *, use_position: bool = False,
                  estimate_lever_arm: bool = False, estimate_delay: bool = False,
-                 estimate_gyro_matrix: bool = False, capacity: int = 1000,
+                 estimate_matrices: bool = False, capacity: int = 1000,
                  excess: float = FIRST_EXCESS) -> None:
         """Start at t0."""
         wanted = np.ones(SIZE, bool)
         wanted[START_POSITION] = use_position
         wanted[LEVER_ARM] = estimate_lever_arm
         wanted[DELAY] = estimate_delay
-        wanted[GYRO_MATRIX] = estimate_gyro_matrix
+        wanted[GYRO_MATRIX] = wanted[ACCEL_MATRIX] = estimate_matrices
         self.columns = np.flatnonzero(wanted)
         self.size = 9 if use_position else 6
         self.prior = prior
         self._capacity = capacity
         self._intervals = Intervals.empty(capacity)
         # With which the intervals were integrated.
-        self._sensor_errors = np.zeros((capacity, 5, 3))
+        self._sensor_errors = np.zeros((capacity, 24))
         self._gnss = Measurements.empty(capacity)
         # Outliers when they came.
         self._refused = np.zeros((capacity, 2), bool)
@@ -149,8 +148,7 @@ class MapEstimator:
     @property
     def sensor_errors(self) -> SensorErrors:
         """Those of the linearisation point: integrate the next intervals with them."""
-        x = self.prior.mean if self.solution is None else self.solution.point
-        return x.gyro_bias, x.accel_bias, x.gyro_matrix
+        return (self.prior.mean if self.solution is None else self.solution.point).sensors
 
     def add(self, intervals: Intervals, gnss: Measurements) -> Iterator[Innovation]:
         """
@@ -182,13 +180,13 @@ class MapEstimator:
         count = min(gnss.time.size, self._capacity - self.count)
         places = slice(self.count, self.count + count)
         self._intervals.put(places, intervals.take(slice(0, count)))
-        self._sensor_errors[places] = np.vstack(self.sensor_errors)
+        self._sensor_errors[places] = self.sensor_errors.vector()
         self._gnss.put(places, gnss.take(slice(0, count)))
         s = self.solution
         if s is None:
             yield from self._first(count)
             return
-        rows = s.rows(self._gnss.take(places), self._corrected(places, s.point))
+        rows = s.rows(self._gnss.take(places), self._intervals.take(places))
         wanted = gnss.present[:count, :s.kinds].copy()
         done, ahead = 0, count
         refused: Tests = {}                       # of the next epoch
@@ -258,6 +256,12 @@ class MapEstimator:
         return self.count >= self._capacity
 
     @property
+    def idle(self) -> bool:
+        """Whether nothing shows the heading yet."""
+        s = self.solution
+        return s is None or bool(s.P[2, 2] > self.IDLE_HEADING_STD ** 2)
+
+    @property
     def stale(self) -> bool:
         """
         Whether a later t0 would serve better, though the store is not full.
@@ -270,7 +274,7 @@ class MapEstimator:
         if s is None:
             return False
         age = self.time
-        if s.P[2, 2] <= self.IDLE_HEADING_STD ** 2:
+        if not self.idle:
             return bool(age >= self.MAX_AGE)
         variances = self.variances
         bias_std = math.sqrt(np.max(variances[GYRO_BIAS]))
@@ -287,17 +291,14 @@ class MapEstimator:
         gnss = self._gnss.take(epochs)
         present = gnss.present[:, :s.kinds]
         wanted = present if gate is not None else present & ~refused[:, :s.kinds]
-        return s.run(s.rows(gnss, self._corrected(epochs, s.point)), present, wanted, gate,
+        return s.run(s.rows(gnss, self._corrected(epochs, s.point.sensors)), present, wanted, gate,
                      self._gate_scale)
 
-    def _corrected(self, epochs: slice, point: Unknowns) -> Intervals:
-        """Return stored intervals as they would be with the sensor errors of a point."""
-        change = (np.vstack([point.gyro_bias, point.accel_bias, point.gyro_matrix])
-                  - self._sensor_errors[epochs])
+    def _corrected(self, epochs: slice, sensors: SensorErrors) -> Intervals:
+        """Return stored intervals as they would be with other sensor errors."""
+        change = sensors.vector() - self._sensor_errors[epochs]
         intervals = self._intervals.take(epochs)
-        if not np.any(change):
-            return intervals
-        return intervals.corrected(change[:, 0], change[:, 1], change[:, 2:])
+        return intervals.corrected(change) if np.any(change) else intervals
 
     # Solution
 
@@ -394,9 +395,9 @@ class MapEstimator:
             self._fit()
 
     def _rough_attitude(self, point: Unknowns) -> Array:
-        """Centred q-method over the store, with the biases and lever arm of `point`."""
+        """Centred q-method over the store, with the sensor errors and lever arm of `point`."""
         epochs = slice(0, self.count)
-        interval = self._corrected(epochs, point)
+        interval = self._corrected(epochs, point.sensors)
         chain = Chain.start().extended(interval)
         gnss = self._gnss.take(epochs)
         moments = np.zeros((3, 3))
@@ -405,8 +406,8 @@ class MapEstimator:
             use = gnss.present[:, kind]
             if np.count_nonzero(use) < self.FIRST_FIT - 1 or (kind and total > 0):
                 continue
-            omega = point.undistorted(interval.omega) - point.gyro_bias
-            lever = cross(omega, point.lever_b) if kind == 0 else point.lever_b
+            lever = (cross(point.sensors.rate(interval.omega), point.lever_b) if kind == 0
+                     else point.lever_b)
             integral = chain.v if kind == 0 else chain.p
             a = (integral + (chain.R @ np.broadcast_to(
                 lever, integral.shape)[..., None])[..., 0])[use]
@@ -451,7 +452,7 @@ class MapEstimator:
                              estimate_lever_arm=(estimate_lever_arm
                                                  or LEVER_ARM.start in self.columns),
                              estimate_delay=DELAY.start in self.columns,
-                             estimate_gyro_matrix=GYRO_MATRIX.start in self.columns,
+                             estimate_matrices=GYRO_MATRIX.start in self.columns,
                              capacity=self.count, excess=self.excess)
         other._intervals, other._gnss = intervals, self._gnss.take(slice(0, self.count))
         other.count = self.count
@@ -463,10 +464,7 @@ class MapEstimator:
 
     def raw_intervals(self) -> Intervals:
         """Return the stored intervals as they would be with sensor errors of zero."""
-        zero = np.zeros(3)
-        return self._corrected(slice(0, self.count),
-                               replace(self.prior.mean, gyro_bias=zero, accel_bias=zero,
-                                       gyro_matrix=np.zeros((3, 3))))
+        return self._corrected(slice(0, self.count), SensorErrors.none())
 
     # Results
 
@@ -486,7 +484,7 @@ class MapEstimator:
 
     @property
     def covariance(self) -> Array:
-        """Covariance of the 28 unknowns; zero where one is not estimated, shape (28, 28)."""
+        """Covariance of the 37 unknowns; zero where one is not estimated, shape (37, 37)."""
         full = np.zeros((SIZE, SIZE))
         if self.solution is not None:
             full[np.ix_(self.columns, self.columns)] = self.solution.P
@@ -494,7 +492,7 @@ class MapEstimator:
 
     @property
     def variances(self) -> Array:
-        """Diagonal of `covariance`, shape (28,)."""
+        """Diagonal of `covariance`, shape (37,)."""
         full = np.zeros(SIZE)
         if self.solution is not None:
             full[self.columns] = self.solution.P.diagonal()

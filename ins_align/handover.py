@@ -18,7 +18,7 @@ from dataclasses import replace
 from ins_align.earth import EARTH_RATE
 from ins_align.estimator import MapEstimator
 from ins_align.rotation import Array, exp_so3, skew
-from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, BODY_FIXED, GYRO, GYRO_BIAS, Prior, prior_of,
+from ins_align.unknowns import (ACCEL, ATTITUDE, BODY_FIXED, GYRO, GYRO_BIAS, Prior, prior_of,
                                 SIZE, START_POSITION, START_VELOCITY, Unknowns)
 from ins_align.whitening import HEADING_RESOLVED_STD, START
 import numpy as np
@@ -44,7 +44,7 @@ def prior_from_now(estimator: MapEstimator, C_n0n: Array, shift_v: Array, shift_
         in n0 axes.
     scale : float
         Factor on the covariance, for data that fit worse than stated.
-    wander : ndarray, shape (28,)
+    wander : ndarray, shape (37,)
         Variance by which the unknowns may have changed since t0.
 
     Raises
@@ -96,8 +96,8 @@ def _now(estimator: MapEstimator, heading_free: bool) -> tuple[Unknowns, Array]:
     C = exp_so3([0.0, 0.0, -step[2]]) @ x.C if heading_free else x.C
     error = np.zeros(9)
     error[:estimator.size] = s.chain_errors()
-    # The stored chain holds the biases of the point: their step is still to be applied.
-    gyro, accel = step[GYRO], step[ACCEL_BIAS]
+    # The stored chain has the sensor errors of the point: their step is still to be applied.
+    gyro, accel = step[GYRO], step[ACCEL]
     v = C @ (chain.v + chain.v_g @ gyro + chain.v_a @ accel)
     p = C @ (chain.p + chain.p_g @ gyro + chain.p_a @ accel)
     # Derivatives of what is now to the unknowns; to attitude and start they are those to the
@@ -108,7 +108,7 @@ def _now(estimator: MapEstimator, heading_free: bool) -> tuple[Unknowns, Array]:
     J[6:, START_VELOCITY] = time * np.eye(3)
     E = J[:, START]
     J[:3, GYRO], J[3:6, GYRO], J[6:, GYRO] = C @ chain.R_g, C @ chain.v_g, C @ chain.p_g
-    J[3:6, ACCEL_BIAS], J[6:, ACCEL_BIAS] = C @ chain.v_a, C @ chain.p_a
+    J[3:6, ACCEL], J[6:, ACCEL] = C @ chain.v_a, C @ chain.p_a
     moved = E @ error
     now = replace(
         x, C=exp_so3(error[:3]) @ C @ exp_so3(chain.R_g @ gyro) @ chain.R,

@@ -15,8 +15,8 @@
 IMU samples that have arrived → steps between GNSS epochs, with the white noise that they have.
 
 Noise is what is stated, what is measured, and what makes the samples miss the motion: gaps, stamps
-that jitter, the end of the sensors' range, an incomplete calibration, gravity at a place that is
-not known.
+that jitter, the end of the sensors' range, forces that shift the gyros' biases, gravity at a place
+that is not known.
 """
 
 from collections import Counter
@@ -25,8 +25,8 @@ from functools import reduce
 import math
 
 from ins_align.buffers import ImuBuffer
-from ins_align.calibration import CalibrationErrors
 from ins_align.config import ImuNoise
+from ins_align.g_sensitivity import GSensitivity
 from ins_align.plausibility import IMU_BEFORE, RangeCheck, without_spikes
 from ins_align.preintegration import Noise, split_at_epochs, Steps, white_noise
 from ins_align.recent import Recent, recent_motion
@@ -86,31 +86,40 @@ class ImuCutter:
         self._buffer = buffer
         self._counts = counts
         self._scale_std = stated.gyro_scale_std
+        self._g_sensitivity = GSensitivity(self._scale_std)
         self._range = RangeCheck()
         self._upto_ns = 0                   # up to where the IMU is cut
-        self._seen_ns = 0                   # and looked at
+        self._checked_ns = 0                # and its range checked
 
     def forget_before(self, stamp_ns: int) -> None:
         """Keep what an epoch at or after a stamp wants to look back at."""
         self._buffer.forget_before(stamp_ns - NOISE_WINDOW_NS)
         self._range.forget_before(stamp_ns)
 
-    def look(self, upto_ns: int) -> list[int]:
-        """Look at the samples up to a stamp; return when the gyros have missed too much."""
+    def check_range(self, upto_ns: int) -> list[int]:
+        """
+        Look for samples up to a stamp that are at the end of the sensors' range, and count them.
+
+        Returns
+        -------
+        list of int
+            When the gyros have missed too much, ns.
+
+        """
         stamps = self._buffer.stamps
-        first, last = np.searchsorted(stamps, [self._seen_ns, upto_ns], side='right').tolist()
+        first, last = np.searchsorted(stamps, [self._checked_ns, upto_ns], side='right').tolist()
         context = max(first - IMU_BEFORE, 0)
         around = slice(context, last + 1)
         samples, _ = without_spikes(stamps[around], self._buffer.samples[around])
         before = self._range.stamps.size
         self._range.add(stamps[first:last], samples[first - context:last - context])
         self._counts['imu_saturated'] += self._range.stamps.size - before
-        self._seen_ns = max(self._seen_ns, upto_ns)
+        self._checked_ns = max(self._checked_ns, upto_ns)
         return self._range.blind
 
     def start(self, stamp_ns: int) -> ImuSteps:
         """Return the steps of no length at the first epoch of an alignment."""
-        self._calibration = CalibrationErrors(self._scale_std)
+        self._g_sensitivity = GSensitivity(self._scale_std)
         self._upto_ns = stamp_ns
         return self.cut([stamp_ns], [0.0])[0]
 
@@ -147,12 +156,12 @@ class ImuCutter:
         excess = self._excess(stamps, samples, first, ends[1:])
         gap, jitter = self._of_stamps(stamps, first, ends[1:], steps.dt)
         beyond = self._beyond_range(stamps, ends_ns, steps.dt)
-        calibration = self._calibration.noise(np.diff(ends_ns) * 1e-9, recent)
+        by_force = self._g_sensitivity.noise(np.diff(ends_ns) * 1e-9, recent)
         noise = Noise(
-            _together(self._stated[0], calibration.gyro, GAP_ANGULAR_ACCELERATION * gap,
+            _together(self._stated[0], by_force, GAP_ANGULAR_ACCELERATION * gap,
                       jitter * _rms(steps.omega_dot), beyond[0]),
-            _together(self._stated[1], calibration.accel, GAP_JERK * gap,
-                      jitter * _rms(steps.f_dot), beyond[1], np.array(gravity_drift)[:, None]),
+            _together(self._stated[1], GAP_JERK * gap, jitter * _rms(steps.f_dot), beyond[1],
+                      np.array(gravity_drift)[:, None]),
             excess[:, :1], excess[:, 1:])
         magnitudes = np.sqrt(np.sum(np.square(accel), axis=1))
         sums = np.diff(np.concatenate([[0.0], np.cumsum(magnitudes)])[ends - 2])

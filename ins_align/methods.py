@@ -23,12 +23,12 @@ from dataclasses import dataclass, replace
 import math
 from typing import Protocol
 
-from ins_align.config import Config
+from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimator import FIRST_EXCESS, Innovation, MapEstimator, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
 from ins_align.handover import prior_from_now
 from ins_align.imu_steps import ImuSteps
-from ins_align.preintegration import Noise, preintegrate
+from ins_align.preintegration import Noise, preintegrate, SensorErrors
 from ins_align.rotation import Array, orthonormalized
 from ins_align.signs import LeverArmCheck, SignCheck, TOLD_STD
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
@@ -37,7 +37,7 @@ from ins_align.whitening import Measurements
 import numpy as np
 
 # Biases wander by this share of their prior sigma in this time (s).
-WANDER, WANDER_TIME = 0.1, 100.0
+WANDER, WANDER_TIME = 0.3, 100.0
 # After t0 has moved, the fit so far counts like this many rows.
 PAST_DOF = 300
 # Epochs that are integrated at one go: few right after the linearisation point has moved, because
@@ -143,14 +143,17 @@ class Method(Protocol):
     def renew(self) -> None:
         """Move t0 to the last epoch before the next one is taken, where a method can."""
 
+    def judged(self, contradicted: bool, good: bool) -> None:
+        """Hear whether the data contradict the model, and whether the attitude is good enough."""
+
     def unconfirmed(self) -> str:
         """Return what the data say against signs or lever arm, or do not say for them yet."""
 
     def nuisance(self) -> Nuisance:
         """Return biases, lever arm and delay."""
 
-    def sensor_errors(self) -> tuple[Array, Array, Array]:
-        """Return gyro bias, accelerometer bias and gyro matrix."""
+    def sensor_errors(self) -> SensorErrors:
+        """Return the errors of gyros and accelerometers."""
 
     def prior_without_attitude(self) -> Prior | None:
         """Return what a fresh start may keep."""
@@ -183,14 +186,14 @@ class MapMethod:
         self._capacity = capacity
         self.moved = 0
         noise = config.imu_noise
-        self._estimates_matrix = noise.gyro_scale_std > 0
+        self._estimates_matrices = noise.gyro_scale_std > 0
         self._wander = np.zeros(SIZE)
         self._wander[GYRO_BIAS] = (WANDER * noise.gyro_bias_std) ** 2 / WANDER_TIME
         self._wander[ACCEL_BIAS] = (WANDER * noise.accel_bias_std) ** 2 / WANDER_TIME
-        if prior is None:
-            prior = first_prior(noise.gyro_bias_std, noise.accel_bias_std,
-                                np.array(config.lever_arm), config.lever_arm_std,
-                                0.0, config.gnss_delay_std, noise.gyro_scale_std)
+        self._first_prior = first_prior(
+            noise.gyro_bias_std, noise.accel_bias_std, np.array(config.lever_arm),
+            config.lever_arm_std, 0.0, config.gnss_delay_std, noise.gyro_scale_std,
+            _force_at_rest(imu))
         self._signs = SignCheck()
         self._lever_arm = LeverArmCheck()
         self._ahead = 1
@@ -198,18 +201,18 @@ class MapMethod:
         self._rejected = [0, 0]
         self._past = 0.0, 0
         self._innovation = NOTHING_NEW
-        self._start(epoch, prior)
+        self._start(epoch, prior or self._first_prior)
         self._take_start(epoch, imu)
 
     def _start(self, epoch: AntennaEpoch, prior: Prior, excess: float = FIRST_EXCESS) -> None:
         self.t0_ns = epoch.stamp_ns
-        self._renewed = False
+        self._renewed = self._good = self._contradicted = False
         self._track = InertialTrack.start(epoch.latitude, epoch.longitude, epoch.altitude)
         self._estimator = MapEstimator(
             prior, use_position=self._use_position,
             estimate_lever_arm=self._config.lever_arm_std > 0,
             estimate_delay=self._config.gnss_delay_std > 0, capacity=self._capacity,
-            estimate_gyro_matrix=self._estimates_matrix, excess=excess)
+            estimate_matrices=self._estimates_matrices, excess=excess)
 
     def _take_start(self, epoch: AntennaEpoch, imu: ImuSteps) -> None:
         """Take the epoch at t0."""
@@ -240,6 +243,21 @@ class MapMethod:
         """Move t0 to the last epoch before the next one is taken."""
         self._renewed = self._estimator.solution is not None
 
+    def judged(self, contradicted: bool, good: bool) -> None:
+        """Hear whether the data contradict the model, and whether the attitude is good enough."""
+        self._contradicted = contradicted
+        self._good |= good
+
+    @property
+    def _lost(self) -> bool:
+        """
+        Whether what is estimated is no knowledge to be handed on.
+
+        A heading that never was good enough and does not fit the data is none, nor is what else
+        was found with it.
+        """
+        return self._contradicted and not self._good and not self._estimator.idle
+
     def _take(self, epochs: Sequence[AntennaEpoch], imu: ImuSteps) -> Iterator[AntennaEpoch]:
         """Take epochs as long as the estimator stays where it is."""
         track = self._track.extended(
@@ -256,9 +274,7 @@ class MapMethod:
         gnss = Measurements(track.time, np.hstack([track.s_v(v_n), track.s_p]),
                             C_n0n @ covariance @ C_n0n.transpose(0, 1, 3, 2), present,
                             track.gravity, -track.still_v)
-        gyro_bias, accel_bias, gyro_matrix = self._estimator.sensor_errors
-        intervals = preintegrate(imu.steps, gyro_bias, accel_bias, imu.noise,
-                                 gyro_matrix if self._estimates_matrix else None, imu.recent)
+        intervals = preintegrate(imu.steps, self._estimator.sensor_errors, imu.noise, imu.recent)
         for k, self._innovation in enumerate(self._estimator.add(intervals, gnss)):
             self._track, self._last_epoch = track.at(k), epochs[k]
             self._last_imu = imu.take(slice(k, k + 1))
@@ -270,10 +286,13 @@ class MapMethod:
         self._estimator.settle(last=True)
         track = self._track
         fit = self.fit()
-        prior = prior_from_now(self._estimator, track.C_n0n, -track.still_v, -track.s_p,
-                               fit.significant_scale, self._wander * track.time)
+        if self._lost:
+            prior, self._past = self._first_prior, (0.0, 0)
+        else:
+            prior = prior_from_now(self._estimator, track.C_n0n, -track.still_v, -track.s_p,
+                                   fit.significant_scale, self._wander * track.time)
+            self._past = PAST_DOF * fit.chi2 / max(fit.dof, 1), PAST_DOF
         self._rejected = [fit.rejected_velocity, fit.rejected_position]
-        self._past = PAST_DOF * fit.chi2 / max(fit.dof, 1), PAST_DOF
         self._signs.restart()
         self._lever_arm.restart()
         self.moved += 1
@@ -325,21 +344,27 @@ class MapMethod:
         """Return biases, lever arm and delay."""
         x = self._estimator.estimate()
         std = np.sqrt(self._estimator.variances)
-        return Nuisance(x.gyro_bias, std[GYRO_BIAS], x.accel_bias, std[ACCEL_BIAS],
+        return Nuisance(x.sensors.gyro_bias, std[GYRO_BIAS],
+                        x.sensors.accel_bias, std[ACCEL_BIAS],
                         x.lever_b, std[LEVER_ARM], self._delay(x), float(std[DELAY][0]))
 
     def _delay(self, x: Unknowns) -> float:
         """Return the delay of the GNSS, of which the configured part is not in the unknowns."""
         return float(self._config.gnss_delay + x.delay)
 
-    def sensor_errors(self) -> tuple[Array, Array, Array]:
-        """Return gyro bias, accelerometer bias and gyro matrix."""
-        x = self._estimator.estimate()
-        return x.gyro_bias, x.accel_bias, x.gyro_matrix
+    def sensor_errors(self) -> SensorErrors:
+        """Return the errors of gyros and accelerometers."""
+        return self._estimator.estimate().sensors
 
     def prior_without_attitude(self) -> Prior | None:
         """Return what a fresh start may keep."""
-        return self._estimator.prior_without_attitude()
+        return None if self._lost else self._estimator.prior_without_attitude()
+
+
+def _force_at_rest(imu: ImuSteps) -> Array:
+    """Specific force of a vehicle that stands as it did at t0, about, shape (3,)."""
+    force = imu.steps.f[0, -1] if imu.recent is None else imu.recent.gained[0, -1]
+    return np.asarray(STANDARD_GRAVITY * force / max(float(np.linalg.norm(force)), 1e-3))
 
 
 class NoteMethod:
@@ -371,7 +396,6 @@ class NoteMethod:
         self._free = config.free_start
         self._position_form = config.method == 'pif'
         self._from_positions = self._position_form and use_position
-        self._zero = np.zeros(3)
         self._body = BodyIntegrals(self._lever_b, imu.steps.omega[0, -1])
         place = epoch.latitude, epoch.longitude, epoch.altitude
         self._track = InertialTrack.start(*place)
@@ -395,7 +419,7 @@ class NoteMethod:
 
     def advance(self, epochs: Sequence[AntennaEpoch], imu: ImuSteps) -> Iterator[AntennaEpoch]:
         """Take epochs and the IMU steps before each; yield each when the results are its."""
-        intervals = preintegrate(imu.steps, self._zero, self._zero, Noise())
+        intervals = preintegrate(imu.steps, SensorErrors.none(), Noise())
         for k, epoch in enumerate(epochs):
             self._body.advance(intervals, k)
             time = (epoch.stamp_ns - self.t0_ns) * 1e-9
@@ -468,6 +492,9 @@ class NoteMethod:
     def renew(self) -> None:
         """Nothing to renew: t0 stays."""
 
+    def judged(self, contradicted: bool, good: bool) -> None:
+        """Nothing to hear: t0 stays."""
+
     def unconfirmed(self) -> str:
         """Return nothing: there is no test of the signs."""
         return ''
@@ -477,9 +504,9 @@ class NoteMethod:
         zero = np.zeros(3)
         return Nuisance(zero, zero, zero, zero, self._lever_b, zero, self._config.gnss_delay, 0.0)
 
-    def sensor_errors(self) -> tuple[Array, Array, Array]:
+    def sensor_errors(self) -> SensorErrors:
         """Return zeros."""
-        return self._zero, self._zero, np.zeros((3, 3))
+        return SensorErrors.none()
 
     def prior_without_attitude(self) -> Prior | None:
         """Nothing but the attitude is estimated."""

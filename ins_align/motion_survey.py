@@ -29,6 +29,7 @@ MANOEUVRE_SPEED, MANOEUVRE_TIME = 5.0, 20.0  # m/s of change within so many s
 WEAK_SPEED = 1.0  # m/s: a change below this shows no heading with a usual receiver
 MIN_DISTANCE = 10.0  # m over which velocity and position are compared,
 DISTANCE_SIGMAS = 10.0  # and so many sigmas of a position
+MIN_STEP, STEP_SIGMAS = 1.0, 5.0  # m, so many sigmas: turns between such steps are seen
 MAX_WINDOW = 30.0  # s: who takes longer for the distance is not compared
 MIN_WINDOWS = 4
 MAX_FRAME_ANGLE = math.radians(20.0)
@@ -122,11 +123,11 @@ def velocity_frame(velocities: Series, positions: Series) -> VelocityFrame:
         ENU, m.
 
     """
-    moved, travelled, path = _distances(velocities, positions)
+    moved, travelled, lengths = _distances(velocities, positions)
     count = moved.shape[0]
     if count < MIN_WINDOWS:
         return VelocityFrame('unknown', count)
-    ratio = float(np.median(path / np.hypot(*moved[:, :2].T)))
+    ratio = float(np.median(lengths[:, 1] / lengths[:, 0]))
     moved_h, travelled_h = moved[:, 0] + 1j * moved[:, 1], travelled[:, 0] + 1j * travelled[:, 1]
     as_enu = _mean_direction(moved_h * travelled_h.conj())
     as_ned = _mean_direction(moved_h * (1j * travelled_h.conj()).conj())
@@ -187,11 +188,16 @@ def find_manoeuvres(velocities: Series) -> Manoeuvres | None:
 
 
 def _distances(velocities: Series, positions: Series) -> tuple[Array, Array, Array]:
-    """Return change of position, integral of velocity (K, 3) and its path (K,) by windows."""
+    """
+    Return change of position, integral of velocity, shape (K, 3), and the lengths of both ways.
+
+    Of K windows; the lengths, shape (K, 2), are those of the ways with all their turns.
+    """
     none = np.zeros((0, 3))
     if velocities.times.size < 2 or positions.times.size < 2:
-        return none, none, np.zeros(0)
-    distance = max(MIN_DISTANCE, DISTANCE_SIGMAS * position_noise(positions))
+        return none, none, np.zeros((0, 2))
+    noise = position_noise(positions)
+    distance = max(MIN_DISTANCE, DISTANCE_SIGMAS * noise)
     steps = np.diff(velocities.times)
     middles = 0.5 * (velocities.vectors[1:] + velocities.vectors[:-1])
     speeds = np.hypot(*middles[:, :2].T)
@@ -217,7 +223,23 @@ def _distances(velocities: Series, positions: Series) -> tuple[Array, Array, Arr
             ends.append(index)
             start = index
     change = travelled[ends] - travelled[starts]
-    return moved[ends] - moved[starts], change[:, :3], change[:, 3]
+    lengths = _length(moved[:, :2], max(MIN_STEP, STEP_SIGMAS * noise))
+    return (moved[ends] - moved[starts], change[:, :3],
+            np.column_stack([lengths[ends] - lengths[starts], change[:, 3]]))
+
+
+def _length(places: Array, step: float) -> Array:
+    """Length of the way to each of N places, shape (N, 2), in steps that noise does not make."""
+    lengths: list[float] = []
+    corner: list[float] = []
+    so_far = 0.0
+    for place in places.tolist():
+        corner = corner or place
+        since = math.dist(place, corner)
+        lengths.append(so_far + since)
+        if since >= step:
+            corner, so_far = place, lengths[-1]
+    return np.array(lengths)
 
 
 def _mean_direction(numbers: np.ndarray) -> complex:

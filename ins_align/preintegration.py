@@ -20,6 +20,7 @@ interpolation. All samples of an interval, and all intervals of a batch, are han
 """
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 from ins_align.recent import Recent, RUNGS
 from ins_align.rotation import (apply, Array, by_row, cross, cumulative_rotations,
@@ -30,6 +31,50 @@ from numpy.typing import ArrayLike
 
 # So many steps of the IMU are one to the derivatives.
 DERIVATIVE_STEPS = 4
+
+
+class SensorErrors(NamedTuple):
+    """
+    Errors of gyros and accelerometers that stay: true = measured - matrix @ measured - bias.
+
+    Attributes
+    ----------
+    gyro_bias, accel_bias : ndarray, shape (3,) or (K, 3)
+        rad/s, m/s^2.
+    gyro_matrix, accel_matrix : ndarray, shape (3, 3) or (K, 3, 3)
+        Scale factor errors on the diagonal, misalignment beside it.
+
+    """
+
+    gyro_bias: Array
+    gyro_matrix: Array
+    accel_bias: Array
+    accel_matrix: Array
+
+    @staticmethod
+    def none() -> 'SensorErrors':
+        """Return those of perfect sensors."""
+        return SensorErrors.of(np.zeros(24))
+
+    @staticmethod
+    def of(vector: Array) -> 'SensorErrors':
+        """Return those that make up a vector, shape (..., 24), the matrices row by row."""
+        gyro, accel = vector[..., :12], vector[..., 12:]
+        square = vector.shape[:-1] + (3, 3)
+        return SensorErrors(gyro[..., :3], gyro[..., 3:].reshape(square),
+                            accel[..., :3], accel[..., 3:].reshape(square))
+
+    def vector(self) -> Array:
+        """Return all of them, shape (24,): those of the gyros first, bias before matrix."""
+        return np.concatenate([array.ravel() for array in self])
+
+    def rate(self, measured: Array, biases: float = 1.0) -> Array:
+        """Return the true angular rate, or what is made of it and holds so many biases."""
+        return measured - apply(self.gyro_matrix, measured) - biases * self.gyro_bias
+
+    def force(self, measured: Array, biases: float = 1.0) -> Array:
+        """Return the true specific force, or what is made of it and holds so many biases."""
+        return measured - apply(self.accel_matrix, measured) - biases * self.accel_bias
 
 
 @dataclass(frozen=True)
@@ -45,12 +90,10 @@ class Intervals:
         Rotation from the body frame at the end to the one at the start.
     v, p : ndarray, shape (K, 3)
         Integral and double integral of the specific force, m/s and m.
-    J_Rg, J_vg, J_pg, J_pa : ndarray, shape (K, 3, 3)
-        Derivatives to the gyro bias (g) and accelerometer bias (a): of the rotation as a left
-        error (``R <- exp_so3(J_Rg d) R``), of v, of p. That of v to the accelerometer bias is the
-        same integral as J_Rg.
-    J_Rm, J_vm, J_pm : ndarray, shape (K, 3, 9)
-        Derivatives to the gyros' matrix of scale factors and misalignment, row by row.
+    J_Rg, J_vg, J_pg, J_va, J_pa : ndarray, shape (K, 3, 12)
+        Derivatives to bias and matrix of the gyros (g) and of the accelerometers (a), in the order
+        of `SensorErrors.vector`: of the rotation as a left error (``R <- exp_so3(J_Rg d) R``), of
+        v, of p.
     Q : ndarray, shape (K, 9, 9)
         Covariance of the errors (rotation at the start, v, p) that the sensors' noise leaves.
     Q_excess : ndarray, shape (K, 9, 9)
@@ -69,10 +112,8 @@ class Intervals:
     J_Rg: Array
     J_vg: Array
     J_pg: Array
+    J_va: Array
     J_pa: Array
-    J_Rm: Array
-    J_vm: Array
-    J_pm: Array
     Q: Array
     Q_excess: Array
     omega: Array
@@ -82,10 +123,9 @@ class Intervals:
     @staticmethod
     def empty(capacity: int) -> 'Intervals':
         """Room for `capacity` intervals, to be filled by `put`."""
-        shapes = {'duration': (), 'v': (3,), 'p': (3,), 'omega': (3,), 'Q': (9, 9),
-                  'Q_excess': (9, 9), 'gained': (RUNGS, 3), 'turned': (RUNGS, 3),
-                  'J_Rm': (3, 9), 'J_vm': (3, 9), 'J_pm': (3, 9)}
-        return Intervals(**{field.name: np.zeros((capacity,) + shapes.get(field.name, (3, 3)))
+        shapes = {'duration': (), 'R': (3, 3), 'v': (3,), 'p': (3,), 'omega': (3,), 'Q': (9, 9),
+                  'Q_excess': (9, 9), 'gained': (RUNGS, 3), 'turned': (RUNGS, 3)}
+        return Intervals(**{field.name: np.zeros((capacity,) + shapes.get(field.name, (3, 12)))
                             for field in fields(Intervals)})
 
     def put(self, index: slice, other: 'Intervals') -> None:
@@ -104,18 +144,20 @@ class Intervals:
         To first order in the rotation over an interval: good for telling the signs apart.
         """
         R, v, p = self.R, self.v, self.p
+        # What a bias does stays; an entry of a matrix is one in proportion to what is mirrored.
+        gyro, accel = (np.repeat([1.0, sign], [3, 9]) for sign in (gyro_sign, accel_sign))
         if gyro_sign < 0:
             back = R.transpose(0, 2, 1)
             R, v, p = back, apply(back, v), apply(back, p)
         return Intervals(**{
             **vars(self), 'R': R, 'v': accel_sign * v, 'p': accel_sign * p,
-            'J_vg': accel_sign * self.J_vg, 'J_pg': accel_sign * self.J_pg,
-            'J_Rm': gyro_sign * self.J_Rm, 'J_vm': gyro_sign * accel_sign * self.J_vm,
-            'J_pm': gyro_sign * accel_sign * self.J_pm,
+            'J_Rg': gyro * self.J_Rg, 'J_vg': accel_sign * gyro * self.J_vg,
+            'J_pg': accel_sign * gyro * self.J_pg,
+            'J_va': accel * self.J_va, 'J_pa': accel * self.J_pa,
             'omega': gyro_sign * self.omega, 'gained': accel_sign * self.gained,
             'turned': gyro_sign * self.turned})
 
-    def corrected(self, gyro_bias: Array, accel_bias: Array, gyro_matrix: Array) -> 'Intervals':
+    def corrected(self, change: Array) -> 'Intervals':
         """
         First-order correction of R, v and p for a change of the sensors' errors.
 
@@ -123,20 +165,17 @@ class Intervals:
 
         Parameters
         ----------
-        gyro_bias, accel_bias : ndarray, shape (3,) or (K, 3)
-            By how much they are larger than those that the samples were integrated with.
-        gyro_matrix : ndarray, shape (3, 3) or (K, 3, 3)
-            So it is with the matrix.
+        change : ndarray, shape (24,) or (K, 24)
+            By how much they are larger than those that the samples were integrated with, in the
+            order of `SensorErrors.vector`.
 
         """
-        matrix = gyro_matrix.reshape(gyro_matrix.shape[:-2] + (9,))
+        gyro, accel = change[..., :12], change[..., 12:]
         return Intervals(**{
             **vars(self),
-            'R': exp_so3(apply(self.J_Rg, gyro_bias) + apply(self.J_Rm, matrix)) @ self.R,
-            'v': (self.v + apply(self.J_vg, gyro_bias) + apply(self.J_Rg, accel_bias)
-                  + apply(self.J_vm, matrix)),
-            'p': (self.p + apply(self.J_pg, gyro_bias) + apply(self.J_pa, accel_bias)
-                  + apply(self.J_pm, matrix))})
+            'R': exp_so3(apply(self.J_Rg, gyro)) @ self.R,
+            'v': self.v + apply(self.J_vg, gyro) + apply(self.J_va, accel),
+            'p': self.p + apply(self.J_pg, gyro) + apply(self.J_pa, accel)})
 
 
 @dataclass(frozen=True)
@@ -290,8 +329,8 @@ def white_noise(stamps: 'Array | Index', samples: Array, first: Index, last: Ind
     return np.where(enough[:, None], density, 0.0)
 
 
-def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise,
-                 gyro_matrix: 'Array | None' = None, recent: 'Recent | None' = None) -> Intervals:
+def preintegrate(steps: Steps, sensors: SensorErrors, noise: Noise,
+                 recent: 'Recent | None' = None) -> Intervals:
     """
     Integrate the steps of K intervals.
 
@@ -303,13 +342,10 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     ----------
     steps : Steps
         The samples, cut at the epochs.
-    gyro_bias, accel_bias : ndarray, shape (3,)
+    sensors : SensorErrors
         Subtracted first.
     noise : Noise
         Of the sensors, in each step.
-    gyro_matrix : ndarray, shape (3, 3), optional
-        Scale factors and misalignment: the true rate is ``omega - gyro_matrix @ omega -
-        gyro_bias``. Without it the derivatives to it are left out, that is zero.
     recent : Recent, optional
         Motion before the end of each interval. Without it force and rate at the end are taken to
         have lasted.
@@ -326,10 +362,7 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
 
     """
     dt = steps.dt
-    omega = steps.omega - gyro_bias
-    if gyro_matrix is not None:
-        omega -= apply(gyro_matrix, steps.omega)
-    f = steps.f - accel_bias
+    omega, f = sensors.rate(steps.omega), sensors.force(steps.f)
     omega0, omega1 = omega[:, :-1], omega[:, 1:]
     f0, f1 = f[:, :-1], f[:, 1:]
     h = dt[..., None]
@@ -356,10 +389,8 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     passed = np.cumsum(dt, axis=1)
     duration = passed[:, -1]
     remaining = duration[:, None] - passed + 0.5 * dt       # from the middle of each step on
-    measured = None if gyro_matrix is None else 0.5 * (steps.omega[:, :-1] + steps.omega[:, 1:])
-    J_R, J_v, J_p, J_pa = _derivatives(dt, A @ jacobian * dt[..., None, None], u, measured)
-    none = np.zeros((dt.shape[0], 3, 9))
-    J_Rm, J_vm, J_pm = (none if gyro_matrix is None else J[..., 3:] for J in (J_R, J_v, J_p))
+    derivatives = _derivatives(dt, A @ jacobian * h[..., None], u, *(
+        0.5 * (measured[:, :-1] + measured[:, 1:]) for measured in (steps.omega, steps.f)))
 
     v, p = v_end[:, -1], p_end[:, -1]
     v_rest = v[:, None] - v_mid
@@ -386,18 +417,18 @@ def preintegrate(steps: Steps, gyro_bias: Array, accel_bias: Array, noise: Noise
     R = orthonormalized(turned[:, -1])
     if recent is None:
         recent = Recent.steady(steps.f[:, -1], steps.omega[:, -1])
-    return Intervals(duration, R, v, p, J_R[..., :3], J_v[..., :3], J_p[..., :3], J_pa, J_Rm, J_vm,
-                     J_pm, Q, Q_excess, steps.omega[:, -1], recent.gained, recent.turned)
+    return Intervals(duration, R, v, p, *derivatives, Q, Q_excess, steps.omega[:, -1],
+                     recent.gained, recent.turned)
 
 
-def _derivatives(dt: Array, turns: Array, u: Array,
-                 rate: 'Array | None') -> tuple[Array, Array, Array, Array]:
+def _derivatives(dt: Array, turns: Array, u: Array, rate: Array,
+                 force: Array) -> tuple[Array, Array, Array, Array, Array]:
     """
-    Derive rotation, v and p by gyro bias and matrix, and p by accelerometer bias.
+    Derive rotation, v and p by the errors of the gyros, v and p by those of the accelerometers.
 
     A gyro bias turns the rest of the interval by minus the integral of the attitude; an entry of
-    the matrix is a bias in proportion to a rate. A few steps are taken as one: what the motion
-    does within them is of second order in something that is small.
+    a matrix is a bias in proportion to a rate or force. A few steps are taken as one: what the
+    motion does within them is of second order in something that is small.
 
     Parameters
     ----------
@@ -407,13 +438,13 @@ def _derivatives(dt: Array, turns: Array, u: Array,
         Integral of the attitude over each step.
     u : ndarray, shape (K, n, 3)
         Velocity gained in it.
-    rate : ndarray, shape (K, n, 3), optional
-        As measured. Without it there are no derivatives to the matrix.
+    rate, force : ndarray, shape (K, n, 3)
+        As measured.
 
     Returns
     -------
-    J_R, J_v, J_p : ndarray, shape (K, 3, 3) or (K, 3, 12)
-    J_pa : ndarray, shape (K, 3, 3)
+    J_Rg, J_vg, J_pg, J_va, J_pa : ndarray, shape (K, 3, 12)
+        As in `Intervals`.
 
     """
     def together(values: Array) -> Array:
@@ -421,16 +452,17 @@ def _derivatives(dt: Array, turns: Array, u: Array,
 
     seconds = together(dt)
     turns, u = together(turns), together(u)
-    if rate is not None:
-        mean = together(rate * dt[..., None]) / np.maximum(seconds, 1e-9)[..., None]
-        turns = np.concatenate([turns, by_row(turns, mean)], axis=-1)
-    turned_by = np.cumsum(turns, axis=1)
-    pushes = skew(u) @ (turned_by - 0.5 * turns)
+    per_second = 1 / np.maximum(seconds, 1e-9)[..., None]
+    by_gyros, by_accelerometers = (
+        np.concatenate([turns, by_row(turns, per_second * together(dt[..., None] * measured))],
+                       axis=-1) for measured in (rate, force))
+    turned_by = np.cumsum(by_gyros, axis=1)
+    pushes = skew(u) @ (turned_by - 0.5 * by_gyros)
     # What a step adds to the velocity moves the body for the time that remains.
     passed = np.cumsum(seconds, axis=1)
     remaining = (passed[:, -1:] - passed + 0.5 * seconds)[..., None, None]
     return (-turned_by[:, -1], np.sum(pushes, axis=1), np.sum(remaining * pushes, axis=1),
-            -np.sum(remaining * turns[..., :3], axis=1))
+            -np.sum(by_accelerometers, axis=1), -np.sum(remaining * by_accelerometers, axis=1))
 
 
 def _least_and_more(density: ArrayLike) -> tuple[Array, Array]:

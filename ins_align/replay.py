@@ -15,22 +15,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-import dataclasses
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 import io
-import itertools
 import math
 import os
 from typing import Any
 
 from ins_align.aligner import Aligner
-from ins_align.bag_files import BagError, Topic
-from ins_align.bags import Bag, Block, Topics
+from ins_align.bags import Topics
 from ins_align.config import Config
 from ins_align.declaration import State
-from ins_align.decoding import decode_imu, decode_orientations, deserialize, Orientations
-from ins_align.messages import fix_from_msg, MessageError, velocity_from_msg
+from ins_align.decoding import ImuSamples, joined, Orientations
+from ins_align.messages import Fix
+from ins_align.reading import Part, read, Request
 from ins_align.results import Attitude, Epoch, Status
 from ins_align.rotation import (
     Array, exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw)
@@ -183,121 +181,64 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
         If the recording cannot be read or lacks a topic.
 
     """
-    with Bag(path) as bag:
-        try:
-            topics = bag.choose_topics(config or Config(), imu_topic, fix_topic, velocity_topic)
-        except BagError as error:
-            reasons = f' ({bag.warnings[0]})' if bag.warnings else ''
-            raise BagError(f'{error}{reasons}') from None
-        config = config or Config()
-        if topics.velocity_type is not None:
-            config = dataclasses.replace(config, velocity_type=topics.velocity_type)
-        run = _Run(Aligner(config), config, topics)
-        try:
-            for block, done in _blocks(bag, run.read, start, duration):
-                run.feed(block)
-                if progress is not None:
-                    progress(done)
-        except OSError as error:
-            raise BagError(f'{path} cannot be read: {error.strerror}') from None
-        return run.result(str(path), bag.warnings)
-
-
-def _blocks(bag: Bag, topics: Sequence[Topic], start: float | None, duration: float | None,
-            ) -> Iterator[tuple[Block, float]]:
-    """Yield messages many at a time, and how much of the recording they end at."""
-    first = bag.start_ns or 0
-    start_ns = first + round((start or 0.0) * 1e9)
-    stop_ns = None if duration is None else start_ns + round(duration * 1e9)
-    end = bag.end_ns or start_ns
-    if stop_ns is not None:
-        end = min(end, stop_ns)
-    for block in bag.blocks(topics, start_ns, stop_ns):
-        done = (block.times_ns[-1] - start_ns) / (end - start_ns) if end > start_ns else 1.0
-        yield block, min(max(done, 0.0), 1.0)
+    request = Request(path, config or Config(), imu_topic, fix_topic, velocity_topic, start,
+                      duration)
+    run: _Run | None = None
+    for part in read(request):
+        run = run or _Run(str(path), part.config, part.topics)
+        run.feed(part)
+        if progress is not None:
+            progress(part.done)
+    assert run is not None
+    return run.result(part.warnings)
 
 
 class _Run:
     """One pass over a recording."""
 
-    def __init__(self, aligner: Aligner, config: Config, topics: Topics) -> None:
-        self._aligner = aligner
-        self._config = config
-        self._topics = topics
-        self.read = tuple(topic for topic in (topics.imu, topics.fix, topics.velocity,
-                                              topics.reference) if topic is not None)
+    def __init__(self, path: str, config: Config, topics: Topics) -> None:
+        self._path, self._config, self._topics = path, config, topics
+        self._aligner = Aligner(config)
         self._epochs: list[Epoch] = []
         self._references: list[Orientations] = []
         self._fixes: list[tuple[int, float, float]] = []
 
-    def feed(self, block: Block) -> None:
-        """Give a block of messages to the aligner, the IMU's decoded all at once."""
-        topics = self._topics
-        kinds = np.array([0 if topic is topics.imu else 1 if topic is topics.reference else 2
-                          for topic in self.read])[np.array(block.topics)]
-        imu_messages = list(itertools.compress(block.messages, (kinds == 0).tolist()))
-        samples = decode_imu(imu_messages, topics.imu)
-        if not samples.decoded.all():
-            for _ in range(np.count_nonzero(~samples.decoded)):
-                self._aligner.reject('imu_undecodable')
-        # For each message of the block: how many usable IMU samples come before it.
-        before = np.zeros(len(kinds), np.int64)
-        before[kinds == 0] = samples.decoded
-        before = np.cumsum(before)
+    def feed(self, part: Part) -> None:
+        """Give a part to the aligner."""
+        aligner, imu = self._aligner, part.imu
+        for _ in range(np.count_nonzero(~imu.decoded)):
+            aligner.reject('imu_undecodable')
         position = 0
-        for index in np.flatnonzero(kinds == 2).tolist():
-            end = int(before[index])
-            self._add_imu(samples, position, end)
-            position = end
-            if self.read[block.topics[index]] is topics.fix:
-                self._add_fix(block.messages[index])
+        for before, message in part.gnss:
+            self._add_imu(imu, position, before)
+            position = before
+            if isinstance(message, str):
+                aligner.reject(message)
+            elif isinstance(message, Fix):
+                self._fixes.append((message.stamp_ns, message.latitude_deg,
+                                    message.longitude_deg))
+                aligner.add_fix(message)
             else:
-                self._add_velocity(block.messages[index])
-        self._add_imu(samples, position, len(samples.stamps_ns))
-        self._epochs += self._aligner.update()
-        if topics.reference is not None and (kinds == 1).any():
-            self._references.append(decode_orientations(
-                list(itertools.compress(block.messages, (kinds == 1).tolist())),
-                topics.reference))
+                aligner.add_velocity(message)
+        self._add_imu(imu, position, len(imu.stamps_ns))
+        self._epochs += aligner.update()
+        if part.orientations.stamps_ns.size:
+            self._references.append(part.orientations)
 
-    def result(self, bag: str, warnings: list[str]) -> ReplayResult:
-        """Return what came of all blocks."""
+    def _add_imu(self, imu: ImuSamples, start: int, end: int) -> None:
+        if end > start:
+            self._aligner.add_imu(imu.stamps_ns[start:end], imu.gyro[start:end],
+                                  imu.accel[start:end])
+
+    def result(self, warnings: tuple[str, ...]) -> ReplayResult:
+        """Return what came of all parts."""
         self._epochs += self._aligner.flush()
-        reference = None
-        if self._references:
-            reference = Reference(Orientations(
-                *(np.concatenate(columns) for columns in zip(*self._references))))
+        reference = Reference(joined(self._references)) if self._references else None
         first_fix_ns = self._fixes[0][0] if self._fixes else 0
         track = np.array([(stamp - first_fix_ns, latitude, longitude)
                           for stamp, latitude, longitude in self._fixes]).reshape(-1, 3)
-        return ReplayResult(bag, self._aligner.status(), tuple(self._epochs), tuple(warnings),
+        return ReplayResult(self._path, self._aligner.status(), tuple(self._epochs), warnings,
                             reference, self._topics, track, first_fix_ns, self._config)
-
-    def _add_imu(self, samples: Any, start: int, end: int) -> None:
-        if end > start:
-            self._aligner.add_imu(samples.stamps_ns[start:end], samples.gyro[start:end],
-                                  samples.accel[start:end])
-
-    def _add_fix(self, data: bytes) -> None:
-        try:
-            fix = fix_from_msg(deserialize(data, self._topics.fix))
-        except MessageError:
-            self._aligner.reject('fix_undecodable')
-            return
-        self._fixes.append((fix.stamp_ns, fix.latitude_deg, fix.longitude_deg))
-        self._aligner.add_fix(fix)
-
-    def _add_velocity(self, data: bytes) -> None:
-        assert self._topics.velocity is not None
-        try:
-            message = deserialize(data, self._topics.velocity)
-        except MessageError:
-            self._aligner.reject('velocity_undecodable')
-            return
-        try:
-            self._aligner.add_velocity(velocity_from_msg(message, self._config))
-        except MessageError:
-            self._aligner.reject('velocity_body_frame')
 
 
 def _attitude_json(attitude: Attitude | None) -> dict[str, Any] | None:

@@ -159,7 +159,12 @@ def feed(aligner: Any, simulation: Simulation, *, fix: bool = True,
         Of every update and the final flush.
 
     """
-    epochs = []
+    return list(epochs_of(aligner, simulation, fix=fix, velocity=velocity))
+
+
+def epochs_of(aligner: Any, simulation: Simulation, *, fix: bool = True,
+              velocity: bool = True) -> Iterator[Any]:
+    """Do as `feed`, and yield the epochs as they come."""
     for count, (kind, payload) in enumerate(simulation.messages()):
         if kind == 'imu':
             aligner.add_imu(*payload)
@@ -168,9 +173,8 @@ def feed(aligner: Any, simulation: Simulation, *, fix: bool = True,
         elif kind == 'velocity' and velocity:
             aligner.add_velocity(payload)
         if count % FEED_BLOCK == 0:
-            epochs.extend(aligner.update())
-    epochs.extend(aligner.flush())
-    return epochs
+            yield from aligner.update()
+    yield from aligner.flush()
 
 
 def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0,
@@ -178,6 +182,7 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
              imu_rate: float = 100.0, imu_jitter: float = 0.0,
              gyro_bias_std: float | None = None, accel_bias_std: float | None = None,
              gyro_scale_std: float = 0.0, gyro_misalignment_std: float = 0.0,
+             accel_scale_std: float = 0.0, accel_misalignment_std: float = 0.0,
              lever_arm: Sequence[float] = (1.0, 1.0, 1.0),
              mount_rpy_deg: Sequence[float] = (0.0, 0.0, 0.0),
              gnss_rate: float = 5.0, gnss_phase: float = 0.0137,
@@ -218,6 +223,8 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
     gyro_scale_std, gyro_misalignment_std : float
         Scale factor error of each gyro (0.01 is one percent), and what it feels of the rate about
         each of the other axes.
+    accel_scale_std, accel_misalignment_std : float
+        So it is with the accelerometers and the force along the axes.
     lever_arm : three floats
         IMU to antenna in the IMU frame, m.
     mount_rpy_deg : three floats
@@ -285,16 +292,18 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
     truth_gyro, truth_accel = trajectory.gyro @ C_vb, trajectory.accel @ C_vb
     gyro_bias = scale * noise.gyro_bias_std * streams[0].standard_normal(3)
     accel_bias = scale * noise.accel_bias_std * streams[0].standard_normal(3)
-    gyro_matrix = np.eye(3) + scale * gyro_scale_std * np.diag(streams[0].standard_normal(3))
-    gyro_matrix += (scale * gyro_misalignment_std * (1 - np.eye(3))
-                    * streams[0].standard_normal((3, 3)))
+    gyro_matrix, accel_matrix = (
+        np.eye(3) + scale * scale_std * np.diag(streams[0].standard_normal(3))
+        + scale * misalignment_std * (1 - np.eye(3)) * streams[0].standard_normal((3, 3))
+        for scale_std, misalignment_std in ((gyro_scale_std, gyro_misalignment_std),
+                                            (accel_scale_std, accel_misalignment_std)))
     gyro_std = scale * noise.angle_random_walk * math.sqrt(imu_rate)
     accel_std = scale * noise.velocity_random_walk * math.sqrt(imu_rate)
     sign = np.array(IMU_AXES[flip_axis])
     shape = truth_gyro.shape
     gyro = sign * (truth_gyro @ gyro_matrix.T + gyro_bias
                    + gyro_std * streams[1].standard_normal(shape))
-    accel = accel_sign * sign * (truth_accel + accel_bias
+    accel = accel_sign * sign * (truth_accel @ accel_matrix.T + accel_bias
                                  + accel_std * streams[2].standard_normal(shape))
 
     stamps, time = _gnss_epochs(duration, gnss_rate, gnss_phase, gnss_delay, outages)

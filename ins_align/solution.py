@@ -75,7 +75,7 @@ class Solution:
     point : Unknowns
     prior : Prior
     columns : ndarray of int, shape (n,)
-        Unknowns that are estimated, out of the 28.
+        Unknowns that are estimated, out of the 37.
     size : int
         9 when positions are used, 6 when velocities alone are.
     excess : float
@@ -219,7 +219,7 @@ class Solution:
                       J @ P @ J.transpose(0, 2, 1) + whitened.P[:, :3, :3])
 
     def step(self) -> Array:
-        """Step from the point to the estimate, of all unknowns, shape (28,)."""
+        """Step from the point to the estimate, of all unknowns, shape (37,)."""
         dx = np.zeros(SIZE)
         dx[self._columns] = self.dx
         return dx
@@ -236,7 +236,7 @@ class Solution:
 
 
 def _nonlinearity(step: Array, P: Array, time: Array) -> Array:
-    """Second-order error of a step, shape (K, 28), in sigmas of tilt or heading, shape (K,)."""
+    """Second-order error of a step, shape (K, 37), in sigmas of tilt or heading, shape (K,)."""
     tilt_e, tilt_n, turn = np.abs(step[:, ATTITUDE].T)
     tilt = np.hypot(tilt_e, tilt_n) + time * np.sqrt(np.sum(step[:, GYRO_BIAS] ** 2, axis=1))
     variances = np.diagonal(P, axis1=1, axis2=2)

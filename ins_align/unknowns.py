@@ -14,22 +14,25 @@
 """
 The unknowns of an alignment and what is known of them beforehand.
 
-All 28 of them have their place in one vector; an estimator takes those columns that it estimates.
+All 37 of them have their place in one vector; an estimator takes those columns that it estimates.
 """
 
 from dataclasses import dataclass, replace
 import math
 
 from ins_align.earth import EARTH_RATE
-from ins_align.rotation import apply, Array, exp_so3, Index, log_so3
+from ins_align.preintegration import SensorErrors
+from ins_align.rotation import Array, by_row, exp_so3, Index, log_so3
 import numpy as np
+from numpy.typing import ArrayLike
 
 # A heading is never known worse than uniform on the circle.
 UNIFORM_ANGLE_STD = math.pi / math.sqrt(3)
 # Of a lever arm that is not known, metres per axis.
 FREE_LEVER_STD = 2.0
-# Misalignment of the gyros, over the error of their scale factors.
-GYRO_MISALIGNMENT = 0.3
+# Over the error of the gyros' scale factors: their misalignment; scale factors and misalignment of
+# the accelerometers.
+GYRO_MISALIGNMENT, ACCEL_ERRORS = 0.3, 0.3
 
 
 @dataclass(frozen=True)
@@ -41,11 +44,7 @@ class Unknowns:
     ----------
     C : ndarray, shape (3, 3)
         Initial attitude ``C_nb(0)``.
-    gyro_bias, accel_bias : ndarray, shape (3,)
-        rad/s, m/s^2; measured minus true.
-    gyro_matrix : ndarray, shape (3, 3)
-        Scale factor errors of the gyros on the diagonal, misalignment beside it: the true rate is
-        ``measured - gyro_matrix @ measured - gyro_bias``.
+    sensors : SensorErrors
     start_velocity, start_position : ndarray, shape (3,)
         Of the IMU at t0 in n0, relative to the antenna's track (c_v, c_p of method.md).
     lever_b : ndarray, shape (3,)
@@ -56,60 +55,55 @@ class Unknowns:
     """
 
     C: Array
-    gyro_bias: Array
-    gyro_matrix: Array
-    accel_bias: Array
+    sensors: SensorErrors
     start_velocity: Array
     start_position: Array
     lever_b: Array
     delay: float | Array
 
     def vector(self) -> Array:
-        """All but the attitude, which has three zeros, shape (28,)."""
-        return np.concatenate([np.zeros(3), self.gyro_bias, self.gyro_matrix.ravel(),
-                               self.accel_bias, self.start_velocity, self.start_position,
-                               self.lever_b, [self.delay]])
+        """All but the attitude, which has three zeros, shape (37,)."""
+        return np.concatenate([np.zeros(3), self.sensors.vector(), self.start_velocity,
+                               self.start_position, self.lever_b, [self.delay]])
 
     def moved(self, dx: Array) -> 'Unknowns':
-        """Return the point moved by `dx`, shape (..., 28)."""
-        turned = exp_so3(dx[..., ATTITUDE]) @ self.C
-        matrix = dx[..., GYRO_MATRIX].reshape(dx.shape[:-1] + (3, 3))
-        return Unknowns(turned, self.gyro_bias + dx[..., GYRO_BIAS],
-                        self.gyro_matrix + matrix,
-                        self.accel_bias + dx[..., ACCEL_BIAS],
+        """Return the point moved by `dx`, shape (..., 37)."""
+        return Unknowns(exp_so3(dx[..., ATTITUDE]) @ self.C,
+                        SensorErrors.of(self.sensors.vector() + dx[..., SENSORS]),
                         self.start_velocity + dx[..., START_VELOCITY],
                         self.start_position + dx[..., START_POSITION],
                         self.lever_b + dx[..., LEVER_ARM], self.delay + dx[..., DELAY.start])
 
     def at(self, index: int) -> 'Unknowns':
         """Return one of many."""
-        return Unknowns(*(array[index] for array in vars(self).values()))
+        C, sensors, *others = vars(self).values()
+        return Unknowns(C[index], SensorErrors(*(array[index] for array in sensors)),
+                        *(array[index] for array in others))
 
     def minus(self, other: 'Unknowns') -> Array:
-        """Return the step from `other` to this point, shape (28,)."""
+        """Return the step from `other` to this point, shape (37,)."""
         step = self.vector() - other.vector()
         step[:3] = log_so3(self.C @ other.C.T)
         return step
 
-    def undistorted(self, measured: Array) -> Array:
-        """Return what gyros measured, shape (K, 3), without scale factor and misalignment."""
-        return measured - apply(self.gyro_matrix, measured)
-
 
 # Places of the blocks in the full vector of unknowns.
 ATTITUDE, GYRO_BIAS, GYRO_MATRIX = slice(0, 3), slice(3, 6), slice(6, 15)
-ACCEL_BIAS, START_VELOCITY, START_POSITION = slice(15, 18), slice(18, 21), slice(21, 24)
-LEVER_ARM, DELAY = slice(24, 27), slice(27, 28)
-SIZE = 28
-GYRO = slice(3, 15)                     # bias and matrix
+ACCEL_BIAS, ACCEL_MATRIX = slice(15, 18), slice(18, 27)
+START_VELOCITY, START_POSITION = slice(27, 30), slice(30, 33)
+LEVER_ARM, DELAY = slice(33, 36), slice(36, 37)
+SIZE = 37
+# Bias and matrix.
+GYRO, ACCEL = slice(GYRO_BIAS.start, GYRO_MATRIX.stop), slice(ACCEL_BIAS.start, ACCEL_MATRIX.stop)
+SENSORS = slice(GYRO.start, ACCEL.stop)
 # Unknowns that outlive a new t0 and do not depend on the heading.
-BODY_FIXED = np.r_[GYRO, ACCEL_BIAS, LEVER_ARM, DELAY]
+BODY_FIXED = np.r_[SENSORS, LEVER_ARM, DELAY]
 
 
 @dataclass(frozen=True)
 class Prior:
     """
-    What is known of x before the data: a mean and an information matrix over all 28 unknowns.
+    What is known of x before the data: a mean and an information matrix over all 37 unknowns.
 
     With `heading_free` the heading of the mean is arbitrary and carries no information.
     """
@@ -135,8 +129,10 @@ class Prior:
         sign[GYRO_BIAS], sign[ACCEL_BIAS] = gyro_sign, accel_sign
         sign = sign[unknowns]
         zero = np.zeros(3)
-        mean = replace(self.mean, C=np.eye(3), gyro_bias=gyro_sign * self.mean.gyro_bias,
-                       accel_bias=accel_sign * self.mean.accel_bias, start_velocity=zero,
+        sensors = self.mean.sensors
+        sensors = sensors._replace(gyro_bias=gyro_sign * sensors.gyro_bias,
+                                   accel_bias=accel_sign * sensors.accel_bias)
+        mean = replace(self.mean, C=np.eye(3), sensors=sensors, start_velocity=zero,
                        start_position=zero)
         return prior_of(mean, covariance * np.outer(sign, sign), unknowns, False)
 
@@ -172,7 +168,7 @@ class Prior:
 
 def first_prior(gyro_bias_std: float, accel_bias_std: float, lever_b: Array,
                 lever_std: float, delay: float, delay_std: float,
-                gyro_scale_std: float = 0.0) -> Prior:
+                gyro_scale_std: float = 0.0, force: ArrayLike = (0.0, 0.0, 0.0)) -> Prior:
     """
     Return the prior before any data: biases, lever arm and delay; nothing else.
 
@@ -185,21 +181,29 @@ def first_prior(gyro_bias_std: float, accel_bias_std: float, lever_b: Array,
     lever_std, delay, delay_std : float
         Metres per axis, seconds.
     gyro_scale_std : float
-        Per axis, 0.01 is one percent, to which misalignment is in proportion; 0: neither.
+        Per axis, 0.01 is one percent, to which misalignment and the errors of the accelerometers
+        are in proportion; 0: none of these.
+    force : array_like, shape (3,)
+        Specific force, m/s^2, at which all errors of the accelerometers together are as large as
+        their biases are said to be.
 
     """
     std = np.full(SIZE, math.inf)
     std[GYRO_BIAS], std[ACCEL_BIAS] = gyro_bias_std, accel_bias_std
     if gyro_scale_std > 0:
         std[GYRO_MATRIX] = gyro_matrix_std(gyro_scale_std).ravel()
+        std[ACCEL_MATRIX] = ACCEL_ERRORS * gyro_scale_std
     if lever_std > 0:
         std[LEVER_ARM] = lever_std
     if delay_std > 0:
         std[DELAY] = delay_std
     zero = np.zeros(3)
-    mean = Unknowns(np.eye(3), zero, np.zeros((3, 3)), zero, zero, zero,
-                    np.asarray(lever_b, dtype=float), delay)
-    return Prior(mean, np.diag(std ** -2.0), False)
+    mean = Unknowns(np.eye(3), SensorErrors.none(), zero, zero, np.asarray(lever_b, dtype=float),
+                    delay)
+    told = np.eye(SIZE)                     # what the sigmas are of, out of the unknowns
+    if gyro_scale_std > 0:
+        told[ACCEL_BIAS, ACCEL_MATRIX] = by_row(np.eye(3), np.asarray(force, dtype=float))
+    return Prior(mean, told.T @ np.diag(std ** -2.0) @ told, False)
 
 
 def gyro_matrix_std(gyro_scale_std: float) -> Array:

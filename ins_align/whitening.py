@@ -26,8 +26,9 @@ from ins_align.preintegration import Intervals
 from ins_align.recent import AGES, exact, smooth
 from ins_align.rotation import (apply, Array, by_row, cross, cumulative_rotations, exp_so3, Index,
                                 running_sum, skew)
-from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO, GYRO_BIAS, GYRO_MATRIX,
-                                LEVER_ARM, SIZE, START_POSITION, START_VELOCITY, Unknowns)
+from ins_align.unknowns import (ACCEL, ACCEL_BIAS, ACCEL_MATRIX, ATTITUDE, DELAY, GYRO, GYRO_BIAS,
+                                GYRO_MATRIX, LEVER_ARM, SIZE, START_POSITION, START_VELOCITY,
+                                Unknowns)
 import numpy as np
 
 # Below this heading sigma (rad) the problem is as good as linear in the heading.
@@ -87,22 +88,21 @@ class Measurements:
 
 @dataclass
 class Chain:
-    """The integrated IMU data up to an epoch, and their derivatives to the biases."""
+    """The integrated IMU data up to an epoch, and their derivatives to the sensors' errors."""
 
     R: Array                # C_b0b
     v: Array                # int C_b0b f
     p: Array                # int int C_b0b f
-    R_g: Array              # left error of R to gyro bias and matrix, (3, 12)
+    R_g: Array              # left error of R to bias and matrix of the gyros, (3, 12)
     v_g: Array
-    v_a: Array
     p_g: Array
+    v_a: Array              # to those of the accelerometers
     p_a: Array
 
     @staticmethod
     def start() -> 'Chain':
         """Return the chain at t0."""
-        gyro, accel = np.zeros((3, 12)), np.zeros((3, 3))
-        return Chain(np.eye(3), np.zeros(3), np.zeros(3), gyro, gyro, accel, gyro, accel)
+        return Chain(np.eye(3), np.zeros(3), np.zeros(3), *(np.zeros((3, 12)) for _ in range(5)))
 
     def at(self, index: int | slice) -> 'Chain':
         """Return one or some epochs of a chain over many."""
@@ -121,18 +121,14 @@ class Chain:
             after = running_sum(start, steps)
             return np.concatenate([start[None], after[:-1]]), after
 
-        def gyro(bias: Array, matrix: Array) -> Array:
-            return R @ np.concatenate([bias, matrix], axis=-1)
-
-        RJ = gyro(interval.J_Rg, interval.J_Rm)
-        R_g, R_g_end = total(self.R_g, RJ)
-        v_g, v_g_end = total(self.v_g, gyro(interval.J_vg, interval.J_vm) - skew_u @ R_g)
-        v_a, v_a_end = total(self.v_a, RJ[..., :3])
+        R_g, R_g_end = total(self.R_g, R @ interval.J_Rg)
+        v_g, v_g_end = total(self.v_g, R @ interval.J_vg - skew_u @ R_g)
+        v_a, v_a_end = total(self.v_a, R @ interval.J_va)
         v, v_end = total(self.v, u)
         p_end = total(self.p, w + interval.duration[:, None] * v)[1]
-        p_g_end = total(self.p_g, h * v_g + gyro(interval.J_pg, interval.J_pm) - skew_w @ R_g)[1]
+        p_g_end = total(self.p_g, h * v_g + R @ interval.J_pg - skew_w @ R_g)[1]
         p_a_end = total(self.p_a, h * v_a + R @ interval.J_pa)[1]
-        return Chain(R_end, v_end, p_end, R_g_end, v_g_end, v_a_end, p_g_end, p_a_end)
+        return Chain(R_end, v_end, p_end, R_g_end, v_g_end, p_g_end, v_a_end, p_a_end)
 
 
 def chain_noise(C: Array, time: Array, chain: Chain, interval: Intervals, size: int,
@@ -192,7 +188,7 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
 
     Returns
     -------
-    ndarray, shape (K, 6, 29)
+    ndarray, shape (K, 6, 38)
         The residual ``s - model`` in the first column, then the derivative of the model to each
         unknown.
 
@@ -205,15 +201,16 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     CR = C @ chain.R
     moved_v, moved_p = apply(C, chain.v), apply(C, chain.p)         # in n0
     # What the receiver saw happened a delay before: there the motion before the epoch leads back.
-    gained = interval.gained - AGES[:, None] * point.accel_bias
-    _, gained_v, gained_p = exact(gained, delay)
+    sensors = point.sensors
+    _, measured_v, measured_p = exact(interval.gained, delay)
+    gained_v = sensors.force(measured_v, delay)
+    gained_p = sensors.force(measured_p, delay ** 2 / 2)
     measured_rate, measured_turn, _ = exact(interval.turned, delay)
-    rate = point.undistorted(measured_rate) - point.gyro_bias
-    turn = point.undistorted(measured_turn) - delay * point.gyro_bias
+    rate, turn = sensors.rate(measured_rate), sensors.rate(measured_turn, delay)
     rate += 0.5 * cross(turn, rate)
     # A lever arm swings with the vibration too.
     vibration = interval.omega - exact(interval.turned, 0.0)[0]
-    omega = rate + point.undistorted(vibration)
+    omega = rate + sensors.rate(vibration, 0.0)
     CR_seen = CR @ exp_so3(-turn)
     swing = CR_seen @ skew(omega)
     swung = apply(CR_seen, cross(omega, lever))
@@ -243,16 +240,20 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     measured_rate += vibration
     H[:, VELOCITY, GYRO_MATRIX] += by_row(arm, measured_rate) - by_row(turned_arm, measured_turn)
     H[:, POSITION, GYRO_MATRIX] -= by_row(arm, measured_turn)
-    H[:, VELOCITY, ACCEL_BIAS] = C_v_a + delay * CR
-    H[:, POSITION, ACCEL_BIAS] = C @ chain.p_a - delay * (C_v_a + delay / 2 * CR)
+    H[:, VELOCITY, ACCEL] = C_v_a
+    H[:, POSITION, ACCEL] = C @ chain.p_a - delay * C_v_a
+    H[:, VELOCITY, ACCEL_BIAS] += delay * CR
+    H[:, POSITION, ACCEL_BIAS] -= delay ** 2 / 2 * CR
+    H[:, VELOCITY, ACCEL_MATRIX] += by_row(CR, measured_v)
+    H[:, POSITION, ACCEL_MATRIX] -= by_row(CR, measured_p)
     H[:, VELOCITY, START_VELOCITY] = eye
     H[:, POSITION, START_VELOCITY] = (gnss.time - delay)[:, None, None] * eye
     H[:, POSITION, START_POSITION] = eye
     H[:, VELOCITY, LEVER_ARM] = swing
     H[:, POSITION, LEVER_ARM] = CR_seen
     # Vibration is no use in a derivative. The rate changes with time as it does not with age.
-    force = smooth(gained, delay)[0]
-    rate_change = point.undistorted(smooth(interval.turned, delay)[1])
+    force = sensors.force(smooth(interval.gained, delay)[0])
+    rate_change = sensors.rate(smooth(interval.turned, delay)[1], 0.0)
     whirled = cross(rate, cross(omega, lever)) - cross(rate_change, lever)
     H[:, VELOCITY, DELAY.start] = -(apply(CR, force) + apply(CR_seen, whirled) + gnss.gravity)
     H[:, POSITION, DELAY.start] = -ground_velocity
@@ -362,7 +363,7 @@ class Whitener:
     Parameters
     ----------
     columns : ndarray of int, shape (n,)
-        Unknowns that are estimated, out of the 28.
+        Unknowns that are estimated, out of the 37.
     size : int
         9 when positions are used, 6 when velocities alone are.
 

@@ -15,12 +15,13 @@
 
 from dataclasses import replace
 
-from alignment import aligned, config_for, error_deg, error_of, normalised_error, simulated
+from alignment import (aligned, config_for, error_deg, error_of, LEVER, normalised_error,
+                       simulated)
 from ins_align.aligner import Aligner
 from ins_align.config import Config, ConfigError
 from ins_align.declaration import State
 from ins_align.experiments.declare import largest, run_trial, trial
-from ins_align.rotation import matrix_from_quaternion, roll_pitch_yaw
+from ins_align.rotation import exp_so3, matrix_from_quaternion, roll_pitch_yaw
 from ins_align.scenarios import Motion, Scenario, SCENARIOS
 from ins_align.simulation import feed
 import numpy as np
@@ -693,3 +694,23 @@ def test_a_receiver_that_never_measures_the_vertical_is_noticed(flight):
     assert normalised_error(absent.status().initial, flight) < chi2.ppf(0.9999, 3)
     assert run(lambda v: v).counts['velocity_no_vertical'] == 0
     assert run(lambda v: 0.0 * v).counts['velocity_no_vertical'] == 0
+
+
+@pytest.mark.parametrize('scenario', ('flight', 'car'))
+@pytest.mark.parametrize('wrong', ('late', 'turned'))
+def test_what_never_fitted_is_not_handed_on(scenario, wrong):
+    """A receiver is wrong for two minutes, 1.4 s late or turned by 60 deg, and right then."""
+    s = simulated(scenario, seed=0, duration=200.0, imu_rate=50.0)
+    velocity = s.velocity.copy()
+    first = s.gnss_stamps_ns < s.gnss_stamps_ns[0] + 110 * 10 ** 9
+    if wrong == 'late':
+        velocity[7:][first[7:]] = s.velocity[:-7][first[7:]]
+    else:
+        velocity[first] = s.velocity[first] @ exp_so3([0.0, 0.0, np.radians(60.0)]).T
+    s = replace(s, velocity=velocity)
+    epochs = feed(Aligner(Config(lever_arm=LEVER)), s)
+    for epoch in epochs:
+        assert (epoch.state is State.ALIGNED) <= (epoch.t_s > 110.0)
+    # A new start after 120 s. Handed on, it is not even declared after another two minutes.
+    assert next(epoch.t_s for epoch in epochs if epoch.state is State.ALIGNED) < 160.0
+    assert normalised_error(epochs[-1].current, s) < chi2.ppf(0.999, 3)

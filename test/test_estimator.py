@@ -23,24 +23,22 @@ from ins_align.declaration import State
 from ins_align.estimator import MapEstimator
 from ins_align.experiments.dense import bound, dense_solution
 from ins_align.methods import MapMethod
-from ins_align.preintegration import Noise, preintegrate, Steps
+from ins_align.preintegration import Noise, preintegrate, SensorErrors, Steps
 from ins_align.rotation import log_so3
 from ins_align.scenarios import Motion
 from ins_align.simulation import simulate
-from ins_align.unknowns import (BODY_FIXED, DELAY, first_prior, GYRO_MISALIGNMENT, SIZE,
-                                START_POSITION, START_VELOCITY, UNIFORM_ANGLE_STD)
+from ins_align.unknowns import (ACCEL_ERRORS, BODY_FIXED, DELAY, first_prior, GYRO_MISALIGNMENT,
+                                SIZE, START_POSITION, START_VELOCITY, UNIFORM_ANGLE_STD)
 from ins_align.whitening import Measurements
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-ZERO = np.zeros(3)
-
 
 def test_a_full_store_says_so():
     estimator = MapEstimator(first_prior(1e-3, 0.05, LEVER, 0.0, 0.0, 0.0), capacity=3)
     steps = Steps(np.zeros((1, 1)), *np.ones((2, 1, 2, 3)), *np.zeros((2, 1, 2, 3)))
-    interval, gnss = preintegrate(steps, ZERO, ZERO, Noise()), Measurements.empty(1)
+    interval, gnss = preintegrate(steps, SensorErrors.none(), Noise()), Measurements.empty(1)
     for _ in range(3):
         assert len(list(estimator.add(interval, gnss))) == 1
     assert estimator.full
@@ -79,16 +77,23 @@ def stated_covariance(estimator):
     return full
 
 
+def as_calibrated(grade):
+    """Errors of scale factors and axes as large as the grade says."""
+    scale_std = PRESETS[grade].gyro_scale_std
+    return {'gyro_scale_std': scale_std, 'gyro_misalignment_std': GYRO_MISALIGNMENT * scale_std,
+            'accel_scale_std': ACCEL_ERRORS * scale_std,
+            'accel_misalignment_std': ACCEL_ERRORS * scale_std}
+
+
 @pytest.mark.parametrize('case', CASES)
 @pytest.mark.parametrize('scenario, grade', [('flight', 'navigation'), ('flight', 'mems'),
                                              ('car', 'tactical')])
 def test_recursion_is_the_dense_solution(scenario, grade, case, monkeypatch):
-    for share in ('ACCEL_ERRORS', 'G_SENSITIVITY'):       # the reference does not count these
-        monkeypatch.setattr(f'ins_align.calibration.{share}', 0.0)
+    # The reference does not count this.
+    monkeypatch.setattr('ins_align.g_sensitivity.G_SENSITIVITY', 0.0)
     changes, _ = CASES[case]
-    scale_std = PRESETS[grade].gyro_scale_std
     s = simulated(scenario, imu_grade=grade, duration=20.0, seed=3, position_std=0.5,
-                  gyro_scale_std=scale_std, gyro_misalignment_std=GYRO_MISALIGNMENT * scale_std)
+                  **as_calibrated(grade))
     aligner, _ = aligned(s, **changes)
     estimator = settled(aligner)
     dense = dense_solution(
@@ -201,11 +206,9 @@ def test_store_is_bounded(monkeypatch):
 def many_flights():
     """Fly with MEMS IMUs for 50 s: initial and current attitudes with their simulations."""
     runs = []
-    scale_std = PRESETS['mems'].gyro_scale_std
     for seed in range(24):
         s = simulated('flight', imu_grade='mems', duration=50.0, seed=seed, gnss_rate=2.0,
-                      gyro_scale_std=scale_std,
-                      gyro_misalignment_std=GYRO_MISALIGNMENT * scale_std)
+                      **as_calibrated('mems'))
         runs.append((s, aligned(s)[0]))
     return runs
 

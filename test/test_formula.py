@@ -18,7 +18,7 @@ from functools import lru_cache
 from ins_align import formula
 from ins_align.earth import EARTH_RATE, earth_rate_n
 from ins_align.experiments.dense import bound
-from ins_align.preintegration import Noise, preintegrate, split_at_epochs
+from ins_align.preintegration import Noise, preintegrate, SensorErrors, split_at_epochs
 from ins_align.simulation import simulate
 import numpy as np
 import pytest
@@ -50,9 +50,9 @@ def run(simulation, lever=LEVER):
     epochs = (simulation.gnss_stamps_ns - simulation.gnss_stamps_ns[0]) * 1e-9
     lla = np.column_stack([np.radians(simulation.lla_deg[:, :2]), simulation.lla_deg[:, 2]])
     intervals = preintegrate(split_at_epochs(stamps, simulation.gyro, simulation.accel, epochs),
-                             ZERO, ZERO, Noise())
+                             SensorErrors.none(), Noise())
     first = preintegrate(split_at_epochs(stamps, simulation.gyro, simulation.accel,
-                                         epochs[[0, 0]]), ZERO, ZERO, Noise())
+                                         epochs[[0, 0]]), SensorErrors.none(), Noise())
     body = formula.BodyIntegrals(lever, first.omega[0])
     navigation = formula.NavigationIntegrals(*lla[0], simulation.velocity[0])
     track = formula.InertialTrack.start(*lla[0])

@@ -355,6 +355,26 @@ def test_track_and_manoeuvres_by_hand():
     assert velocity_frame(swapped, positions).frame == 'ned'
 
 
+def test_velocities_and_positions_of_different_times_leave_the_frame_open():
+    times = np.arange(0.0, 60.0, 0.5)
+    line = np.column_stack([10.0 * times, times, times])
+    assert velocity_frame(Series(times, line), Series(times + 100.0, line)).frame == 'unknown'
+
+
+@pytest.mark.parametrize('noise', (0.0, 0.02))
+@pytest.mark.parametrize('unit, expected', [(1.0, 'enu'), (3.6, 'contradiction')])
+def test_loops_of_a_walker_are_no_wrong_unit(noise, unit, expected):
+    """A way that winds: while it leads 10 m away, 20 m are walked."""
+    times = np.arange(0.0, 120.0, 0.25)
+    turn = 2 * np.pi * times / 12.0
+    place = np.column_stack([0.7 * times + 3.0 * np.cos(turn), 3.0 * np.sin(turn), 0 * times])
+    speed = np.gradient(place, times, axis=0)
+    noisy = place + noise * np.random.default_rng(0).standard_normal(place.shape)
+    frame = velocity_frame(Series(times, unit * speed), Series(times, noisy))
+    assert frame.frame == expected
+    assert frame.speed_ratio == pytest.approx(unit, rel=0.05)
+
+
 @pytest.mark.parametrize('name, rate, frame, rest, first', [
     ('uav_thor75', 50.0, 'enu', True, 45.0), ('car_drive0708', 100.0, 'enu', True, 53.0),
     ('quad_dot08.bag', 120.5, None, False, 2.7)])

@@ -15,7 +15,7 @@
 
 from ins_align.earth import EARTH_RATE, matrix_earth_turned
 from ins_align.prediction import Prediction
-from ins_align.preintegration import Noise, preintegrate, split_at_epochs
+from ins_align.preintegration import Noise, preintegrate, SensorErrors, split_at_epochs
 from ins_align.rotation import exp_so3, orthonormalized, skew
 from ins_align.whitening import Chain
 import numpy as np
@@ -53,7 +53,7 @@ def test_preintegrated_intervals_chained_through_a_day():
     """IMU samples of a rate and a force that stay, against their integrals in closed form."""
     rate, force = np.array([0.3, -0.2, 0.5]), np.array([1.0, 9.0, -3.0])
     hour_ns, epoch_ns, sample_ns = 3600 * 10 ** 9, 10 ** 9, 10 ** 8
-    zero, chain = np.zeros(3), Chain.start()
+    chain = Chain.start()
     for hour in range(24):
         # Samples between the epochs, not on them, and two before and after.
         start_ns = hour * hour_ns
@@ -62,7 +62,8 @@ def test_preintegrated_intervals_chained_through_a_day():
         steps = split_at_epochs(stamps, np.tile(rate, (stamps.size, 1)),
                                 np.tile(force, (stamps.size, 1)), epochs, unit=1e-9)
         nothing = np.zeros((epochs.size - 1, 1))
-        chain = chain.extended(preintegrate(steps, zero, zero, Noise(*[nothing] * 4))).at(-1)
+        chain = chain.extended(preintegrate(steps, SensorErrors.none(),
+                                            Noise(*[nothing] * 4))).at(-1)
     size = np.linalg.norm(rate)
     axis = rate / size
     along, around = np.outer(axis, axis), skew(axis)

@@ -121,3 +121,10 @@ def test_readme_names_no_file_that_is_not_there():
     links = re.findall(r'\]\((?!https?:|#)([^)#]+)', read('README.md'))
     assert links
     assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+def test_api_page_has_every_module():
+    """A module that was renamed makes the documentation fail, one that is new is not in it."""
+    listed = re.findall(r'automodule:: ins_align\.(\w+)', read('docs/api.rst'))
+    assert sorted(listed) == sorted(
+        [path.stem for path in (ROOT / 'ins_align').glob('[a-z]*.py')] + ['experiments'])

@@ -13,14 +13,13 @@
 # limitations under the License.
 """Preintegration against quadrature of closed-form motion, re-integration and Monte Carlo."""
 
-from ins_align.preintegration import (Intervals, Noise, preintegrate,
+from ins_align.preintegration import (Intervals, Noise, preintegrate, SensorErrors,
                                       split_at_epochs, white_noise)
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-ZERO = np.zeros(3)
 RATE = 100.0
 NOISE = Noise(1e-3, 1e-2)     # rad/sqrt(s), m/s/sqrt(s)
 
@@ -59,11 +58,10 @@ def samples(duration, rate=RATE, jitter=0.0, seed=0):
     return stamps, omega_of(stamps), force_of(stamps)
 
 
-def integrated(epochs, rate=RATE, jitter=0.0, gyro_bias=ZERO, accel_bias=ZERO,
-               gyro_matrix=np.zeros((3, 3))):
+def integrated(epochs, rate=RATE, jitter=0.0, errors=np.zeros(24)):
     stamps, gyro, accel = samples(epochs[-1], rate, jitter)
     steps = split_at_epochs(stamps, gyro, accel, np.asarray(epochs, float))
-    return preintegrate(steps, gyro_bias, accel_bias, NOISE, gyro_matrix)
+    return preintegrate(steps, SensorErrors.of(errors), NOISE)
 
 
 def chained(interval):
@@ -105,7 +103,7 @@ def test_constant_rate_and_force_in_closed_form():
     stamps = np.arange(-2, 43) * 0.1
     steps = split_at_epochs(stamps, np.tile([0.0, 0.0, w], (45, 1)), np.tile(f, (45, 1)),
                             np.array([0.0, t]))
-    interval = preintegrate(steps, ZERO, ZERO, NOISE)
+    interval = preintegrate(steps, SensorErrors.none(), NOISE)
     assert np.allclose(interval.R[0], Rotation.from_rotvec([0.0, 0.0, w * t]).as_matrix(),
                        atol=1e-13)
     expected = [2.0 * np.sin(w * t) / w, 2.0 * (1 - np.cos(w * t)) / w, 9.8 * t]
@@ -131,11 +129,11 @@ def test_split_at_any_epochs_is_the_unsplit(inner, jitter):
 def test_intervals_in_one_batch_are_those_one_by_one():
     epochs = [0.0, 0.213, 0.4, 1.0, 1.001, 2.0]
     stamps, gyro, accel = samples(2.0, jitter=0.3)
-    batch = preintegrate(split_at_epochs(stamps, gyro, accel, np.array(epochs)), ZERO, ZERO,
-                         NOISE)
+    batch = preintegrate(split_at_epochs(stamps, gyro, accel, np.array(epochs)),
+                         SensorErrors.none(), NOISE)
     for k in range(len(epochs) - 1):
         one = preintegrate(split_at_epochs(stamps, gyro, accel, np.array(epochs[k:k + 2])),
-                           ZERO, ZERO, NOISE)
+                           SensorErrors.none(), NOISE)
         for name, array in vars(one).items():
             assert np.allclose(array[0], getattr(batch, name)[k], rtol=1e-12, atol=1e-14), name
 
@@ -155,33 +153,28 @@ def test_interval_without_length_turns_nothing():
     assert np.allclose(interval.omega[0], omega_of(0.4), atol=1e-6)
 
 
-@pytest.mark.parametrize('axis', range(3))
-def test_jacobians_are_the_derivatives_of_the_integration(axis):
-    step = 1e-5
+@pytest.mark.parametrize('column', range(24))
+def test_jacobians_are_the_derivatives_of_the_integration(column):
+    step = np.zeros(24)
+    step[column] = 1e-5
     epochs = [0.0, 1.5]
     at = integrated(epochs)
-    unit = step * np.eye(3)[axis]
-    entries = step * np.eye(9).reshape(9, 3, 3)[3 * axis:3 * axis + 3]
-    for errors, column, expected in (
-            ({'gyro_bias': unit}, axis, (at.J_Rg, at.J_vg, at.J_pg)),
-            ({'accel_bias': unit}, axis, (np.zeros((1, 3, 3)), at.J_Rg, at.J_pa)),
-            *(({'gyro_matrix': entry}, 3 * axis + k, (at.J_Rm, at.J_vm, at.J_pm))
-              for k, entry in enumerate(entries))):
-        plus, minus = (integrated(epochs, **{name: sign * error for name, error in errors.items()})
-                       for sign in (1, -1))
-        turn = Rotation.from_matrix(plus.R[0] @ minus.R[0].T).as_rotvec() / (2 * step)
-        J_v = (plus.v[0] - minus.v[0]) / (2 * step)
-        J_p = (plus.p[0] - minus.p[0]) / (2 * step)
-        assert np.allclose(turn, expected[0][0][:, column], atol=1e-4)
-        assert np.allclose(J_v, expected[1][0][:, column], atol=2e-3)
-        assert np.allclose(J_p, expected[2][0][:, column], atol=2e-3)
+    of_gyros, of_accelerometers = ((at.J_Rg, at.J_vg, at.J_pg),
+                                   (np.zeros((1, 3, 12)), at.J_va, at.J_pa))
+    expected = [J[0, :, column % 12] for J in (of_gyros if column < 12 else of_accelerometers)]
+    plus, minus = (integrated(epochs, errors=sign * step) for sign in (1, -1))
+    turn = Rotation.from_matrix(plus.R[0] @ minus.R[0].T).as_rotvec()
+    for change, J, atol in zip((turn, plus.v[0] - minus.v[0], plus.p[0] - minus.p[0]), expected,
+                               (1e-4, 2e-3, 2e-3)):
+        assert np.allclose(change / 2e-5, J, atol=atol)
 
 
 def test_correction_is_re_integration_to_first_order():
-    gyro_bias, accel_bias = np.array([2e-3, -1e-3, 1.5e-3]), np.array([0.05, -0.02, 0.03])
     matrix = 1e-3 * np.array([[1.0, 0.5, -0.5], [0.3, -2.0, 0.2], [-0.4, 0.1, 2.0]])
-    corrected = integrated([0.0, 0.2]).corrected(gyro_bias, accel_bias, matrix)
-    again = integrated([0.0, 0.2], gyro_bias=gyro_bias, accel_bias=accel_bias, gyro_matrix=matrix)
+    errors = SensorErrors(np.array([2e-3, -1e-3, 1.5e-3]), matrix,
+                          np.array([0.05, -0.02, 0.03]), matrix.T).vector()
+    corrected = integrated([0.0, 0.2]).corrected(errors)
+    again = integrated([0.0, 0.2], errors=errors)
     # Second order: 1/2 (2.7e-3 * 0.2)^2 for angles.
     assert angle(corrected.R[0], again.R[0]) < 3e-7
     assert np.allclose(corrected.v[0], again.v[0], atol=3e-6)
@@ -192,9 +185,9 @@ def test_correction_is_re_integration_to_first_order():
 
 def test_correction_from_absurd_errors_back():
     """A fit that has lost its way asks for scale factors of 0.4; the way back must not depend."""
-    bias, scale = np.array([0.02, -0.01, 0.01]), np.diag([0.4, -0.3, 0.2])
-    corrected = integrated([0.0, 0.1], gyro_bias=bias, gyro_matrix=scale).corrected(
-        -bias, ZERO, -scale)
+    errors = np.zeros(24)
+    errors[:3], errors[[3, 7, 11]] = [0.02, -0.01, 0.01], [0.4, -0.3, 0.2]
+    corrected = integrated([0.0, 0.1], errors=errors).corrected(-errors)
     again = integrated([0.0, 0.1])
     # Half the square of the angle that the errors make of 0.8 rad/s in 0.1 s.
     assert angle(corrected.R[0], again.R[0]) < 0.5 * (0.5 * 0.8 * 0.1) ** 2
@@ -203,12 +196,10 @@ def test_correction_from_absurd_errors_back():
 
 def test_correction_takes_errors_for_each_interval():
     interval = integrated([0.0, 0.2, 0.4])
-    gyro, accel = np.array([[1e-3, 0, 0], [0, 2e-3, 0]]), np.array([[0, 0.1, 0], [0.1, 0, 0]])
-    matrix = np.zeros((2, 3, 3))
-    matrix[0, 1, 1], matrix[1, 2, 0] = 0.01, 0.02
-    both = interval.corrected(gyro, accel, matrix)
+    change = 1e-3 * np.random.default_rng(0).standard_normal((2, 24))
+    both = interval.corrected(change)
     for k in range(2):
-        one = interval.take(slice(k, k + 1)).corrected(gyro[k], accel[k], matrix[k])
+        one = interval.take(slice(k, k + 1)).corrected(change[k])
         assert np.allclose(one.v[0], both.v[k]) and np.allclose(one.R[0], both.R[k])
 
 
@@ -227,8 +218,8 @@ def test_noise_covariance_is_that_of_many_runs():
     clean = integrated(epochs, rate=rate)
     errors = np.empty((runs, 9))
     for run in range(runs):
-        noisy = preintegrate(split_at_epochs(stamps, gyro[run], accel[run], epochs), ZERO, ZERO,
-                             Noise())
+        noisy = preintegrate(split_at_epochs(stamps, gyro[run], accel[run], epochs),
+                             SensorErrors.none(), Noise())
         errors[run, :3] = Rotation.from_matrix(noisy.R[0] @ clean.R[0].T).as_rotvec()
         errors[run, 3:6] = noisy.v[0] - clean.v[0]
         errors[run, 6:] = noisy.p[0] - clean.p[0]
@@ -264,9 +255,9 @@ def test_noise_may_differ_from_step_to_step():
     epochs = np.array([0.0, 1.0])
     stamps, gyro, accel = samples(1.0)
     steps = split_at_epochs(stamps, gyro, accel, epochs)
-    uniform = preintegrate(steps, ZERO, ZERO, Noise(1e-3)).Q[0]
+    uniform = preintegrate(steps, SensorErrors.none(), Noise(1e-3)).Q[0]
     first_half = np.where(np.cumsum(steps.dt, axis=1) <= 0.5 + 1e-9, 2e-3, 0.0)
-    halved = preintegrate(steps, ZERO, ZERO, Noise(first_half)).Q[0]
+    halved = preintegrate(steps, SensorErrors.none(), Noise(first_half)).Q[0]
     assert np.allclose(np.diag(halved)[:3], 2 * np.diag(uniform)[:3], rtol=1e-9)
     # Angle errors of the first half act longer on the velocity.
     assert np.all(np.diag(halved)[3:5] > 3 * np.diag(uniform)[3:5])
@@ -317,20 +308,21 @@ def test_white_noise_of_a_window_is_that_of_its_samples_alone():
 def test_noise_in_excess_is_kept_apart():
     stamps, gyro, accel = samples(1.0)
     steps = split_at_epochs(stamps, gyro, accel, np.array([0.0, 1.0]))
-    interval = preintegrate(steps, ZERO, ZERO, Noise(1e-3, 1e-2, 2e-3, 3e-2))
-    assert np.allclose(interval.Q, preintegrate(steps, ZERO, ZERO, NOISE).Q)
-    assert np.allclose(interval.Q_excess, preintegrate(steps, ZERO, ZERO, Noise(2e-3, 3e-2)).Q)
-    assert not np.any(preintegrate(steps, ZERO, ZERO, NOISE).Q_excess)
+    interval = preintegrate(steps, SensorErrors.none(), Noise(1e-3, 1e-2, 2e-3, 3e-2))
+    assert np.allclose(interval.Q, preintegrate(steps, SensorErrors.none(), NOISE).Q)
+    assert np.allclose(interval.Q_excess,
+                       preintegrate(steps, SensorErrors.none(), Noise(2e-3, 3e-2)).Q)
+    assert not np.any(preintegrate(steps, SensorErrors.none(), NOISE).Q_excess)
 
 
 def test_mirrored_intervals_are_those_of_mirrored_sensors():
     """To first order in the rotation over an interval, which is what is promised."""
     epochs = np.array([0.0, 0.2, 0.4])
     stamps, gyro, accel = samples(0.4)
-    plain = preintegrate(split_at_epochs(stamps, gyro, accel, epochs), ZERO, ZERO, NOISE)
+    plain = preintegrate(split_at_epochs(stamps, gyro, accel, epochs), SensorErrors.none(), NOISE)
     for gyro_sign, accel_sign in ((1, -1), (-1, 1), (-1, -1)):
         steps = split_at_epochs(stamps, gyro_sign * gyro, accel_sign * accel, epochs)
-        expected = preintegrate(steps, ZERO, ZERO, NOISE)
+        expected = preintegrate(steps, SensorErrors.none(), NOISE)
         mirrored = plain.mirrored(gyro_sign, accel_sign)
         for name in ('R', 'v', 'p', 'omega'):
             assert np.allclose(getattr(mirrored, name), getattr(expected, name),

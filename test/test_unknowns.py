@@ -15,22 +15,14 @@
 
 from dataclasses import replace
 
-from alignment import LEVER
+from alignment import LEVER, some_unknowns
 from ins_align.rotation import exp_so3
-from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, FREE_LEVER_STD,
-                                GYRO_BIAS, GYRO_MATRIX, GYRO_MISALIGNMENT, inverse_spd, LEVER_ARM,
-                                Prior, prior_of, SIZE, START_POSITION, START_VELOCITY, Unknowns)
+from ins_align.unknowns import (ACCEL_BIAS, ACCEL_ERRORS, ACCEL_MATRIX, ATTITUDE, DELAY,
+                                first_prior, FREE_LEVER_STD, GYRO_BIAS, GYRO_MATRIX,
+                                GYRO_MISALIGNMENT, inverse_spd, LEVER_ARM, Prior, prior_of, SIZE,
+                                START_POSITION, START_VELOCITY)
 import numpy as np
 import pytest
-
-
-def some_unknowns(seed=0):
-    r = np.random.default_rng(seed)
-    return Unknowns(C=exp_so3(r.standard_normal(3)), gyro_bias=1e-3 * r.standard_normal(3),
-                    gyro_matrix=0.01 * r.standard_normal((3, 3)),
-                    accel_bias=0.01 * r.standard_normal(3),
-                    start_velocity=r.standard_normal(3), start_position=r.standard_normal(3),
-                    lever_b=r.standard_normal(3), delay=0.03)
 
 
 def test_moving_and_comparing_points_are_inverse():
@@ -48,14 +40,25 @@ def test_first_prior_knows_what_it_was_told():
     matrix = known[GYRO_MATRIX].reshape(3, 3)
     assert np.allclose(np.diag(matrix), 1e4)
     assert np.allclose(matrix[~np.eye(3, dtype=bool)], 1e4 / GYRO_MISALIGNMENT ** 2)
+    assert np.allclose(known[ACCEL_MATRIX], 1e4 / ACCEL_ERRORS ** 2)
     assert np.allclose(known[LEVER_ARM], 4.0) and np.allclose(known[DELAY], 100.0)
     for nothing in (ATTITUDE, START_VELOCITY, START_POSITION):
         assert np.all(known[nothing] == 0)
     assert np.allclose(step[LEVER_ARM], np.array(LEVER) - x.lever_b)
     assert np.allclose(step[DELAY], 0.02 - x.delay)
+    # Biases are as large as said under a force; without the matrix it makes no difference.
+    force = np.array([1.0, -2.0, 9.0])
+    told = first_prior(1e-3, 0.05, LEVER, 0.5, 0.02, 0.1, 0.01, force)
+    matrix = np.random.default_rng(0).standard_normal((3, 3))
+    moved = np.zeros(SIZE)
+    moved[ACCEL_BIAS], moved[ACCEL_MATRIX] = -matrix @ force, matrix.ravel()
+    assert moved @ told.information @ moved == pytest.approx(
+        np.sum(matrix ** 2) * 1e4 / ACCEL_ERRORS ** 2)
+    assert np.array_equal(first_prior(1e-3, 0.05, LEVER, 0.0, 0.0, 0.0, 0.0, force).information,
+                          first_prior(1e-3, 0.05, LEVER, 0.0, 0.0, 0.0).information)
     fixed = np.diag(first_prior(1e-3, 0.05, LEVER, 0.0, 0.0, 0.0).information)
     assert np.all(fixed[LEVER_ARM] == 0) and np.all(fixed[DELAY] == 0)
-    assert np.all(fixed[GYRO_MATRIX] == 0)
+    assert np.all(fixed[GYRO_MATRIX] == 0) and np.all(fixed[ACCEL_MATRIX] == 0)
 
 
 @pytest.mark.parametrize('turn', (0.0, 0.5, 3.0))

@@ -15,25 +15,15 @@
 
 from dataclasses import replace
 
-from ins_align.preintegration import Noise, preintegrate, Steps
+from alignment import some_unknowns
+from ins_align.preintegration import Noise, preintegrate, SensorErrors, Steps
 from ins_align.recent import AGES, Recent
 from ins_align.rotation import exp_so3
-from ins_align.unknowns import DELAY, SIZE, Unknowns
+from ins_align.unknowns import DELAY, SIZE
 from ins_align.whitening import (Chain, chain_noise, GATE, Gate, Measurements, Rows,
                                  sensitivities, START, Whitener)
 import numpy as np
 import pytest
-
-ZERO = np.zeros(3)
-
-
-def some_unknowns(seed=0):
-    r = np.random.default_rng(seed)
-    return Unknowns(C=exp_so3(r.standard_normal(3)), gyro_bias=1e-3 * r.standard_normal(3),
-                    gyro_matrix=0.01 * r.standard_normal((3, 3)),
-                    accel_bias=0.01 * r.standard_normal(3),
-                    start_velocity=r.standard_normal(3), start_position=r.standard_normal(3),
-                    lever_b=r.standard_normal(3), delay=0.03)
 
 
 def some_intervals(count=5, seed=0):
@@ -47,8 +37,7 @@ def some_intervals(count=5, seed=0):
     before = (AGES[:, None] * values[:, -1:]
               + AGES[:, None] ** 2 * r.standard_normal((count, 1, 3))
               for values in (steps.f, steps.omega))
-    return preintegrate(steps, ZERO, ZERO, Noise(1e-3, 1e-2), gyro_matrix=np.zeros((3, 3)),
-                        recent=Recent(*before))
+    return preintegrate(steps, SensorErrors.none(), Noise(1e-3, 1e-2), Recent(*before))
 
 
 def some_measurements(count=5, seed=0):
@@ -60,7 +49,7 @@ def some_measurements(count=5, seed=0):
 
 def residuals(x, intervals, gnss):
     """Residuals at x and their derivatives, from scratch: intervals corrected, chained."""
-    corrected = intervals.corrected(x.gyro_bias, x.accel_bias, x.gyro_matrix)
+    corrected = intervals.corrected(x.sensors.vector())
     return sensitivities(x, Chain.start().extended(corrected), gnss, corrected)
 
 
@@ -94,7 +83,7 @@ def test_noise_of_an_interval_looks_like_an_error_of_the_start(row):
     """An error of interval 1, as seen at t0, acts on the later epochs as one of the start."""
     x, intervals, gnss = some_unknowns(), some_intervals(), some_measurements()
     x = replace(x, delay=0.0)
-    corrected = intervals.corrected(x.gyro_bias, x.accel_bias, x.gyro_matrix)
+    corrected = intervals.corrected(x.sensors.vector())
     before = Chain.start().extended(corrected.take(slice(0, 2)))
     chain, later = before.at(-1), slice(2, 5)
     error = np.zeros(9)

@@ -34,8 +34,8 @@ import time
 from typing import Any
 
 from ins_align.aligner import Aligner
-from ins_align.experiments.common import config_for, epochs_of, Report
-from ins_align.simulation import simulate, Simulation
+from ins_align.experiments.common import config_for, Report
+from ins_align.simulation import epochs_of, simulate, Simulation
 import numpy as np
 
 MINUTES = 60

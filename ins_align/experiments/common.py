@@ -25,12 +25,12 @@ from pathlib import Path
 import sys
 from typing import Any, NamedTuple
 
-from ins_align.aligner import Aligner, Attitude, Epoch
+from ins_align.aligner import Attitude, Epoch
 from ins_align.config import Config
 from ins_align.declaration import State
 from ins_align.report import format_table, write_whole
 from ins_align.rotation import Array, log_so3
-from ins_align.simulation import FEED_BLOCK, Simulation
+from ins_align.simulation import Simulation
 import numpy as np
 
 # Of simulated data nothing comes late, but an unknown delay wants IMU samples beyond the stamp.
@@ -87,21 +87,6 @@ def _counted(results: Iterable[Any], total: int, name: str) -> Iterator[Any]:
             end = '\n' if count == total else ''
             print(f'\r{name}: {count}/{total}', end=end, file=sys.stderr, flush=True)
         yield result
-
-
-def epochs_of(aligner: Aligner, simulation: Simulation, *, fix: bool = True,
-              velocity: bool = True) -> Iterator[Epoch]:
-    """Feed a simulation in the order of arrival and yield the epochs as they come, in blocks."""
-    for count, (kind, payload) in enumerate(simulation.messages()):
-        if kind == 'imu':
-            aligner.add_imu(*payload)
-        elif kind == 'fix' and fix:
-            aligner.add_fix(payload)
-        elif kind == 'velocity' and velocity:
-            aligner.add_velocity(payload)
-        if count % FEED_BLOCK == 0:
-            yield from aligner.update()
-    yield from aligner.flush()
 
 
 def config_for(simulation: Simulation, **changes: Any) -> Config:

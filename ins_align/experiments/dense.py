@@ -28,13 +28,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from ins_align.config import ImuNoise
+from ins_align.config import ImuNoise, STANDARD_GRAVITY
 from ins_align.messages import ENU_FROM_NED
 from ins_align.rotation import Array, skew
 from ins_align.simulation import Simulation
-from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, GYRO, GYRO_BIAS, GYRO_MATRIX,
-                                gyro_matrix_std, Index, LEVER_ARM, SIZE, START_POSITION,
-                                START_VELOCITY)
+from ins_align.unknowns import (ACCEL, ACCEL_BIAS, ACCEL_ERRORS, ACCEL_MATRIX, ATTITUDE, DELAY,
+                                GYRO, GYRO_BIAS, GYRO_MATRIX, gyro_matrix_std, Index, LEVER_ARM,
+                                SIZE, START_POSITION, START_VELOCITY)
 import numpy as np
 
 # Nothing more than "somewhere on the circle" is known of an angle (rad): keeps the information
@@ -74,10 +74,10 @@ class DenseSolution:
     ----------
     C : ndarray, shape (3, 3)
         ``C_nb(t0)``.
-    unknowns : ndarray, shape (28,)
+    unknowns : ndarray, shape (37,)
         Sensor errors, start, lever arm, delay in their places, the first three zero. The start is
         that of the IMU with respect to inertial space.
-    covariance : ndarray, shape (28, 28)
+    covariance : ndarray, shape (37, 37)
         Zero where something is not estimated.
     chi2 : float
         Sum of squares of the whitened residuals and the prior's.
@@ -124,10 +124,10 @@ def bound(simulation: Simulation, *, noise: ImuNoise | None = None, use_velocity
     H = _design(path, simulation.lever_arm)
     V = _noise_covariance(path, noise, _measurement_covariance(simulation, path))
     rows = _rows(len(epochs), use_velocity, use_position)
-    columns, prior = _prior(noise, use_position, lever_arm_std, delay_std)
+    columns, prior = _prior(simulation, noise, use_position, lever_arm_std, delay_std)
     whitened = _whitened(V[np.ix_(rows, rows)], H[rows][:, columns])
     each = whitened.reshape(len(epochs), -1, len(columns))
-    information = np.cumsum(each.transpose(0, 2, 1) @ each, axis=0) + np.diag(prior)
+    information = np.cumsum(each.transpose(0, 2, 1) @ each, axis=0) + prior
     return Bound(path.time, np.array([_inverse(matrix)[:3, :3] for matrix in information]))
 
 
@@ -161,7 +161,7 @@ def dense_solution(simulation: Simulation, *, noise: ImuNoise | None = None,
     noise = simulation.imu_noise if noise is None else noise
     stamps = simulation.gnss_stamps_ns
     rows = _rows(len(stamps), use_velocity, use_position)
-    columns, prior = _prior(noise, use_position, lever_arm_std, delay_std)
+    columns, prior = _prior(simulation, noise, use_position, lever_arm_std, delay_std)
     mean = np.zeros(SIZE)
     mean[LEVER_ARM] = simulation.lever_arm if lever_arm is None else lever_arm
     x = mean.copy()
@@ -180,14 +180,15 @@ def dense_solution(simulation: Simulation, *, noise: ImuNoise | None = None,
                       - time * x[START_VELOCITY]], axis=1).ravel()[rows]
         both = _whitened(V[np.ix_(rows, rows)], np.column_stack([y, H]))
         whitened_y, whitened_H = both[:, 0], both[:, 1:]
-        P = _inverse(whitened_H.T @ whitened_H + np.diag(prior))
+        P = _inverse(whitened_H.T @ whitened_H + prior)
         to_mean = (mean - x)[columns]
         information = prior.copy()
-        information[:3] = 0.0
+        information[:3, :3] = 0.0
         dx = np.zeros(SIZE)
-        dx[columns] = P @ (whitened_H.T @ whitened_y + information * to_mean)
+        dx[columns] = P @ (whitened_H.T @ whitened_y + information @ to_mean)
         left = whitened_y - whitened_H @ dx[columns]
-        chi2 = float(left @ left + np.sum(information * (to_mean - dx[columns]) ** 2))
+        off = to_mean - dx[columns]
+        chi2 = float(left @ left + off @ information @ off)
         rotation, E = _attitude_error_now(path, noise, V[np.ix_(rows, rows)], rows, y, H,
                                           dx[columns])
         current = _rotation(dx[:3] - path.Theta[-1] @ dx[GYRO] + rotation) @ path.C[-1]
@@ -207,20 +208,21 @@ class _Path:
     """
     Integrals over the motion at K epochs, in n0 axes.
 
-    U and P are the first and second integral of the specific force, S that of C; Theta, shape
-    (K, 3, 12), of C and of C times each rate: what bias and matrix of the gyros turn; Gamma
-    that of ``[U' x] Theta``; M holds the integrals of z z^T, z = (1, U, t U - P).
+    U and P are the first and second integral of the specific force; Theta, shape (K, 3, 12), the
+    integral of C and of C times each rate: what bias and matrix of the gyros turn; Gamma that of
+    ``[U' x] Theta``; Sigma, shape (K, 3, 12), that of C and of C times each force: what bias and
+    matrix of the accelerometers push; M holds the integrals of z z^T, z = (1, U, t U - P).
     """
 
     time: Array
     C: Array              # C_n0b
     U: Array
     P: Array
-    S: Array
-    int_S: Array
     Theta: Array
     Gamma: Array
     int_Gamma: Array
+    Sigma: Array
+    int_Sigma: Array
     M: Array
     omega: Array          # of the body to inertial space, body axes
     omega_dot: Array
@@ -243,13 +245,15 @@ def _path(time: Array, C: Array, omega: Array, f: Array, at: Array, C_n0n: Array
     U = _cumulative(time, force)
     P = _cumulative(time, U)
     S = _cumulative(time, C)
-    Theta = np.concatenate([S, _cumulative(time, _by_row(C, omega))], axis=-1)
+    Theta, Sigma = (np.concatenate([S, _cumulative(time, _by_row(C, measured))], axis=-1)
+                    for measured in (omega, f))
     Gamma = _cumulative(time, skew(force) @ Theta)
     z = np.hstack([np.ones((len(time), 1)), U, time[:, None] * U - P])
     M = _cumulative(time, z[:, :, None] * z[:, None, :])
     gravity = np.einsum('nij,nj->ni', C_n0n, g_n)
-    return _Path(time[at], C[at], U[at], P[at], S[at], _cumulative(time, S)[at], Theta[at],
-                 Gamma[at], _cumulative(time, Gamma)[at], M[at], omega[at],
+    return _Path(time[at], C[at], U[at], P[at], Theta[at], Gamma[at],
+                 _cumulative(time, Gamma)[at], Sigma[at], _cumulative(time, Sigma)[at], M[at],
+                 omega[at],
                  _rate_of_change(time, omega)[at], force[at] + gravity,
                  np.einsum('nij,nj->ni', C_n0n, v_n), C_n0n)
 
@@ -312,7 +316,8 @@ def _measured_path(simulation: Simulation, C: Array, x: Array) -> _Path:
     time = (grid - grid[0]) * 1e-9
     omega = _interpolated(simulation.imu_stamps_ns, simulation.gyro, grid)
     omega = omega - omega @ x[GYRO_MATRIX].reshape(3, 3).T - x[GYRO_BIAS]
-    f = _interpolated(simulation.imu_stamps_ns, simulation.accel, grid) - x[ACCEL_BIAS]
+    f = _interpolated(simulation.imu_stamps_ns, simulation.accel, grid)
+    f = f - f @ x[ACCEL_MATRIX].reshape(3, 3).T - x[ACCEL_BIAS]
     # Angle of each step with the coning term of a rate that is linear in time.
     h = np.diff(time)[:, None]
     steps = Rotation.from_rotvec(h / 2 * (omega[1:] + omega[:-1])
@@ -374,7 +379,7 @@ def _lever_terms(path: _Path, lever_b: Array) -> tuple[Array, Array]:
 
 
 def _design(path: _Path, lever_b: Array) -> Array:
-    """Derive the measurements by the unknowns, shape (6 K, 28)."""
+    """Derive the measurements by the unknowns, shape (6 K, 37)."""
     lever_v, lever_p = _lever_terms(path, lever_b)
     time = path.time[:, None, None]
     H = np.zeros((len(path.time), 2, 3, SIZE))
@@ -386,8 +391,8 @@ def _design(path: _Path, lever_b: Array) -> Array:
     velocity[..., GYRO_BIAS] += C_lever
     velocity[..., GYRO_MATRIX] += _by_row(C_lever, path.omega)
     position[..., GYRO] = path.int_Gamma + skew(lever_p) @ path.Theta
-    velocity[..., ACCEL_BIAS] = -path.S
-    position[..., ACCEL_BIAS] = -path.int_S
+    velocity[..., ACCEL] = -path.Sigma
+    position[..., ACCEL] = -path.int_Sigma
     velocity[..., START_VELOCITY] = np.eye(3)
     position[..., START_VELOCITY] = time * np.eye(3)
     position[..., START_POSITION] = np.eye(3)
@@ -484,9 +489,9 @@ def _rows(epochs: int, use_velocity: bool, use_position: bool) -> Index:
     return np.flatnonzero(np.tile(np.repeat([use_velocity, use_position], 3), epochs))
 
 
-def _prior(noise: ImuNoise, use_position: bool, lever_arm_std: float,
+def _prior(simulation: Simulation, noise: ImuNoise, use_position: bool, lever_arm_std: float,
            delay_std: float) -> tuple[Index, Array]:
-    """Numbers of the unknowns that are estimated, and the prior's information about each."""
+    """Numbers of the unknowns that are estimated, and the prior's information about them."""
     std = np.zeros(SIZE)
     std[ATTITUDE] = _ATTITUDE_STD
     std[START_VELOCITY] = math.inf
@@ -494,9 +499,18 @@ def _prior(noise: ImuNoise, use_position: bool, lever_arm_std: float,
     std[GYRO_BIAS] = noise.gyro_bias_std
     std[GYRO_MATRIX] = gyro_matrix_std(noise.gyro_scale_std).ravel()
     std[ACCEL_BIAS] = noise.accel_bias_std
+    std[ACCEL_MATRIX] = ACCEL_ERRORS * noise.gyro_scale_std
     std[LEVER_ARM], std[DELAY] = lever_arm_std, delay_std
-    wanted = std > 0
-    return np.flatnonzero(wanted), std[wanted] ** -2.0
+    columns = np.flatnonzero(std)
+    # The biases of the accelerometers are what they are said to be under the force at t0, turned
+    # into one of gravity's size.
+    force = _interpolated(simulation.imu_stamps_ns, simulation.accel,
+                          simulation.gnss_stamps_ns[:1])
+    force *= STANDARD_GRAVITY / np.linalg.norm(force)
+    told = np.eye(SIZE)
+    told[ACCEL_BIAS, ACCEL_MATRIX] = _by_row(np.eye(3)[None], force)[0]
+    told = told[np.ix_(columns, columns)]
+    return columns, told.T @ np.diag(std[columns] ** -2.0) @ told
 
 
 def _whitened(V: Array, columns: Array) -> Array:

@@ -26,11 +26,11 @@ from typing import Any
 from ins_align.aligner import Aligner
 from ins_align.earth import EARTH_RATE, earth_rate_n, LocalLevel
 from ins_align.experiments import dense
-from ins_align.experiments.common import epochs_of, exact_config_for, parallel, Report, rms
+from ins_align.experiments.common import exact_config_for, parallel, Report, rms
 from ins_align.formula import exact_lever_remainder
 from ins_align.report import new_figure
 from ins_align.rotation import Array, cross, roll_pitch_yaw
-from ins_align.simulation import simulate
+from ins_align.simulation import epochs_of, simulate
 import numpy as np
 
 DURATION = 100.0

@@ -24,11 +24,10 @@ from ins_align.aligner import Aligner
 from ins_align.bag_files import BagError
 from ins_align.bags import Bag
 from ins_align.config import Config
-from ins_align.decoding import (
-    decode_imu, decode_orientations, deserialize, ImuSamples, Orientations)
+from ins_align.decoding import ImuSamples, joined, Orientations
 from ins_align.earth import ecef_from_lla, matrix_en
 from ins_align.experiments.common import Error, error_of
-from ins_align.messages import fix_from_msg, MessageError, velocity_from_msg
+from ins_align.reading import read, Request
 from ins_align.replay import Reference
 from ins_align.results import Epoch
 from ins_align.rotation import Array
@@ -50,8 +49,7 @@ class Recording:
 
     name: str
     imu: ImuSamples
-    times_ns: np.ndarray            # (M,), when GNSS messages were recorded
-    imu_before: np.ndarray          # (M,), IMU samples before each
+    imu_before: np.ndarray          # (M,), IMU samples before each GNSS message
     messages: tuple[Any, ...]       # (M,), Fix or Velocity
     reference: Reference
     reference_std_deg: Array        # (3,) about east, north, up
@@ -82,36 +80,21 @@ def recordings_in(folder: Path) -> list[Path]:
 @lru_cache(maxsize=3)
 def load(path: Path) -> Recording:
     """Read and decode a recording; the last few are kept."""
-    config = Config()
-    imu_bytes: list[bytes] = []
-    reference_bytes: list[bytes] = []
-    gnss: list[tuple[int, int, Any]] = []
-    with Bag(path) as bag:
-        topics = bag.choose_topics(config)
-        chosen = [topic for topic in (topics.imu, topics.fix, topics.velocity, topics.reference)
-                  if topic is not None]
-        for topic, time_ns, data in bag.messages(chosen):
-            if topic == topics.imu:
-                imu_bytes.append(data)
-            elif topic == topics.reference:
-                reference_bytes.append(data)
-            else:
-                try:
-                    message = deserialize(data, topic)
-                    gnss.append((time_ns, len(imu_bytes), fix_from_msg(message)
-                                 if topic == topics.fix else velocity_from_msg(message, config)))
-                except MessageError:
-                    continue
-        if topics.reference is None:
-            raise BagError(f'{path} has no reference')
-        imu = decode_imu(imu_bytes, topics.imu)
-        orientations = decode_orientations(reference_bytes, topics.reference)
-    decoded_before = np.concatenate([[0], np.cumsum(imu.decoded)])
+    parts = list(read(Request(path)))
+    if parts[0].topics.reference is None:
+        raise BagError(f'{path} has no reference')
+    imu = joined([part.imu for part in parts])
+    orientations = joined([part.orientations for part in parts])
+    gnss = []
+    earlier = 0
+    for part in parts:
+        gnss += [(earlier + before, message) for before, message in part.gnss
+                 if not isinstance(message, str)]
+        earlier += part.imu.stamps_ns.size
     name = path.name.split('.')[0]
     return Recording(
-        name, imu, np.array([time for time, _, _ in gnss]),
-        decoded_before[[count for _, count, _ in gnss]],
-        tuple(message for _, _, message in gnss), Reference(orientations),
+        name, imu, np.array([before for before, _ in gnss]),
+        tuple(message for _, message in gnss), Reference(orientations),
         _reference_std(name, orientations), int(imu.stamps_ns[0]), int(imu.stamps_ns[-1]))
 
 

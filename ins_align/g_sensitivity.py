@@ -12,53 +12,35 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-What forces make of an IMU's calibration errors, as noise.
+What forces make of the gyros' bias, as noise.
 
-An accelerometer whose axis is misaligned feels a part of the forces along the others, and a force
-shifts a gyro's bias (g-sensitivity). What is steady in this looks like a bias and is estimated as
-one. What changes is taken for white noise that leaves the spread of these errors behind; as
-unknowns they would be 18. Scale factors and misalignment of the gyros are unknowns.
+A force shifts a gyro's bias (g-sensitivity). What is steady in this looks like a bias and is
+estimated as one. What changes is taken for white noise that leaves the spread of this error
+behind; as unknowns it would be nine. Scale factors and misalignment are unknowns.
 """
 
 import math
-from typing import NamedTuple
 
 from ins_align.recent import AGES, Recent
 from ins_align.rotation import Array
 import numpy as np
 
-# Over the error of the gyros' scale factors: misalignment and scale factors of the accelerometers,
-# g-sensitivity of the gyros (rad/s per m/s^2).
-ACCEL_ERRORS, G_SENSITIVITY = 0.3, 0.01
+# rad/s per m/s^2, over the error of the gyros' scale factors.
+G_SENSITIVITY = 0.01
 # A force is averaged over this time (s): of what swings faster nothing remains.
 CALM_TIME = 3.0
 # What has been so since the start, or for this long (s), looks like a bias.
 STEADY_TIME = 60.0
 
 
-class CalibrationNoise(NamedTuple):
+class GSensitivity:
     """
-    Noise densities of K intervals.
-
-    Attributes
-    ----------
-    gyro, accel : ndarray, shape (K, 1)
-        rad/sqrt(s), m/s/sqrt(s), about and along any axis.
-
-    """
-
-    gyro: Array
-    accel: Array
-
-
-class CalibrationErrors:
-    """
-    The noise that a force makes of the errors of a calibration: how far it is from steady.
+    The noise that a force makes of the gyros' biases: how far it is from steady.
 
     Parameters
     ----------
     gyro_scale_std : float
-        Scale factor error of the gyros, 1 sigma, to which the others are in proportion.
+        Scale factor error of the gyros, 1 sigma, to which g-sensitivity is in proportion.
 
     """
 
@@ -69,9 +51,9 @@ class CalibrationErrors:
         self._means: Array | None = None
         self._age = 0.0
 
-    def noise(self, spacing: Array, recent: Recent) -> CalibrationNoise:
+    def noise(self, spacing: Array, recent: Recent) -> Array:
         """
-        Return what the force makes of the sensors' errors.
+        Return what the force makes of the gyros' biases.
 
         Parameters
         ----------
@@ -80,15 +62,19 @@ class CalibrationErrors:
         recent : Recent
             Motion before the end of each.
 
+        Returns
+        -------
+        ndarray, shape (K, 1)
+            Noise density about any axis, rad/sqrt(s).
+
         """
         unsteady = np.zeros((spacing.size, 3))
         if self._scale_std > 0:
             forces = recent.gained[:, -1] / AGES[-1]
             unsteady[:] = [self._step(*step) for step in zip(spacing.tolist(), forces)]
-        # A push that is soon over leaves the spread that misaligned axes give its end.
+        # A push that is soon over leaves the spread that such gyros give its end.
         size = np.sqrt(np.sum(np.square(unsteady), axis=1, keepdims=True))
-        density = self._scale_std * math.sqrt(2 * CALM_TIME) * size
-        return CalibrationNoise(G_SENSITIVITY * density, ACCEL_ERRORS * density)
+        return G_SENSITIVITY * self._scale_std * math.sqrt(2 * CALM_TIME) * size
 
     def _step(self, seconds: float, force: Array) -> Array:
         """Take the force at the end of an interval; return how far it is from steady."""

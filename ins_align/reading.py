@@ -1,0 +1,148 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What an alignment wants of a recording: its messages, decoded many at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+import dataclasses
+from dataclasses import dataclass
+import itertools
+import os
+from typing import NamedTuple
+
+from ins_align.bag_files import BagError, Topic
+from ins_align.bags import Bag, Block, Topics
+from ins_align.config import Config
+from ins_align.decoding import (
+    decode_imu, decode_orientations, deserialize, ImuSamples, Orientations)
+from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Request:
+    """
+    What to read of which recording.
+
+    Attributes
+    ----------
+    path : path
+        rosbag2 directory or file, ROS 1 bag.
+    config : Config
+        ``velocity_type`` is used where the recording leaves a choice, as are the standard
+        deviations of GNSS messages without any.
+    imu_topic, fix_topic, velocity_topic : str, optional
+        Where there is more than one candidate.
+    start, duration : float, optional
+        Part of the recording, seconds from its start, by recorded time.
+
+    """
+
+    path: str | os.PathLike[str]
+    config: Config = Config()
+    imu_topic: str | None = None
+    fix_topic: str | None = None
+    velocity_topic: str | None = None
+    start: float | None = None
+    duration: float | None = None
+
+
+class Part(NamedTuple):
+    """Consecutive messages of a recording, decoded."""
+
+    topics: Topics
+    config: Config  # as requested, for the type of velocity that was found
+    imu: ImuSamples
+    # Each GNSS message, or why it is none as the counts name it, and how many of the IMU samples
+    # come before it.
+    gnss: tuple[tuple[int, Fix | Velocity | str], ...]
+    orientations: Orientations
+    done: float  # how much of the recording this ends at, 0 to 1
+    warnings: tuple[str, ...]  # so far
+
+
+def read(request: Request) -> Iterator[Part]:
+    """
+    Read a recording; the last part has no messages and all warnings.
+
+    Raises
+    ------
+    BagError
+        If the recording cannot be read or lacks a topic.
+
+    """
+    with Bag(request.path) as bag:
+        try:
+            topics = bag.choose_topics(request.config, request.imu_topic, request.fix_topic,
+                                       request.velocity_topic)
+        except BagError as error:
+            reasons = f' ({bag.warnings[0]})' if bag.warnings else ''
+            raise BagError(f'{error}{reasons}') from None
+        config = request.config
+        if topics.velocity_type is not None:
+            config = dataclasses.replace(config, velocity_type=topics.velocity_type)
+        wanted = tuple(topic for topic in (topics.imu, topics.fix, topics.velocity,
+                                           topics.reference) if topic is not None)
+        start_ns = (bag.start_ns or 0) + round((request.start or 0.0) * 1e9)
+        stop_ns = (None if request.duration is None
+                   else start_ns + round(request.duration * 1e9))
+        end_ns = bag.end_ns or start_ns
+        if stop_ns is not None:
+            end_ns = min(end_ns, stop_ns)
+        done = 0.0
+        try:
+            for block in bag.blocks(wanted, start_ns, stop_ns):
+                if end_ns > start_ns:
+                    done = min(max((block.times_ns[-1] - start_ns) / (end_ns - start_ns), 0.0),
+                               1.0)
+                yield _decoded(block, wanted, topics, config, done, tuple(bag.warnings))
+        except OSError as error:
+            raise BagError(f'{request.path} cannot be read: {error.strerror}') from None
+        yield _decoded(Block((), (), ()), wanted, topics, config, 1.0, tuple(bag.warnings))
+
+
+def _decoded(block: Block, wanted: Sequence[Topic], topics: Topics, config: Config, done: float,
+             warnings: tuple[str, ...]) -> Part:
+    """Decode a block, the IMU's messages all at once."""
+    kinds = np.array([0 if topic is topics.imu else 1 if topic is topics.reference else 2
+                      for topic in wanted])[np.array(block.topics, int)]
+    imu_messages, reference_messages = (
+        list(itertools.compress(block.messages, (kinds == kind).tolist())) for kind in (0, 1))
+    samples = decode_imu(imu_messages, topics.imu)
+    before = np.zeros(len(kinds), np.int64)
+    before[kinds == 0] = samples.decoded
+    before = np.cumsum(before)
+    gnss = tuple((int(before[index]), _gnss_message(block.messages[index],
+                                                    wanted[block.topics[index]], topics, config))
+                 for index in np.flatnonzero(kinds == 2).tolist())
+    return Part(topics, config, samples, gnss,
+                decode_orientations(reference_messages, topics.reference or topics.imu), done,
+                warnings)
+
+
+def _gnss_message(data: bytes, topic: Topic, topics: Topics,
+                  config: Config) -> Fix | Velocity | str:
+    """Return a GNSS message, or why it is none as the counts name it."""
+    name = 'fix' if topic is topics.fix else 'velocity'
+    try:
+        message = deserialize(data, topic)
+    except MessageError:
+        return f'{name}_undecodable'
+    if topic is topics.fix:
+        return fix_from_msg(message)
+    try:
+        return velocity_from_msg(message, config)
+    except MessageError:
+        return 'velocity_body_frame'
