@@ -210,10 +210,16 @@ def log_so3(matrix: ArrayLike) -> Array:
     """
     q = quaternion_from_matrix(matrix)
     sine = np.sqrt(np.sum(q[..., :3] ** 2, axis=-1))
-    angle = 2 * np.arctan2(sine, q[..., 3])
+    angle = 2 * _arctan2(sine, q[..., 3])
     small = sine < 1e-12
     scale = np.where(small, 2.0, angle / np.where(small, 1.0, sine))
     return q[..., :3] * scale[..., None]
+
+
+def _arctan2(y: Array, x: Array) -> Array:
+    """Of packed copies: the last bit of others depends, with numpy 1.26, on where they lie."""
+    angle: Array = np.arctan2(np.array(y), np.array(x))
+    return angle
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
@@ -309,9 +315,9 @@ def roll_pitch_yaw(matrix: ArrayLike) -> Array:
 
     """
     m = np.asarray(matrix, dtype=float)
-    return np.stack([np.arctan2(m[..., 2, 1], m[..., 2, 2]),
-                     np.arctan2(-m[..., 2, 0], np.hypot(m[..., 0, 0], m[..., 1, 0])),
-                     np.arctan2(m[..., 1, 0], m[..., 0, 0])], axis=-1)
+    return np.stack([_arctan2(m[..., 2, 1], m[..., 2, 2]),
+                     _arctan2(-m[..., 2, 0], np.hypot(m[..., 0, 0], m[..., 1, 0])),
+                     _arctan2(m[..., 1, 0], m[..., 0, 0])], axis=-1)
 
 
 def orthonormalized(matrix: Array) -> Array:

@@ -116,6 +116,15 @@ def test_vertical_nose_still_gives_angles_of_the_same_rotation(pitch):
     assert rpy[1] == pytest.approx(pitch, abs=1e-7)
 
 
+def test_the_memory_that_a_call_gets_does_not_change_the_last_bit():
+    matrices = Rotation.random(500, random_state=3).as_matrix()
+    random = np.random.default_rng(4)
+    first, held = rotation.log_so3(matrices), []
+    for _ in range(4000):
+        held = [*held[-20:], np.empty(random.integers(1, 9000))]
+        assert np.array_equal(rotation.log_so3(matrices), first)
+
+
 @pytest.mark.parametrize('count', (1, 2, 3, 7, 8, 33))
 def test_cumulative_rotations_are_the_products_one_by_one(count):
     steps = Rotation.random(3 * count, random_state=count).as_matrix().reshape(3, count, 3, 3)
