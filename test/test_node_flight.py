@@ -100,6 +100,6 @@ def check_imu(listener, flight, time_to_align_s):
     errors, sigmas = np.array(errors), np.array(sigmas)
     assert len(errors) > 5900
     assert np.abs(errors / sigmas).max() < 3.0
-    # Honest must not mean vague.
-    assert sigmas.max() < 1.0
+    # Honest must not mean vague: from the threshold, at which it was declared, sigma falls.
+    assert sigmas[len(sigmas) // 2:].max() < 0.5
     assert sigmas[-1].max() < 0.3
