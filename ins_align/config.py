@@ -47,19 +47,21 @@ class ImuNoise(NamedTuple):
     gyro_bias_std: float  # rad/s
     accel_bias_std: float  # m/s^2
     gyro_scale_std: float = 0.0  # scale factor error, 0.01 is one percent
+    rate_random_walk: float = 0.0  # of the gyros' biases, rad/s/sqrt(s)
 
 
 def _imu_noise(arw: float, vrw: float, gyro_bias: float, accel_bias: float,
-               gyro_scale: float = 0.0) -> ImuNoise:
-    """Convert deg/sqrt(h), m/s/sqrt(h), deg/s, m/s^2 to SI."""
+               gyro_scale: float = 0.0, rate_walk: float = 0.0) -> ImuNoise:
+    """Convert deg/sqrt(h), m/s/sqrt(h), deg/s, m/s^2, 1, deg/s/sqrt(h) to SI."""
     return ImuNoise(math.radians(arw) / 60.0, vrw / 60.0, math.radians(gyro_bias), accel_bias,
-                    gyro_scale)
+                    gyro_scale, math.radians(rate_walk) / 60.0)
 
 
 PRESETS = {
     'navigation': _imu_noise(0.002, 0.003, 0.01 / 3600.0, 50e-6 * STANDARD_GRAVITY),
-    'tactical': _imu_noise(0.05, 0.03, 1.0 / 3600.0, 1e-3 * STANDARD_GRAVITY, 0.0005),
-    'mems': _imu_noise(0.3, 0.09, 0.1, 0.05, 0.01),
+    'tactical': _imu_noise(0.05, 0.03, 1.0 / 3600.0, 1e-3 * STANDARD_GRAVITY, 0.0005,
+                           1.8 / 3600.0),
+    'mems': _imu_noise(0.3, 0.09, 0.1, 0.05, 0.01, 0.18),
 }
 
 
@@ -134,6 +136,9 @@ class Config:
         "preset's; where that is above 0 it is estimated, as are, 3 tenths of it, misalignment "
         'and the errors of the accelerometers; g-sensitivity counts as noise', '1',
         minimum=0.0, maximum=0.5)
+    rate_random_walk: float = _parameter(
+        0.0, "rate random walk of the gyroscopes: how their biases change; 0: the preset's",
+        'deg/s/sqrt(h)', minimum=0.0, maximum=100.0)
     velocity_std: float = _parameter(
         0.3, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none', 'm/s',
         minimum=1e-4, maximum=100.0)
@@ -186,7 +191,8 @@ class Config:
     def imu_noise(self) -> ImuNoise:
         """Noise of the IMU in SI units: the preset's, where a figure is given that one."""
         own = _imu_noise(self.angle_random_walk, self.velocity_random_walk,
-                         self.gyro_bias_std, self.accel_bias_std, self.gyro_scale_std)
+                         self.gyro_bias_std, self.accel_bias_std, self.gyro_scale_std,
+                         self.rate_random_walk)
         if self.imu_grade == 'custom':
             return own
         return ImuNoise(*(given or preset for given, preset

@@ -29,8 +29,8 @@ from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals, SensorErrors
 from ins_align.rotation import Array, cross
 from ins_align.solution import Course, Solution
-from ins_align.unknowns import (ACCEL_MATRIX, BODY_FIXED, DELAY, GYRO_BIAS, GYRO_MATRIX, LEVER_ARM,
-                                Prior, prior_of, SIZE, START_POSITION, START_VELOCITY, Unknowns)
+from ins_align.unknowns import (ACCEL_MATRIX, DELAY, GYRO_BIAS, GYRO_MATRIX, LEVER_ARM, Prior,
+                                SIZE, START_POSITION, START_VELOCITY, Unknowns)
 from ins_align.whitening import (Chain, GATE, Gate, HEADING_RESOLVED_STD, Measurements, POSITION,
                                  VELOCITY, Whitened)
 import numpy as np
@@ -80,6 +80,10 @@ class MapEstimator:
         Otherwise they stay at the prior's mean.
     capacity : int
         Epochs that are stored.
+    excess : float
+        Share of the measured excess noise that counts at first.
+    rate_random_walk : float
+        Of the gyros' biases, rad/s/sqrt(s); 0: they stay what they are.
 
     """
 
@@ -118,7 +122,7 @@ class MapEstimator:
     def __init__(self, prior: Prior, *, use_position: bool = False,
                  estimate_lever_arm: bool = False, estimate_delay: bool = False,
                  estimate_matrices: bool = False, capacity: int = 1000,
-                 excess: float = FIRST_EXCESS) -> None:
+                 excess: float = FIRST_EXCESS, rate_random_walk: float = 0.0) -> None:
         """Start at t0."""
         wanted = np.ones(SIZE, bool)
         wanted[START_POSITION] = use_position
@@ -139,6 +143,7 @@ class MapEstimator:
         self.solution: Solution | None = None
         self._last_fit = self._last_tuned = self._last_afresh = 0
         self.excess = excess
+        self._rate_random_walk = rate_random_walk
         self.gated = True
         self._recent: deque[float] = deque(maxlen=self.GATE_WINDOW)
         self._gate_scale = 1.0
@@ -268,14 +273,16 @@ class MapEstimator:
 
         The heading at t0 gets lost with the vertical gyro's bias the longer the vehicle stands or
         flies straight after it. That it does shows when the velocity is known and the heading is
-        not. A long chain of a poor IMU says little of its beginning in any case.
+        not. A long chain of a poor IMU says little of its beginning in any case, nor does one
+        whose errors have grown out of the linear picture.
         """
         s = self.solution
         if s is None:
             return False
         age = self.time
         if not self.idle:
-            return bool(age >= self.MAX_AGE)
+            return bool(age >= self.MAX_AGE or (s.bent > self.NONLINEARITY
+                                                and self.heading_std < HEADING_RESOLVED_STD))
         variances = self.variances
         bias_std = math.sqrt(np.max(variances[GYRO_BIAS]))
         if age * bias_std < self.IDLE_HEADING_LOSS:
@@ -304,7 +311,8 @@ class MapEstimator:
 
     def _start(self, point: Unknowns) -> Solution:
         """Return an empty solution at a linearisation point."""
-        return Solution(point, self.prior, self.columns, self.size, self.excess)
+        return Solution(point, self.prior, self.columns, self.size, self.excess,
+                        self._rate_random_walk)
 
     def _converge(self, point: Unknowns, P: 'Array | None', refused: np.ndarray) -> Solution:
         """
@@ -453,7 +461,8 @@ class MapEstimator:
                                                  or LEVER_ARM.start in self.columns),
                              estimate_delay=DELAY.start in self.columns,
                              estimate_matrices=GYRO_MATRIX.start in self.columns,
-                             capacity=self.count, excess=self.excess)
+                             capacity=self.count, excess=self.excess,
+                             rate_random_walk=self._rate_random_walk)
         other._intervals, other._gnss = intervals, self._gnss.take(slice(0, self.count))
         other.count = self.count
         other.gated = False
@@ -535,12 +544,3 @@ class MapEstimator:
         if s is None:
             raise RuntimeError('no solution yet')
         return s.C, s.covariance
-
-    def prior_without_attitude(self) -> Prior:
-        """Return what is known of biases, lever arm and delay as the prior of a fresh start."""
-        if self.solution is None:
-            return self.prior
-        unknowns = self.columns[np.isin(self.columns, BODY_FIXED)]
-        mean = replace(self.estimate(), C=np.eye(3), start_velocity=np.zeros(3),
-                       start_position=np.zeros(3))
-        return prior_of(mean, self.covariance[np.ix_(unknowns, unknowns)], unknowns, False)

@@ -80,6 +80,16 @@ def prior_from_now(estimator: MapEstimator, C_n0n: Array, shift_v: Array, shift_
     return prior_of(mean, joint[np.ix_(places, places)], unknowns, heading_free)
 
 
+def prior_without_attitude(estimator: MapEstimator) -> Prior:
+    """Return what is known now of sensors, lever arm and delay as the prior of a fresh start."""
+    if estimator.solution is None:
+        return estimator.prior
+    now, joint = _now(estimator, True)
+    kept = np.flatnonzero(np.isin(estimator.columns, BODY_FIXED))
+    mean = replace(now, C=np.eye(3), start_velocity=np.zeros(3), start_position=np.zeros(3))
+    return prior_of(mean, joint[np.ix_(9 + kept, 9 + kept)], estimator.columns[kept], False)
+
+
 def _now(estimator: MapEstimator, heading_free: bool) -> tuple[Unknowns, Array]:
     """
     Return the unknowns as if the last epoch were t0, in the axes and origin of the present n0.
@@ -94,8 +104,6 @@ def _now(estimator: MapEstimator, heading_free: bool) -> tuple[Unknowns, Array]:
         raise RuntimeError('no solution yet')
     x, step, time, chain = s.estimate, s.step(), estimator.time, s.chain
     C = exp_so3([0.0, 0.0, -step[2]]) @ x.C if heading_free else x.C
-    error = np.zeros(9)
-    error[:estimator.size] = s.chain_errors()
     # The stored chain has the sensor errors of the point: their step is still to be applied.
     gyro, accel = step[GYRO], step[ACCEL]
     v = C @ (chain.v + chain.v_g @ gyro + chain.v_a @ accel)
@@ -109,14 +117,19 @@ def _now(estimator: MapEstimator, heading_free: bool) -> tuple[Unknowns, Array]:
     E = J[:, START]
     J[:3, GYRO], J[3:6, GYRO], J[6:, GYRO] = C @ chain.R_g, C @ chain.v_g, C @ chain.p_g
     J[3:6, ACCEL], J[6:, ACCEL] = C @ chain.v_a, C @ chain.p_a
-    moved = E @ error
+    # Derivatives of all that is now to the errors of the chain.
+    errors = s.chain_errors()
+    size, n = estimator.size, estimator.columns.size
+    D = np.zeros((9 + n, errors.size))
+    D[:9, :size] = E[:, :size]
+    if errors.size > size:                                      # the gyros' biases walk
+        D[:9, size:] = J[:, GYRO_BIAS]
+        D[9 + np.flatnonzero(np.isin(estimator.columns, np.r_[GYRO_BIAS])), size:] = np.eye(3)
+    moved = D[:9] @ errors
     now = replace(
-        x, C=exp_so3(error[:3]) @ C @ exp_so3(chain.R_g @ gyro) @ chain.R,
+        x, C=exp_so3(moved[:3]) @ C @ exp_so3(chain.R_g @ gyro) @ chain.R,
+        sensors=x.sensors._replace(gyro_bias=s.gyro_bias),
         start_velocity=x.start_velocity + v + moved[3:6],
         start_position=x.start_position + time * x.start_velocity + p + moved[6:])
-    E = E[:, :estimator.size]
-    total = np.vstack([J[:, estimator.columns] - E @ s.whitener.X[:, 1:],
-                       np.eye(estimator.columns.size)])
-    covariance = total @ s.P @ total.T
-    covariance[:9, :9] += E @ s.whitener.P @ E.T
-    return now, covariance
+    total = np.vstack([J[:, estimator.columns], np.eye(n)]) - D @ s.whitener.X[:, 1:]
+    return now, total @ s.P @ total.T + D @ s.whitener.P @ D.T

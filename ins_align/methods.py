@@ -26,7 +26,7 @@ from typing import Protocol
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimator import FIRST_EXCESS, Innovation, MapEstimator, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
-from ins_align.handover import prior_from_now
+from ins_align.handover import prior_from_now, prior_without_attitude
 from ins_align.imu_steps import ImuSteps
 from ins_align.preintegration import Noise, preintegrate, SensorErrors
 from ins_align.rotation import Array, orthonormalized
@@ -153,7 +153,7 @@ class Method(Protocol):
         """Return biases, lever arm and delay."""
 
     def sensor_errors(self) -> SensorErrors:
-        """Return the errors of gyros and accelerometers."""
+        """Return the errors of gyros and accelerometers at the last epoch."""
 
     def prior_without_attitude(self) -> Prior | None:
         """Return what a fresh start may keep."""
@@ -188,7 +188,8 @@ class MapMethod:
         noise = config.imu_noise
         self._estimates_matrices = noise.gyro_scale_std > 0
         self._wander = np.zeros(SIZE)
-        self._wander[GYRO_BIAS] = (WANDER * noise.gyro_bias_std) ** 2 / WANDER_TIME
+        if noise.rate_random_walk == 0.0:       # otherwise it counts all the time
+            self._wander[GYRO_BIAS] = (WANDER * noise.gyro_bias_std) ** 2 / WANDER_TIME
         self._wander[ACCEL_BIAS] = (WANDER * noise.accel_bias_std) ** 2 / WANDER_TIME
         self._first_prior = first_prior(
             noise.gyro_bias_std, noise.accel_bias_std, np.array(config.lever_arm),
@@ -212,7 +213,8 @@ class MapMethod:
             prior, use_position=self._use_position,
             estimate_lever_arm=self._config.lever_arm_std > 0,
             estimate_delay=self._config.gnss_delay_std > 0, capacity=self._capacity,
-            estimate_matrices=self._estimates_matrices, excess=excess)
+            estimate_matrices=self._estimates_matrices, excess=excess,
+            rate_random_walk=self._config.imu_noise.rate_random_walk)
 
     def _take_start(self, epoch: AntennaEpoch, imu: ImuSteps) -> None:
         """Take the epoch at t0."""
@@ -344,7 +346,10 @@ class MapMethod:
         """Return biases, lever arm and delay."""
         x = self._estimator.estimate()
         std = np.sqrt(self._estimator.variances)
-        return Nuisance(x.sensors.gyro_bias, std[GYRO_BIAS],
+        solution = self._estimator.solution
+        if solution is not None:
+            std[GYRO_BIAS] = np.sqrt(solution.gyro_bias_covariance().diagonal())
+        return Nuisance(self.sensor_errors().gyro_bias, std[GYRO_BIAS],
                         x.sensors.accel_bias, std[ACCEL_BIAS],
                         x.lever_b, std[LEVER_ARM], self._delay(x), float(std[DELAY][0]))
 
@@ -353,12 +358,13 @@ class MapMethod:
         return float(self._config.gnss_delay + x.delay)
 
     def sensor_errors(self) -> SensorErrors:
-        """Return the errors of gyros and accelerometers."""
-        return self._estimator.estimate().sensors
+        """Return the errors of gyros and accelerometers at the last epoch."""
+        sensors, solution = self._estimator.estimate().sensors, self._estimator.solution
+        return sensors if solution is None else sensors._replace(gyro_bias=solution.gyro_bias)
 
     def prior_without_attitude(self) -> Prior | None:
         """Return what a fresh start may keep."""
-        return None if self._lost else self._estimator.prior_without_attitude()
+        return None if self._lost else prior_without_attitude(self._estimator)
 
 
 def _force_at_rest(imu: ImuSteps) -> Array:

@@ -68,7 +68,7 @@ class Simulation:
     truth_lla: Array                # (N, 3), IMU, degrees and metres
     truth_gyro: Array               # (N, 3), rad/s
     truth_accel: Array              # (N, 3), m/s^2
-    gyro_bias: Array                # (3,), rad/s
+    gyro_bias: Array                # (3,), rad/s, at the first sample
     accel_bias: Array               # (3,), m/s^2
     lever_arm: Array                # (3,), IMU to antenna in the IMU frame, m
     imu_noise: ImuNoise             # what the errors are drawn from
@@ -181,6 +181,7 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
              duration: float | None = None, ideal: bool = False,
              imu_rate: float = 100.0, imu_jitter: float = 0.0,
              gyro_bias_std: float | None = None, accel_bias_std: float | None = None,
+             rate_random_walk: float = 0.0,
              gyro_scale_std: float = 0.0, gyro_misalignment_std: float = 0.0,
              accel_scale_std: float = 0.0, accel_misalignment_std: float = 0.0,
              lever_arm: Sequence[float] = (1.0, 1.0, 1.0),
@@ -220,6 +221,8 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
         tell the displaced instants.
     gyro_bias_std, accel_bias_std : float, optional
         rad/s and m/s^2 per axis in place of the grade's.
+    rate_random_walk : float
+        Of the gyros' biases, rad/s/sqrt(s).
     gyro_scale_std, gyro_misalignment_std : float
         Scale factor error of each gyro (0.01 is one percent), and what it feels of the rate about
         each of the other axes.
@@ -271,7 +274,8 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
 
     """
     meta = dict(locals())
-    noise = checked_arguments(meta)._replace(gyro_scale_std=gyro_scale_std)
+    noise = checked_arguments(meta)._replace(gyro_scale_std=gyro_scale_std,
+                                             rate_random_walk=rate_random_walk)
     if gyro_bias_std is not None:
         noise = noise._replace(gyro_bias_std=gyro_bias_std)
     if accel_bias_std is not None:
@@ -297,11 +301,12 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
         + scale * misalignment_std * (1 - np.eye(3)) * streams[0].standard_normal((3, 3))
         for scale_std, misalignment_std in ((gyro_scale_std, gyro_misalignment_std),
                                             (accel_scale_std, accel_misalignment_std)))
+    walk = _random_walk(trajectory.stamps_ns * 1e-9, scale * rate_random_walk, streams[0])
     gyro_std = scale * noise.angle_random_walk * math.sqrt(imu_rate)
     accel_std = scale * noise.velocity_random_walk * math.sqrt(imu_rate)
     sign = np.array(IMU_AXES[flip_axis])
     shape = truth_gyro.shape
-    gyro = sign * (truth_gyro @ gyro_matrix.T + gyro_bias
+    gyro = sign * (truth_gyro @ gyro_matrix.T + gyro_bias + walk
                    + gyro_std * streams[1].standard_normal(shape))
     accel = accel_sign * sign * (truth_accel @ accel_matrix.T + accel_bias
                                  + accel_std * streams[2].standard_normal(shape))
@@ -364,6 +369,12 @@ def _gauss_markov(time: Array, std: float, correlation_time: float,
     for k in range(1, len(drive)):
         drive[k] += decay[k] * drive[k - 1]
     return drive
+
+
+def _random_walk(time: Array, density: float, random: np.random.Generator) -> Array:
+    """Random walk (n, 3) from 0 on."""
+    steps = np.sqrt(np.diff(time, prepend=time[0]))[:, None]
+    return np.cumsum(density * steps * random.standard_normal((len(time), 3)), axis=0)
 
 
 def write_bag(simulation: Simulation, path: str | os.PathLike, storage: str = 'mcap') -> None:

@@ -48,7 +48,7 @@ class Course:
     chain : Chain
     whitened : Whitened
     time : ndarray, shape (K,)
-    dx, P, estimate, chi2, dof, nonlinearity, C, covariance
+    dx, P, estimate, chi2, dof, nonlinearity, bent, C, covariance, gyro_bias
         As in `Solution`, with a leading axis of K.
 
     """
@@ -62,8 +62,10 @@ class Course:
     chi2: Array
     dof: Index
     nonlinearity: Array
+    bent: Array
     C: Array
     covariance: Array
+    gyro_bias: Array
 
 
 class Solution:
@@ -80,6 +82,8 @@ class Solution:
         9 when positions are used, 6 when velocities alone are.
     excess : float
         Share that is believed of the IMU noise measured in excess of the stated one.
+    rate_random_walk : float
+        Of the gyros' biases, rad/s/sqrt(s).
 
     Attributes
     ----------
@@ -100,38 +104,46 @@ class Solution:
     dof : int
     nonlinearity : float
         Second-order error of the linearisation, in sigmas of tilt or heading.
+    bent : float
+        So it is with the errors of the chain, which is linearised where they are zero.
     C, covariance : ndarray, shape (3, 3)
         Attitude at the last epoch with respect to n0, ``C_n0b``, and the covariance of its left
         error, rad^2.
+    gyro_bias : ndarray, shape (3,)
+        Of the gyros at the last epoch, rad/s; that of `estimate` is the one at t0.
 
     """
 
     def __init__(self, point: Unknowns, prior: Prior, columns: Index, size: int,
-                 excess: float) -> None:
+                 excess: float, rate_random_walk: float = 0.0) -> None:
         """Start empty, at t0."""
         information, step = prior.at(point)
         self.point = self.estimate = point
         self._columns, self._size, self._excess = columns, size, excess
+        self._rate_random_walk = rate_random_walk
         self.information = information[np.ix_(columns, columns)]
         self._mean_step = step[columns]
         self._weak = np.diag(WEAK_INFORMATION[columns])
         self._known = int(np.count_nonzero(self.information.diagonal()))
         self._gyro = np.flatnonzero((columns >= GYRO.start) & (columns < GYRO.stop))
         self.chain = Chain.start()
-        self.whitener = Whitener(columns, size)
+        self.whitener = Whitener(columns, size, rate_random_walk > 0)
         self.rejected = [0, 0]
         self.time = 0.0
         self.dx = np.zeros(columns.size)
         self.P = np.zeros((columns.size, columns.size))
         self.chi2 = self.nonlinearity = math.nan
+        self.bent = 0.0
         self.dof = 0
         self.C, self.covariance = point.C, np.zeros((3, 3))
+        self.gyro_bias = point.sensors.gyro_bias
 
     def rows(self, gnss: Measurements, interval: Intervals) -> Rows:
         """Linearise K epochs that follow the chain; their intervals with the point's biases."""
         chain = self.chain.extended(interval)
         Y = sensitivities(self.point, chain, gnss, interval)[:, :, self.whitener.columns]
-        noise = chain_noise(self.point.C, gnss.time, chain, interval, self._size, self._excess)
+        noise = chain_noise(self.point.C, gnss.time, chain, interval, self._size, self._excess,
+                            self._rate_random_walk)
         kinds = self.kinds
         return Rows(chain, noise, Y.reshape(Y.shape[0], 2, 3, -1)[:, :kinds],
                     gnss.covariance[:, :kinds], gnss.time)
@@ -183,8 +195,9 @@ class Solution:
         self.time = float(course.time[k])
         self.dx, self.P, self.estimate = course.dx[k], course.P[k], course.estimate.at(k)
         self.chi2, self.dof = float(course.chi2[k]), int(course.dof[k])
-        self.nonlinearity = float(course.nonlinearity[k])
+        self.nonlinearity, self.bent = float(course.nonlinearity[k]), float(course.bent[k])
         self.C, self.covariance = course.C[k], course.covariance[k]
+        self.gyro_bias = course.gyro_bias[k]
 
     def _course(self, rows: Rows, whitened: Whitened, index: slice) -> Course:
         """Solve the normal equations and judge the fit after each epoch of `index`."""
@@ -203,20 +216,29 @@ class Solution:
         step = np.zeros((dx.shape[0], SIZE))
         step[:, self._columns] = dx
         estimate = self.point.moved(step)
-        # The attitude now.
-        X = whitened.X
-        J = -X[:, :3, 1:]
+        # The attitude and the biases now.
+        turned = np.zeros((len(time), 3, whitened.P.shape[1]))
+        turned[:, :, :3] = np.eye(3)
+        gyro_bias = estimate.sensors.gyro_bias
+        if self._rate_random_walk > 0:
+            turned[:, :, -3:] = self.point.C @ chain.R_g[:, :, :3]
+            walked = whitened.X[:, -3:]
+            gyro_bias = gyro_bias + walked[:, :, 0] - apply(walked[:, :, 1:], dx)
+        X = turned @ whitened.X
+        J = -X[:, :, 1:]
         J[:, :, ATTITUDE] += np.eye(3)
         J[:, :, self._gyro] += (estimate.C @ chain.R_g)[
             :, :, self._columns[self._gyro] - GYRO.start]
-        errors = X[:, :3, 0] - apply(X[:, :3, 1:], dx)
+        errors = X[:, :, 0] - apply(X[:, :, 1:], dx)
         before, after = exp_so3(np.stack([errors, apply(chain.R_g, step[:, GYRO])]))
         C = before @ estimate.C @ after @ chain.R
         return Course(chain, whitened, time, dx, P, estimate,
                       normal[:, 0, 0] + self._mean_step @ prior - np.sum(right * dx, axis=1),
                       whitened.rows - dx.shape[1] + self._known,
-                      _nonlinearity(step, P, time), C,
-                      J @ P @ J.transpose(0, 2, 1) + whitened.P[:, :3, :3])
+                      _nonlinearity(step, P, time),
+                      0.5 * np.sum(errors ** 2, axis=1) / np.sqrt(_tilt_variance(P)), C,
+                      J @ P @ J.transpose(0, 2, 1)
+                      + turned @ whitened.P @ turned.transpose(0, 2, 1), gyro_bias)
 
     def step(self) -> Array:
         """Step from the point to the estimate, of all unknowns, shape (37,)."""
@@ -225,8 +247,16 @@ class Solution:
         return dx
 
     def chain_errors(self) -> Array:
-        """Estimated errors of the chain at the last epoch, as seen at t0, shape (6,) or (9,)."""
+        """Estimated errors of the chain at the last epoch, as seen at t0, shape (m,)."""
         return self.whitener.X[:, 0] - self.whitener.X[:, 1:] @ self.dx
+
+    def gyro_bias_covariance(self) -> Array:
+        """Covariance of `gyro_bias`, shape (3, 3)."""
+        J = np.eye(self._columns.size)[self._gyro[:3]]
+        if self._rate_random_walk == 0.0:
+            return J @ self.P @ J.T
+        J -= self.whitener.X[-3:, 1:]
+        return J @ self.P @ J.T + self.whitener.P[-3:, -3:]
 
     @property
     def log_likelihood(self) -> float:
@@ -239,7 +269,10 @@ def _nonlinearity(step: Array, P: Array, time: Array) -> Array:
     """Second-order error of a step, shape (K, 37), in sigmas of tilt or heading, shape (K,)."""
     tilt_e, tilt_n, turn = np.abs(step[:, ATTITUDE].T)
     tilt = np.hypot(tilt_e, tilt_n) + time * np.sqrt(np.sum(step[:, GYRO_BIAS] ** 2, axis=1))
-    variances = np.diagonal(P, axis1=1, axis2=2)
-    return np.maximum(
-        tilt * (0.5 * tilt + turn) / np.sqrt(np.minimum(variances[:, 0], variances[:, 1])),
-        0.5 * turn * turn / np.sqrt(variances[:, 2]))
+    return np.maximum(tilt * (0.5 * tilt + turn) / np.sqrt(_tilt_variance(P)),
+                      0.5 * turn * turn / np.sqrt(P[:, 2, 2]))
+
+
+def _tilt_variance(P: Array) -> Array:
+    """Variance of the tilt about the axis where it is known best, rad^2, shape (K,)."""
+    return np.minimum(P[:, 0, 0], P[:, 1, 1])

@@ -17,7 +17,9 @@ Whitening: residuals and sensitivities of the integration formulas, freed of the
 The random-walk errors of the integrated IMU data are carried as what they amount to at t0: errors
 of the initial attitude, of the start velocity and, with positions, of the start position, in n0.
 Seen so they are a plain random walk, and a measurement's derivative to them is its derivative to
-those unknowns. Measurement rows: velocity first, then position; both in n0.
+those unknowns. So it is with how far the gyros' biases have walked since t0: a step of theirs is
+one of the biases at t0 less what that would have done until then. Measurement rows: velocity
+first, then position; both in n0.
 """
 
 from dataclasses import dataclass
@@ -132,7 +134,7 @@ class Chain:
 
 
 def chain_noise(C: Array, time: Array, chain: Chain, interval: Intervals, size: int,
-                excess: float = 1.0) -> Array:
+                excess: float = 1.0, rate_random_walk: float = 0.0) -> Array:
     """
     Covariance that each interval's noise adds to the errors of the chain, as seen at t0.
 
@@ -150,10 +152,13 @@ def chain_noise(C: Array, time: Array, chain: Chain, interval: Intervals, size: 
         9 with the start position, 6 without.
     excess : float
         Share of the noise measured in excess of the stated one that is believed.
+    rate_random_walk : float
+        Of the gyros' biases, rad/s/sqrt(s); 0: they stay what they are.
 
     Returns
     -------
-    ndarray, shape (K, size, size)
+    ndarray, shape (K, n, n)
+        n is `size`, or 3 more for the biases where they walk.
 
     """
     turn = (C @ chain.R) @ interval.R.transpose(0, 2, 1)       # from the interval's start to n0
@@ -167,7 +172,35 @@ def chain_noise(C: Array, time: Array, chain: Chain, interval: Intervals, size: 
         spread[:, 6:, 3:6] = -t * turn
         spread[:, 6:, 6:] = turn
     Q = interval.Q[:, :size, :size] + excess * interval.Q_excess[:, :size, :size]
-    return spread @ Q @ spread.transpose(0, 2, 1)
+    noise = spread @ Q @ spread.transpose(0, 2, 1)
+    if rate_random_walk == 0.0:
+        return noise
+    step = np.concatenate([-bias_seen_at_start(C, time, chain, size),
+                           np.broadcast_to(np.eye(3), (time.size, 3, 3))], axis=1)
+    step *= rate_random_walk * np.sqrt(interval.duration)[:, None, None]
+    walk = step @ step.transpose(0, 2, 1)
+    walk[:, :size, :size] += noise
+    return walk
+
+
+def bias_seen_at_start(C: Array, time: Array, chain: Chain, size: int) -> Array:
+    """
+    Return what a gyro bias does to the chain up to each of K epochs, as seen at t0.
+
+    Parameters
+    ----------
+    C, time, chain, size
+        As for `chain_noise`.
+
+    Returns
+    -------
+    ndarray, shape (K, size, 3)
+
+    """
+    R_g, v_g, p_g = (C @ derivative[:, :, :3] for derivative in (chain.R_g, chain.v_g, chain.p_g))
+    v = v_g + skew(apply(C, chain.v)) @ R_g
+    p = p_g + skew(apply(C, chain.p)) @ R_g - time[:, None, None] * v
+    return np.concatenate([R_g, v, p], axis=1)[:, :size]
 
 
 def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
@@ -366,12 +399,14 @@ class Whitener:
         Unknowns that are estimated, out of the 37.
     size : int
         9 when positions are used, 6 when velocities alone are.
+    walks : bool
+        Whether the gyros' biases walk, which are three more errors then.
 
     Attributes
     ----------
-    P : ndarray, shape (size, size)
+    P : ndarray, shape (m, m)
         Covariance of the chain's errors for known unknowns.
-    X : ndarray, shape (size, 1 + n)
+    X : ndarray, shape (m, 1 + n)
         What they are known to be: a constant and its derivatives to the unknowns.
     normal : ndarray, shape (1 + n, 1 + n)
         Sum of the whitened rows' squares and products, the residual's first.
@@ -384,12 +419,13 @@ class Whitener:
 
     """
 
-    def __init__(self, columns: Index, size: int) -> None:
+    def __init__(self, columns: Index, size: int, walks: bool = False) -> None:
         """Start at t0, where the chain has no error."""
         self.columns = np.concatenate([[0], 1 + columns])
-        self._start_columns = 1 + np.searchsorted(columns, START[:size])
-        self.P = np.zeros((size, size))
-        self.X = np.zeros((size, self.columns.size))
+        alike = np.concatenate([START[:size], np.r_[GYRO_BIAS][:3 * walks]])
+        self._alike_columns = 1 + np.searchsorted(columns, alike)
+        self.P = np.zeros((alike.size, alike.size))
+        self.X = np.zeros((alike.size, self.columns.size))
         self.normal = np.zeros((self.columns.size, self.columns.size))
         self.rows = 0
         self.spurious = 0.0
@@ -420,7 +456,7 @@ class Whitener:
         """
         Y, covariance = rows.Y, rows.covariance
         K, kinds = wanted.shape
-        D = Y[..., self._start_columns]
+        D = Y[..., self._alike_columns]
         D_T = D.swapaxes(-1, -2)
         used = wanted.copy()
         P, X = self.P, self.X

@@ -14,6 +14,7 @@
 """The recursive estimator against the dense reference and the truth."""
 
 from functools import partial
+import math
 
 from alignment import (aligned, config_for, error_of, estimator_of, LEVER, normalised_error,
                        simulated)
@@ -86,14 +87,15 @@ def as_calibrated(grade):
 
 
 @pytest.mark.parametrize('case', CASES)
-@pytest.mark.parametrize('scenario, grade', [('flight', 'navigation'), ('flight', 'mems'),
-                                             ('car', 'tactical')])
-def test_recursion_is_the_dense_solution(scenario, grade, case, monkeypatch):
+@pytest.mark.parametrize('scenario, grade, walk', [
+    ('flight', 'navigation', 0.0), ('flight', 'mems', 0.0), ('car', 'tactical', 0.0),
+    ('flight', 'mems', 0.1), ('car', 'tactical', 1.0)])
+def test_recursion_is_the_dense_solution(scenario, grade, walk, case, monkeypatch):
     # The reference does not count this.
     monkeypatch.setattr('ins_align.g_sensitivity.G_SENSITIVITY', 0.0)
     changes, _ = CASES[case]
     s = simulated(scenario, imu_grade=grade, duration=20.0, seed=3, position_std=0.5,
-                  **as_calibrated(grade))
+                  rate_random_walk=walk * PRESETS[grade].gyro_bias_std, **as_calibrated(grade))
     aligner, _ = aligned(s, **changes)
     estimator = settled(aligner)
     dense = dense_solution(
@@ -144,17 +146,19 @@ def test_covariance_without_noise_is_the_cramer_rao_bound_at_every_time(scenario
 
 # Handover
 
+@pytest.mark.parametrize('walk', (0.0, 0.3))
 @pytest.mark.parametrize('changes', (
     {}, {'use_position': True}, {'use_velocity': False, 'use_position': True},
     {'lever_arm_std': 0.5, 'gnss_delay_std': 0.05}))
-def test_handover_gives_the_attitude_of_one_that_never_handed_over(changes, monkeypatch):
+def test_handover_gives_the_attitude_of_one_that_never_handed_over(changes, walk, monkeypatch):
     # Not looked at here: what a misfit adds to sigmas, what biases may have wandered since, what
     # is left of second order.
     monkeypatch.setattr('ins_align.methods.Fit.factor', 1.0)
     monkeypatch.setattr('ins_align.methods.Fit.significant_scale', 1.0)
     monkeypatch.setattr('ins_align.methods.WANDER', 0.0)
     monkeypatch.setattr(MapEstimator, 'NONLINEARITY', 0.01)
-    s = simulated('flight', imu_grade='tactical', duration=30.0, seed=2, position_std=0.5)
+    s = simulated('flight', imu_grade='tactical', duration=30.0, seed=2, position_std=0.5,
+                  rate_random_walk=walk * PRESETS['tactical'].gyro_bias_std)
     one = aligned(s, **changes)[0].status()
     monkeypatch.setattr('ins_align.aligner.MapMethod', partial(MapMethod, capacity=70))
     other = aligned(s, **changes)[0].status()
@@ -230,6 +234,26 @@ def test_biases_are_found_within_their_sigmas(many_flights):
         assert np.all(np.abs(status.accel_bias - s.accel_bias) < 5 * status.accel_bias_std)
     low, high = chi2.ppf([0.0005, 0.9995], 3 * len(many_flights))
     assert low / 2 < total < 2 * high              # the three axes are not independent
+
+
+@pytest.mark.parametrize('scenario', ('flight', 'hover'))
+def test_biases_that_walk_are_followed(scenario):
+    """Over two minutes of a MEMS IMU whose biases walk by their sigma; one and more handovers."""
+    walk = PRESETS['mems'].gyro_bias_std / math.sqrt(120.0)
+    errors, attitudes, start_errors = [], [], []
+    for seed in range(6):
+        options = {'imu_grade': 'mems', 'duration': 120.0, 'seed': seed}
+        s = simulated(scenario, rate_random_walk=walk, **options)
+        walked = (s.gyro - simulated(scenario, **options).gyro)[-1]
+        status = aligned(s)[0].status()
+        assert status.state is State.ALIGNED
+        error = status.gyro_bias - s.gyro_bias - walked
+        errors.append(error / status.gyro_bias_std)
+        start_errors.append((error + walked) / status.gyro_bias_std)
+        attitudes.append(normalised_error(status.current, s) / 3)
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.5
+    assert np.sqrt(np.mean(np.square(start_errors))) > 3.0
+    assert 0.3 < np.mean(attitudes) < 1.9
 
 
 def test_residuals_have_their_degrees_of_freedom(many_flights):

@@ -57,7 +57,7 @@ def test_error_is_counted_in_stated_sigmas():
 def test_exact_model_is_that_of_the_simulation():
     simulation = simulate('flight', imu_grade='tactical', duration=5.0)
     assert common.exact_config_for(simulation).imu_noise == pytest.approx(
-        PRESETS['tactical']._replace(gyro_scale_std=0.0))
+        PRESETS['tactical']._replace(gyro_scale_std=0.0, rate_random_walk=0.0))
 
 
 def test_bound_is_reached_on_a_navigation_grade_flight(monkeypatch):

@@ -177,6 +177,19 @@ def test_scale_factors_and_misalignment(sensor, error, there):
         assert_same(getattr(s, other), getattr(plain, other))
 
 
+def test_biases_of_the_gyros_walk():
+    plain, s = (simulate('hover', seed=3, duration=400.0, imu_rate=10.0, rate_random_walk=walk)
+                for walk in (0.0, 1e-4))
+    walk = s.gyro - plain.gyro
+    assert np.all(walk[0] == 0.0)
+    np.testing.assert_allclose(np.diff(walk, axis=0).std(axis=0), 1e-4 * math.sqrt(0.1), rtol=0.05)
+    # Steps that hang together would grow faster.
+    apart = walk[200:] - walk[:-200]
+    assert 0.3 < apart.std() / (1e-4 * math.sqrt(20.0)) < 1.7
+    assert_same(s.accel, plain.accel)
+    assert_same(s.velocity, plain.velocity)
+
+
 def test_gnss_noise():
     s = simulate('static', duration=2000.0, imu_rate=1.0, velocity_std=0.2,
                  velocity_std_vertical=0.3, position_std=2.0)

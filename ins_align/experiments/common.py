@@ -106,6 +106,7 @@ def exact_config_for(simulation: Simulation, **changes: Any) -> Config:
         'velocity_random_walk': 60 * noise.velocity_random_walk,
         'gyro_bias_std': math.degrees(noise.gyro_bias_std),
         'accel_bias_std': noise.accel_bias_std, 'gyro_scale_std': noise.gyro_scale_std,
+        'rate_random_walk': 60 * math.degrees(noise.rate_random_walk),
         'lever_arm_std': 0.0, 'gnss_delay_std': 0.0}
     values.update(changes)
     return config_for(simulation, **values)

@@ -122,7 +122,8 @@ def bound(simulation: Simulation, *, noise: ImuNoise | None = None, use_velocity
     epochs = _true_epochs_ns(simulation)
     path = _true_path(simulation, epochs)
     H = _design(path, simulation.lever_arm)
-    V = _noise_covariance(path, noise, _measurement_covariance(simulation, path))
+    walk = _bias_walk(path, noise, simulation.lever_arm)
+    V = _noise_covariance(path, noise, walk, _measurement_covariance(simulation, path))
     rows = _rows(len(epochs), use_velocity, use_position)
     columns, prior = _prior(simulation, noise, use_position, lever_arm_std, delay_std)
     whitened = _whitened(V[np.ix_(rows, rows)], H[rows][:, columns])
@@ -170,7 +171,8 @@ def dense_solution(simulation: Simulation, *, noise: ImuNoise | None = None,
     for _ in range(iterations):
         # A late measurement is one of an earlier instant.
         path = _measured_path(simulation, C, x)
-        V = _noise_covariance(path, noise, _measurement_covariance(simulation, path))
+        walk = _bias_walk(path, noise, x[LEVER_ARM])
+        V = _noise_covariance(path, noise, walk, _measurement_covariance(simulation, path))
         H = _design(path, x[LEVER_ARM])[rows][:, columns]
         s = _measured_sides(simulation, path)
         lever_v, lever_p = _lever_terms(path, x[LEVER_ARM])
@@ -189,7 +191,7 @@ def dense_solution(simulation: Simulation, *, noise: ImuNoise | None = None,
         left = whitened_y - whitened_H @ dx[columns]
         off = to_mean - dx[columns]
         chi2 = float(left @ left + off @ information @ off)
-        rotation, E = _attitude_error_now(path, noise, V[np.ix_(rows, rows)], rows, y, H,
+        rotation, E = _attitude_error_now(path, noise, walk, V[np.ix_(rows, rows)], rows, y, H,
                                           dx[columns])
         current = _rotation(dx[:3] - path.Theta[-1] @ dx[GYRO] + rotation) @ path.C[-1]
         C = _rotation(dx[:3]) @ C
@@ -432,7 +434,41 @@ def _turned_by_noise(path: _Path) -> tuple[Array, Array]:
     return B.reshape(-1, 3, 7), np.repeat(path.M, 2, axis=0)
 
 
-def _noise_covariance(path: _Path, noise: ImuNoise, measurement: Array) -> Array:
+def _bias_walk(path: _Path, noise: ImuNoise, lever_b: Array) -> tuple[Array, Array]:
+    """
+    Follow steps of the gyros' biases at the epochs, 1 sigma each, from then on.
+
+    Returns
+    -------
+    to_rows : ndarray, shape (6 K, 3 J)
+        To the measurements; J = 0 where they do not walk.
+    to_attitude : ndarray, shape (3, 3 J)
+        To the attitude at the last epoch.
+
+    """
+    lever_v, lever_p = _lever_terms(path, lever_b)
+    C_lever = path.C @ skew(lever_b)
+    Theta, Gamma, int_Gamma = (a[..., :3] for a in (path.Theta, path.Gamma, path.int_Gamma))
+    n = len(path.time)
+    steps = n if noise.rate_random_walk > 0 else 0
+    to_rows = np.zeros((n, 2, 3, steps, 3))
+    to_attitude = np.zeros((3, steps, 3))
+    for j in range(1, steps):
+        std = noise.rate_random_walk * math.sqrt(path.time[j] - path.time[j - 1])
+        t = path.time[j:, None] - path.time[j]
+        turned = Theta[j:] - Theta[j]
+        to_rows[j:, 0, :, j] = std * (
+            Gamma[j:] - Gamma[j] - skew(path.U[j:] - path.U[j]) @ Theta[j]
+            + skew(lever_v[j:]) @ turned + C_lever[j:])
+        to_rows[j:, 1, :, j] = std * (
+            int_Gamma[j:] - int_Gamma[j] - t[..., None] * Gamma[j]
+            - skew(path.P[j:] - path.P[j] - t * path.U[j]) @ Theta[j] + skew(lever_p[j:]) @ turned)
+        to_attitude[:, j] = -std * turned[-1]
+    return to_rows.reshape(6 * n, 3 * steps), to_attitude.reshape(3, 3 * steps)
+
+
+def _noise_covariance(path: _Path, noise: ImuNoise, walk: tuple[Array, Array],
+                      measurement: Array) -> Array:
     """Covariance of all rows: random walks of the IMU and GNSS noise, shape (6 K, 6 K)."""
     B, M = _turned_by_noise(path)
     n = len(B)
@@ -458,11 +494,11 @@ def _noise_covariance(path: _Path, noise: ImuNoise, measurement: Array) -> Array
     V = np.where(upper > 0, V, V.T)
     blocks = V.reshape(n, 3, n, 3)
     blocks[range(n), :, range(n), :] += measurement.reshape(-1, 3, 3)
-    return V
+    return V + walk[0] @ walk[0].T
 
 
-def _attitude_error_now(path: _Path, noise: ImuNoise, V: Array, rows: Index, y: Array, H: Array,
-                        dx: Array) -> tuple[Array, Array]:
+def _attitude_error_now(path: _Path, noise: ImuNoise, walk: tuple[Array, Array], V: Array,
+                        rows: Index, y: Array, H: Array, dx: Array) -> tuple[Array, Array]:
     """
     Predict the random-walk error of the attitude at the last epoch.
 
@@ -477,8 +513,11 @@ def _attitude_error_now(path: _Path, noise: ImuNoise, V: Array, rows: Index, y: 
     B, M = _turned_by_noise(path)
     mean = (B @ M[..., :1])[..., 0]
     cross = variance * skew(mean).transpose(1, 0, 2).reshape(3, -1)[:, rows]
+    to_rows, to_attitude = walk
+    cross = cross + to_attitude @ to_rows[rows].T
     solved = np.linalg.solve(V, np.column_stack([y, H, cross.T]))
-    spread = variance * path.time[-1] * np.eye(3) - cross @ solved[:, -3:]
+    spread = (variance * path.time[-1] * np.eye(3) + to_attitude @ to_attitude.T
+              - cross @ solved[:, -3:])
     n = H.shape[1]
     E = np.hstack([cross @ solved[:, 1:1 + n], spread])
     return cross @ solved[:, 0] - E[:, :n] @ dx, E
