@@ -61,7 +61,7 @@ PRESETS = {
     'navigation': _imu_noise(0.002, 0.003, 0.01 / 3600.0, 50e-6 * STANDARD_GRAVITY),
     'tactical': _imu_noise(0.05, 0.03, 1.0 / 3600.0, 1e-3 * STANDARD_GRAVITY, 0.0005,
                            1.8 / 3600.0),
-    'mems': _imu_noise(0.3, 0.09, 0.1, 0.05, 0.01, 0.18),
+    'mems': _imu_noise(0.3, 0.09, 0.1, 0.05, 0.01, 0.15),
 }
 
 
