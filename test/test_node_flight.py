@@ -101,4 +101,4 @@ def check_imu(listener, flight, time_to_align_s):
     assert len(errors) > 2000
     assert np.abs(errors / sigmas).max() < 3.0
     # Honest must not mean vague: from the threshold, at which it was declared, sigma falls.
-    assert sigmas[-1].max() < 0.5
+    assert sigmas[-1].max() < 0.3
