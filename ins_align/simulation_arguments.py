@@ -56,8 +56,7 @@ def checked_arguments(arguments: dict[str, Any]) -> ImuNoise:
     check('velocity_std position_std position_drift_std outlier_velocity outlier_position '
           'gyro_scale_std gyro_misalignment_std accel_scale_std accel_misalignment_std '
           'rate_random_walk gnss_phase gnss_latency gnss_delay stand_still',
-          'a number, 0 or above',
-          lambda value: number(value) and value >= 0)
+          'a number, 0 or above', lambda value: number(value) and value >= 0)
     check('velocity_std_vertical position_std_vertical gyro_bias_std accel_bias_std',
           'a number, 0 or above', lambda value: value is None or number(value) and value >= 0)
     check('position_drift_time', 'a number of seconds above 0',

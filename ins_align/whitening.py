@@ -40,7 +40,7 @@ GATE = 25.0
 VELOCITY, POSITION = slice(0, 3), slice(3, 6)
 # Between these delays (s) the motion before the epoch leads back, or a little on.
 MIN_DELAY, MAX_DELAY = -0.1, AGES[-1]
-# The unknowns that the errors of the chain look like.
+# The unknowns that the errors of the chain look like, but for biases that walk.
 START = np.r_[ATTITUDE, START_VELOCITY, START_POSITION]
 
 
@@ -422,7 +422,8 @@ class Whitener:
     def __init__(self, columns: Index, size: int, walks: bool = False) -> None:
         """Start at t0, where the chain has no error."""
         self.columns = np.concatenate([[0], 1 + columns])
-        alike = np.concatenate([START[:size], np.r_[GYRO_BIAS][:3 * walks]])
+        # The unknowns whose derivatives are those to the errors of the chain.
+        alike = np.concatenate([START[:size], np.r_[GYRO_BIAS]]) if walks else START[:size]
         self._alike_columns = 1 + np.searchsorted(columns, alike)
         self.P = np.zeros((alike.size, alike.size))
         self.X = np.zeros((alike.size, self.columns.size))
