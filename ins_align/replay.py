@@ -26,7 +26,7 @@ from ins_align.aligner import Aligner
 from ins_align.bags import Topics
 from ins_align.config import Config
 from ins_align.declaration import State
-from ins_align.decoding import ImuSamples, joined, Orientations
+from ins_align.decoding import ImuSamples, Orientations
 from ins_align.messages import Fix
 from ins_align.reading import Part, read, Request
 from ins_align.results import Attitude, Epoch, Status
@@ -47,21 +47,36 @@ class Reference:
 
     Parameters
     ----------
-    orientations : Orientations
-        Those with a negative variance ("not known") or without a direction are left out.
+    *parts : Orientations
+        As for `add`.
 
     """
 
-    def __init__(self, orientations: Orientations) -> None:
+    def __init__(self, *parts: Orientations) -> None:
+        self._stamps_ns, self._quaternions = np.zeros(0, np.int64), np.zeros((0, 4))
+        self._added: list[tuple[np.ndarray, Array]] = []
+        for part in parts:
+            self.add(part)
+
+    def add(self, orientations: Orientations) -> None:
+        """Add those without a negative variance ("not known") and with a direction."""
         good = (np.isfinite(orientations.quaternions).all(axis=1)
                 & (np.abs(orientations.quaternions).max(axis=1, initial=0.0) > 1e-3)
                 & ~(orientations.covariances[:, 0] < 0.0))
-        stamps, first = np.unique(orientations.stamps_ns[good], return_index=True)
-        self._stamps_ns = stamps
-        self._quaternions = orientations.quaternions[good][first]
+        self._added.append((orientations.stamps_ns[good], orientations.quaternions[good]))
+
+    def _sort(self) -> None:
+        """Put what was added in the order of stamps; of one stamp the first counts."""
+        columns = zip((self._stamps_ns, self._quaternions), *self._added)
+        self._added = []
+        stamps, quaternions = map(np.concatenate, columns)
+        self._stamps_ns, first = np.unique(stamps, return_index=True)
+        self._quaternions = quaternions[first]
 
     def attitude_at(self, stamp_ns: int) -> Array | None:
         """Return ``C_nb``, shape (3, 3), interpolated; None where there is none close by."""
+        if self._added:
+            self._sort()
         after = int(np.searchsorted(self._stamps_ns, stamp_ns))
         if after < len(self._stamps_ns) and self._stamps_ns[after] == stamp_ns:
             return matrix_from_quaternion(self._quaternions[after])
@@ -200,7 +215,7 @@ class _Run:
         self._path, self._config, self._topics = path, config, topics
         self._aligner = Aligner(config)
         self._epochs: list[Epoch] = []
-        self._references: list[Orientations] = []
+        self._reference: Reference | None = None
         self._fixes: list[tuple[int, float, float]] = []
 
     def feed(self, part: Part) -> None:
@@ -223,7 +238,8 @@ class _Run:
         self._add_imu(imu, position, len(imu.stamps_ns))
         self._epochs += aligner.update()
         if part.orientations.stamps_ns.size:
-            self._references.append(part.orientations)
+            self._reference = self._reference or Reference()
+            self._reference.add(part.orientations)
 
     def _add_imu(self, imu: ImuSamples, start: int, end: int) -> None:
         if end > start:
@@ -233,12 +249,11 @@ class _Run:
     def result(self, warnings: tuple[str, ...]) -> ReplayResult:
         """Return what came of all parts."""
         self._epochs += self._aligner.flush()
-        reference = Reference(joined(self._references)) if self._references else None
         first_fix_ns = self._fixes[0][0] if self._fixes else 0
         track = np.array([(stamp - first_fix_ns, latitude, longitude)
                           for stamp, latitude, longitude in self._fixes]).reshape(-1, 3)
         return ReplayResult(self._path, self._aligner.status(), tuple(self._epochs), warnings,
-                            reference, self._topics, track, first_fix_ns, self._config)
+                            self._reference, self._topics, track, first_fix_ns, self._config)
 
 
 def _attitude_json(attitude: Attitude | None) -> dict[str, Any] | None:

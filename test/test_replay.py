@@ -209,6 +209,19 @@ def test_reference_has_gaps_and_unknown_attitudes():
     assert Reference(known._replace(quaternions=np.full((3, 4), np.nan))).attitude_at(0) is None
 
 
+def test_reference_comes_in_parts_in_any_order():
+    angles = np.random.default_rng(1).uniform(-1.0, 1.0, (4, 3))
+    parts = [orientations(angles[[2, 3]], [200, 300]), orientations(angles[[0, 1, 0]],
+                                                                    [0, 100, 200])]
+    growing = Reference(parts[0])
+    assert growing.attitude_at(100) is None
+    growing.add(parts[1])
+    for reference in (growing, Reference(*parts)):
+        for stamp, rpy in zip((0, 100, 200, 300), angles):  # of two for one stamp the first
+            np.testing.assert_allclose(reference.attitude_at(stamp), matrix_from_rpy(rpy),
+                                       atol=1e-12)
+
+
 def test_errors_are_estimate_less_reference_and_wrap():
     reference = Reference(orientations([[0.1, 0.0, 3.1]] * 2, [0, 1]))
     C_nb = matrix_from_rpy([0.1, 0.02, -3.1])
