@@ -156,7 +156,7 @@ class Declaration:
         config = self.config
         if self.aligned:
             return Verdict(State.ALIGNED, f'heading sigma {heading:.2g} deg, '
-                                          f'tilt sigma {tilt:.2g} deg')
+                                          f'tilt sigma {tilt:.2g} deg{_understated(fit)}')
         if fit.dof < MIN_DOF:
             return Verdict(State.ALIGNING, f'{fit.offered} GNSS epochs so far: more are needed')
         if tilt > config.tilt_std_threshold and not self.levelled:
@@ -195,6 +195,13 @@ class Declaration:
                     'allows: check the lever arm, the GNSS delay, the velocity frame, the IMU '
                     'axes and signs, the covariances that the receiver states')
         return ''
+
+
+def _understated(fit: Fit) -> str:
+    """Return what a receiver states too little of, as the end of a sentence."""
+    return ''.join(f'; the GNSS {name} are {math.sqrt(factor):.1f} times as noisy as stated'
+                   for name, factor in zip(('velocities', 'positions'), fit.gnss_noise)
+                   if factor > 1.0)
 
 
 def _largest_std(P: Array) -> float:

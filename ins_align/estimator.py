@@ -28,7 +28,7 @@ import math
 from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals, SensorErrors
 from ins_align.rotation import Array, cross
-from ins_align.solution import Course, Solution
+from ins_align.solution import Course, NoiseLevels, Solution
 from ins_align.unknowns import (ACCEL_MATRIX, DELAY, GYRO_BIAS, GYRO_MATRIX, LEVER_ARM, Prior,
                                 SIZE, START_POSITION, START_VELOCITY, Unknowns)
 from ins_align.whitening import (Chain, GATE, Gate, HEADING_RESOLVED_STD, Measurements, POSITION,
@@ -37,8 +37,9 @@ import numpy as np
 
 # Median of chi-square with three degrees of freedom.
 MEDIAN_CHI2_3 = 2.366
-# Share of the measured excess noise that counts until the data say that it is more.
-FIRST_EXCESS = 1 / 27
+# Noise until the data say that it is more: a share of the excess of the IMU's, the receiver's as
+# stated.
+FIRST_NOISE = NoiseLevels(1 / 27)
 # Normalised innovation squared and normalised innovation by kind (velocity 0, position 1).
 Tests = dict[int, tuple[float, Array]]
 
@@ -80,8 +81,8 @@ class MapEstimator:
         Otherwise they stay at the prior's mean.
     capacity : int
         Epochs that are stored.
-    excess : float
-        Share of the measured excess noise that counts at first.
+    noise : NoiseLevels
+        At first.
     rate_random_walk : float
         Of the gyros' biases, rad/s/sqrt(s); 0: they stay what they are.
 
@@ -96,10 +97,14 @@ class MapEstimator:
     GROWTH = 0.125
     FAR, GROWTH_FAR = 1.0, 0.015
     MAX_ITERATIONS = 8
-    # The share of the excess noise is judged when the store has grown by this share, tried at
-    # steps of this factor, and moved when the log likelihood gains this much.
+    # Noise is judged when the store has grown by this share. That in excess of the IMU's is tried
+    # at steps of this factor, and moved when the log likelihood gains this much.
     TUNE_FROM, TUNE_GROWTH, TUNE_STEP, TUNE_GAIN = 12, 0.5, 9.0, 3.0
     MAX_EXCESS = 3.0
+    # The receiver's is taken for understated when the residuals' variance is so many times what it
+    # should be and at least so much of it is white, as what does not fit the model is not; from
+    # then on it follows when they differ by this factor.
+    LOUD, WHITE, FOLLOW = 3.0, 0.7, 1.3
     MAX_REJECTED = 0.3
     # Chi-square per degree of freedom from which on a fit looks for outliers among its residuals.
     MISFIT = 4.0
@@ -122,7 +127,7 @@ class MapEstimator:
     def __init__(self, prior: Prior, *, use_position: bool = False,
                  estimate_lever_arm: bool = False, estimate_delay: bool = False,
                  estimate_matrices: bool = False, capacity: int = 1000,
-                 excess: float = FIRST_EXCESS, rate_random_walk: float = 0.0) -> None:
+                 noise: NoiseLevels = FIRST_NOISE, rate_random_walk: float = 0.0) -> None:
         """Start at t0."""
         wanted = np.ones(SIZE, bool)
         wanted[START_POSITION] = use_position
@@ -142,7 +147,7 @@ class MapEstimator:
         self.count = 0
         self.solution: Solution | None = None
         self._last_fit = self._last_tuned = self._last_afresh = 0
-        self.excess = excess
+        self.noise = noise
         self._rate_random_walk = rate_random_walk
         self.gated = True
         self._recent: deque[float] = deque(maxlen=self.GATE_WINDOW)
@@ -246,9 +251,9 @@ class MapEstimator:
             median = sorted(self._recent)[self.GATE_WINDOW // 2]
             self._gate_scale = max(1.0, median / MEDIAN_CHI2_3)
         if self.count >= max(self.TUNE_FROM, self._last_tuned * (1 + self.TUNE_GROWTH)):
-            self._tune()
+            self._tune(s)
         growth = self.GROWTH_FAR if s.nonlinearity > self.FAR else self.GROWTH
-        if ((s.nonlinearity > self.NONLINEARITY or self._misfits(s))
+        if ((s.nonlinearity > self.NONLINEARITY or self._misfits(s) or self._refuses(s))
                 and self.count >= self._last_fit * (1 + growth)):
             self._fit()
         if not tested:
@@ -311,7 +316,7 @@ class MapEstimator:
 
     def _start(self, point: Unknowns) -> Solution:
         """Return an empty solution at a linearisation point."""
-        return Solution(point, self.prior, self.columns, self.size, self.excess,
+        return Solution(point, self.prior, self.columns, self.size, self.noise,
                         self._rate_random_walk)
 
     def _converge(self, point: Unknowns, P: 'Array | None', refused: np.ndarray) -> Solution:
@@ -324,14 +329,14 @@ class MapEstimator:
         for _ in range(self.MAX_ITERATIONS):
             s = self._start(point)
             whitened = self._run(s, None if P is None else Gate(s.dx, P), refused)
-            if sum(s.rejected) > self.MAX_REJECTED * self.count:
+            if self._refuses(s):
                 # Not a few outliers but a wrong picture: look at everything again.
                 s, P = self._start(point), None
                 refused[:] = False
                 whitened = self._run(s, None, refused)
             if s.nonlinearity <= self.NONLINEARITY:
                 if not (self.gated and self._misfits(s)
-                        and self._refuse_wild(s.residuals(whitened), refused)):
+                        and self._refuse_wild(s.residuals(whitened)[0], refused)):
                     break
                 P = None
             point = s.estimate
@@ -340,6 +345,10 @@ class MapEstimator:
     def _misfits(self, s: Solution) -> bool:
         """Whether a solution leaves residuals that no noise makes."""
         return s.chi2 > self.MISFIT * max(s.dof, 1)
+
+    def _refuses(self, s: Solution) -> bool:
+        """Whether a solution goes without so many epochs that it is they which are right."""
+        return sum(s.rejected) > self.MAX_REJECTED * self.count
 
     def _refuse_wild(self, squares: Array, refused: np.ndarray) -> bool:
         """Refuse the residuals that are wild beside the others, if there are few."""
@@ -377,30 +386,56 @@ class MapEstimator:
             fits.append((s.chi2 + GATE * self._gate_scale * sum(s.rejected), s, refused))
         _, self.solution, self._refused[:self.count] = min(fits, key=lambda fit: fit[0])
 
-    def _tune(self) -> None:
+    def _tune(self, s: Solution) -> None:
+        """Judge how noisy IMU and receiver are."""
+        self._last_tuned = self.count
+        before = self.noise
+        if np.any(self._intervals.Q_excess[:self.count]):
+            self._tune_excess(s)
+        if s.chi2 > self.LOUD * s.dof or max(self.noise.gnss) > 1.0:
+            self._tune_gnss(s.estimate)
+        if self.noise != before:
+            self._fit()
+
+    def _rerun(self, point: Unknowns) -> tuple[Solution, Whitened]:
+        """Take the stored epochs once more, with the noise as it is taken to be now."""
+        solution = self._start(point)
+        return solution, self._run(solution, None, self._refused[:self.count])
+
+    def _tune_excess(self, s: Solution) -> None:
         """
-        Judge by the likelihood how much of the noise in excess counts.
+        Judge by the likelihood how much of the IMU's noise in excess counts.
 
         Vibration looks like white noise between samples and is less than that over seconds; and
         other errors grow with it. The overall scale is left to the a-posteriori factor.
         """
-        self._last_tuned = self.count
-        old = self.solution
-        if old is None or not np.any(self._intervals.Q_excess[:self.count]):
-            return
-        before = excess = self.excess
-        best, gain = old.log_likelihood, self.TUNE_GAIN
+        best = self.noise
+        before, likelihood = best.excess, s.log_likelihood + self.TUNE_GAIN
         for trial in (before / self.TUNE_STEP, before * self.TUNE_STEP):
-            if not 0.99 * FIRST_EXCESS <= trial <= self.MAX_EXCESS:
+            if not 0.99 * FIRST_NOISE.excess <= trial <= self.MAX_EXCESS:
                 continue
-            self.excess = trial
-            solution = self._start(old.estimate)
-            self._run(solution, None, self._refused[:self.count])
-            if solution.log_likelihood > best + gain:
-                excess, best, gain = trial, solution.log_likelihood, 0.0
-        self.excess = excess
-        if excess != before:
-            self._fit()
+            self.noise = self.noise._replace(excess=trial)
+            solution, _ = self._rerun(s.estimate)
+            if solution.log_likelihood > likelihood:
+                best, likelihood = self.noise, solution.log_likelihood
+        self.noise = best
+
+    def _tune_gnss(self, point: Unknowns) -> None:
+        """Judge by the residuals how far a receiver understates its noise."""
+        solution, whitened = self._rerun(point)
+        normalised = solution.residuals(whitened)[1]
+        factors = list(self.noise.gnss)
+        for kind in range(solution.kinds):
+            residuals = normalised[whitened.used[:, kind], kind]
+            if len(residuals) < self.TUNE_FROM:
+                continue
+            # Of noise that is white a difference of two has twice the variance.
+            level, white = (float(np.median(np.sum(rows ** 2, axis=1))) / MEDIAN_CHI2_3
+                            for rows in (residuals, np.diff(residuals, axis=0) / math.sqrt(2)))
+            limit = self.FOLLOW if factors[kind] > 1.0 else self.LOUD
+            if level < 1 / limit or level > limit and white > self.WHITE * level:
+                factors[kind] = max(1.0, factors[kind] * level)
+        self.noise = self.noise._replace(gnss=(factors[0], factors[1]))
 
     def _rough_attitude(self, point: Unknowns) -> Array:
         """Centred q-method over the store, with the sensor errors and lever arm of `point`."""
@@ -461,7 +496,7 @@ class MapEstimator:
                                                  or LEVER_ARM.start in self.columns),
                              estimate_delay=DELAY.start in self.columns,
                              estimate_matrices=GYRO_MATRIX.start in self.columns,
-                             capacity=self.count, excess=self.excess,
+                             capacity=self.count, noise=self.noise,
                              rate_random_walk=self._rate_random_walk)
         other._intervals, other._gnss = intervals, self._gnss.take(slice(0, self.count))
         other.count = self.count

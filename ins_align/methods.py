@@ -24,13 +24,14 @@ import math
 from typing import Protocol
 
 from ins_align.config import Config, STANDARD_GRAVITY
-from ins_align.estimator import FIRST_EXCESS, Innovation, MapEstimator, NOTHING_NEW
+from ins_align.estimator import FIRST_NOISE, Innovation, MapEstimator, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
 from ins_align.handover import prior_from_now, prior_without_attitude
 from ins_align.imu_steps import ImuSteps
 from ins_align.preintegration import Noise, preintegrate, SensorErrors
 from ins_align.rotation import Array, orthonormalized
 from ins_align.signs import LeverArmCheck, SignCheck, TOLD_STD
+from ins_align.solution import NoiseLevels
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
                                 Prior, SIZE, UNIFORM_ANGLE_STD, Unknowns)
 from ins_align.whitening import Measurements
@@ -86,6 +87,8 @@ class Fit:
     rejected_position: int
     offered: int                # epochs that were offered to the model, rejected ones included
     delay: float                # of the GNSS, seconds; the told one where none is estimated
+    # Variances of velocities and positions over the stated ones.
+    gnss_noise: tuple[float, float] = (1.0, 1.0)
 
     @property
     def factor(self) -> float:
@@ -205,7 +208,8 @@ class MapMethod:
         self._start(epoch, prior or self._first_prior)
         self._take_start(epoch, imu)
 
-    def _start(self, epoch: AntennaEpoch, prior: Prior, excess: float = FIRST_EXCESS) -> None:
+    def _start(self, epoch: AntennaEpoch, prior: Prior,
+               noise: NoiseLevels = FIRST_NOISE) -> None:
         self.t0_ns = epoch.stamp_ns
         self._renewed = self._good = self._contradicted = False
         self._track = InertialTrack.start(epoch.latitude, epoch.longitude, epoch.altitude)
@@ -213,7 +217,7 @@ class MapMethod:
             prior, use_position=self._use_position,
             estimate_lever_arm=self._config.lever_arm_std > 0,
             estimate_delay=self._config.gnss_delay_std > 0, capacity=self._capacity,
-            estimate_matrices=self._estimates_matrices, excess=excess,
+            estimate_matrices=self._estimates_matrices, noise=noise,
             rate_random_walk=self._config.imu_noise.rate_random_walk)
 
     def _take_start(self, epoch: AntennaEpoch, imu: ImuSteps) -> None:
@@ -299,7 +303,7 @@ class MapMethod:
         self._lever_arm.restart()
         self.moved += 1
         start = replace(self._last_epoch, v_n=None, position_measured=False)
-        self._start(start, prior, self._estimator.excess)
+        self._start(start, prior, self._estimator.noise)
         innovation = self._innovation
         self._take_start(start, self._last_imu.end())
         self._innovation = innovation
@@ -329,7 +333,7 @@ class MapMethod:
         return Fit(past_chi2 + solution.chi2, past_dof + solution.dof, self._innovation,
                    self._estimator.converged,
                    self._rejected[0] + rejected[0], self._rejected[1] + rejected[1],
-                   self._offered, self._delay(solution.estimate))
+                   self._offered, self._delay(solution.estimate), self._estimator.noise.gnss)
 
     def settle(self) -> None:
         """Relinearise now if that is worth it at all."""

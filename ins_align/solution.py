@@ -19,6 +19,7 @@ The estimator decides where the point lies and when it moves.
 
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 from ins_align.preintegration import Intervals
 from ins_align.rotation import apply, Array, exp_so3, Index
@@ -36,6 +37,23 @@ WEAK_INFORMATION[START_POSITION] = 1e7 ** -2
 # The motion that the fit attributes to the vehicle has the noise of what was fitted to it, one
 # unit of information for each: horizontal slope (tilt) and curvature (gyro bias) of the velocity.
 FITTED_DIRECTIONS = 4
+
+
+class NoiseLevels(NamedTuple):
+    """
+    How far the noise is another one than is stated, as the data say.
+
+    Attributes
+    ----------
+    excess : float
+        Share that is believed of the IMU noise measured in excess of the stated one.
+    gnss : tuple of float
+        Factors on the covariances of velocities and positions.
+
+    """
+
+    excess: float
+    gnss: tuple[float, float] = (1.0, 1.0)
 
 
 @dataclass
@@ -80,8 +98,7 @@ class Solution:
         Unknowns that are estimated, out of the 37.
     size : int
         9 when positions are used, 6 when velocities alone are.
-    excess : float
-        Share that is believed of the IMU noise measured in excess of the stated one.
+    noise : NoiseLevels
     rate_random_walk : float
         Of the gyros' biases, rad/s/sqrt(s).
 
@@ -115,11 +132,11 @@ class Solution:
     """
 
     def __init__(self, point: Unknowns, prior: Prior, columns: Index, size: int,
-                 excess: float, rate_random_walk: float = 0.0) -> None:
+                 noise: NoiseLevels, rate_random_walk: float = 0.0) -> None:
         """Start empty, at t0."""
         information, step = prior.at(point)
         self.point = self.estimate = point
-        self._columns, self._size, self._excess = columns, size, excess
+        self._columns, self._size, self._noise = columns, size, noise
         self._rate_random_walk = rate_random_walk
         self.information = information[np.ix_(columns, columns)]
         self._mean_step = step[columns]
@@ -142,11 +159,12 @@ class Solution:
         """Linearise K epochs that follow the chain; their intervals with the point's biases."""
         chain = self.chain.extended(interval)
         Y = sensitivities(self.point, chain, gnss, interval)[:, :, self.whitener.columns]
-        noise = chain_noise(self.point.C, gnss.time, chain, interval, self._size, self._excess,
-                            self._rate_random_walk)
+        noise = chain_noise(self.point.C, gnss.time, chain, interval, self._size,
+                            self._noise.excess, self._rate_random_walk)
         kinds = self.kinds
+        covariance = gnss.covariance * np.array(self._noise.gnss)[:, None, None]
         return Rows(chain, noise, Y.reshape(Y.shape[0], 2, 3, -1)[:, :kinds],
-                    gnss.covariance[:, :kinds], gnss.time)
+                    covariance[:, :kinds], gnss.time)
 
     @property
     def kinds(self) -> int:
@@ -166,17 +184,19 @@ class Solution:
         self.move_to(self._course(rows, whitened, slice(-1, None)), 0)
         return whitened
 
-    def residuals(self, whitened: Whitened) -> Array:
+    def residuals(self, whitened: Whitened) -> tuple[Array, Array]:
         """
-        Return the normalised squares of the residuals at the estimate of what `run` took.
+        Return what `run` took as residuals at the estimate; 0 where nothing was taken.
 
         Returns
         -------
-        ndarray, shape (K, kinds)
-            0 where nothing was taken.
+        squares : ndarray, shape (K, kinds)
+            Normalised.
+        normalised : ndarray, shape (K, kinds, 3)
+            Over their sigma.
 
         """
-        return Gate(self.dx, np.zeros_like(self.P)).test(whitened.innovation, whitened.S)[0]
+        return Gate(self.dx, np.zeros_like(self.P)).test(whitened.innovation, whitened.S)
 
     def course(self, rows: Rows, wanted: np.ndarray) -> Course:
         """Return what the solution would be after each of K epochs if it took what is wanted."""

@@ -156,6 +156,13 @@ def test_not_before_the_linearisation_has_settled():
                  fit(converged=False)).state is State.ALIGNING
 
 
+def test_a_receiver_that_understates_its_noise_is_named():
+    loud = judge(Declaration(Config()), 0.0, 3.0, GOOD, fit(gnss_noise=(9.0, 1.0)))
+    assert loud.state is State.ALIGNED
+    assert 'velocities are 3.0 times as noisy' in loud.reason and 'positions' not in loud.reason
+    assert 'noisy' not in judge(Declaration(Config()), 0.0, 3.0, GOOD).reason
+
+
 def test_doubt_about_the_signs_holds_the_heading_back_and_not_the_level():
     declaration = Declaration(Config(hold_time=2.0))
     verdict = judge(declaration, 0.0, 10.0, GOOD, doubt='signs of the axes: turn')

@@ -13,6 +13,7 @@
 # limitations under the License.
 """The recursive estimator against the dense reference and the truth."""
 
+from dataclasses import replace
 from functools import partial
 import math
 
@@ -322,6 +323,39 @@ def test_outliers_are_rejected_and_counted():
     assert abs(status.counts['epochs_rejected_velocity'] - spoilt) <= 3
     assert normalised_error(status.initial, s) < chi2.ppf(0.9999, 3)
     assert aligned(clean)[0].status().counts['epochs_rejected_velocity'] <= 1
+
+
+@pytest.mark.parametrize('scenario, rate, understated', [
+    ('flight', 5.0, 3.0), ('flight', 5.0, 10.0), ('car', 5.0, 6.0), ('car', 1.0, 6.0)])
+def test_noise_that_the_receiver_understates_is_found(scenario, rate, understated):
+    s = simulated(scenario, imu_grade='mems', seed=1, duration=60.0, gnss_rate=rate)
+    honest = aligned(s)[0].status()
+    aligner, _ = aligned(replace(s, velocity_covariance=s.velocity_covariance / understated ** 2))
+    status, factor = aligner.status(), math.sqrt(estimator_of(aligner).noise.gnss[0])
+    assert status.state is State.ALIGNED
+    assert factor == pytest.approx(understated, rel=0.25)
+    assert f'velocities are {factor:.1f} times as noisy as stated' in status.reason
+    assert np.all(np.abs(np.log(status.current.sigma_deg / honest.current.sigma_deg)) < 0.4)
+    assert normalised_error(status.current, s) < chi2.ppf(0.9999, 3)
+
+
+def test_noise_of_positions_is_found_too():
+    s = simulated('flight', imu_grade='mems', seed=1, duration=60.0, position_std=0.02)
+    aligner, _ = aligned(replace(s, position_covariance=s.position_covariance / 4.0 ** 2),
+                         velocity=False, use_velocity=False)
+    velocities, positions = estimator_of(aligner).noise.gnss
+    assert velocities == 1.0 and math.sqrt(positions) == pytest.approx(4.0, rel=0.25)
+    assert aligner.status().state is State.ALIGNED
+    assert normalised_error(aligner.status().current, s) < chi2.ppf(0.9999, 3)
+
+
+@pytest.mark.parametrize('wrong', [{'flip_axis': 'y'}, {'velocity_frame': 'ned'}])
+def test_what_does_not_fit_the_model_is_not_taken_for_noise(wrong):
+    s = simulated('flight', imu_grade='mems', seed=1, duration=30.0, **wrong)
+    aligner, _ = aligned(s, velocity_frame='enu')
+    solution = estimator_of(aligner).solution
+    assert solution.chi2 > 10.0 * solution.dof
+    assert estimator_of(aligner).noise.gnss == (1.0, 1.0)
 
 
 def test_receiver_that_comes_back_after_an_outage_goes_on():
