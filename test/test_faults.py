@@ -46,8 +46,9 @@ def test_trials_are_repeatable_and_cover_everything():
                 for t in trials}) == combinations
 
 
-ALIGNED = ('none', 'status unknown', 'covariance 0, -1, nan', 'GNSS up to 1 s late', 'IMU twice',
-           'IMU out of order', 'vertical absent, told', 'clock loops', 'updates at random')
+ALIGNED = ('none', 'status unknown', 'covariance 0, -1, nan', 'covariance too small',
+           'GNSS up to 1 s late', 'IMU twice', 'IMU out of order',
+           'vertical absent, told', 'clock loops', 'updates at random')
 NOT_ALIGNED = 'accelerations in g', 'rates in deg/s', 'GNSS clock far off'
 
 

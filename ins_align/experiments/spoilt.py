@@ -216,6 +216,12 @@ def nonsense_covariance(stream: Stream, random: np.random.Generator) -> None:
         rows['covariance'][chosen, places[0], places[1]] = random.choice(values, len(chosen))
 
 
+def small_covariance(stream: Stream, random: np.random.Generator) -> None:
+    """Understate the noise of the receiver."""
+    for rows in stream.fix, stream.velocity:
+        rows['covariance'] /= random.uniform(2.0, 10.0) ** 2
+
+
 def one_stamp(stream: Stream, random: np.random.Generator) -> None:
     """Give one stamp to several messages: what is sent again, or whole seconds."""
     if random.random() < 0.5:
@@ -444,7 +450,8 @@ FAULTS: dict[str, Callable[[Stream, np.random.Generator], None]] = {
     'none': none, 'outliers': outliers, 'outages': outages, 'position jumps': position_jump,
     'fix at 0, 0': null_island, 'no fix': no_fix, 'status unknown': unknown_status,
     'GNSS nan, inf': broken_gnss, 'covariance 0, -1, nan': unknown_covariance,
-    'covariance nonsense': nonsense_covariance, 'several with one stamp': one_stamp,
+    'covariance nonsense': nonsense_covariance, 'covariance too small': small_covariance,
+    'several with one stamp': one_stamp,
     'GNSS up to 1 s late': late_gnss, 'GNSS later': too_late_gnss,
     'GNSS clock far off': other_clock, 'GNSS clock seconds off': near_clock,
     'vertical absent, told': vertical_absent, 'vertical absent, not told': vertical_absent_untold,
@@ -458,6 +465,6 @@ FAULTS: dict[str, Callable[[Stream, np.random.Generator], None]] = {
     'resets': resets, 'updates at random': random_updates, 'three of these': several}
 # Faults that leave the clock and the units alone.
 TOGETHER = (outliers, outages, null_island, no_fix, unknown_status, broken_gnss,
-            unknown_covariance, nonsense_covariance, one_stamp, late_gnss, too_late_gnss,
-            imu_duplicates, imu_out_of_order, imu_missing, imu_gap, imu_broken, resets,
-            random_updates)
+            unknown_covariance, nonsense_covariance, small_covariance, one_stamp, late_gnss,
+            too_late_gnss, imu_duplicates, imu_out_of_order, imu_missing, imu_gap, imu_broken,
+            resets, random_updates)
