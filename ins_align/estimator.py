@@ -253,7 +253,9 @@ class MapEstimator:
         if self.count >= max(self.TUNE_FROM, self._last_tuned * (1 + self.TUNE_GROWTH)):
             self._tune(s)
         growth = self.GROWTH_FAR if s.nonlinearity > self.FAR else self.GROWTH
-        if ((s.nonlinearity > self.NONLINEARITY or self._misfits(s) or self._refuses(s))
+        # Where most are outliers the few that agree do so by chance.
+        overfit = sum(s.rejected) > 0.5 * self.count
+        if ((s.nonlinearity > self.NONLINEARITY or self._misfits(s) or overfit)
                 and self.count >= self._last_fit * (1 + growth)):
             self._fit()
         if not tested:
@@ -329,7 +331,7 @@ class MapEstimator:
         for _ in range(self.MAX_ITERATIONS):
             s = self._start(point)
             whitened = self._run(s, None if P is None else Gate(s.dx, P), refused)
-            if self._refuses(s):
+            if sum(s.rejected) > self.MAX_REJECTED * self.count:
                 # Not a few outliers but a wrong picture: look at everything again.
                 s, P = self._start(point), None
                 refused[:] = False
@@ -345,10 +347,6 @@ class MapEstimator:
     def _misfits(self, s: Solution) -> bool:
         """Whether a solution leaves residuals that no noise makes."""
         return s.chi2 > self.MISFIT * max(s.dof, 1)
-
-    def _refuses(self, s: Solution) -> bool:
-        """Whether a solution goes without so many epochs that it is they which are right."""
-        return sum(s.rejected) > self.MAX_REJECTED * self.count
 
     def _refuse_wild(self, squares: Array, refused: np.ndarray) -> bool:
         """Refuse the residuals that are wild beside the others, if there are few."""
