@@ -534,7 +534,7 @@ class MapEstimator:
 
     @property
     def variances(self) -> Array:
-        """Diagonal of `covariance`, shape (37,)."""
+        """Variances of the 37 unknowns; zero where one is not estimated, shape (37,)."""
         full = np.zeros(SIZE)
         if self.solution is not None:
             full[self.columns] = self.solution.P.diagonal()
