@@ -123,9 +123,9 @@ class Solution:
         Second-order error of the linearisation, in sigmas of tilt or heading.
     bent : float
         So it is with the errors of the chain, which is linearised where they are zero.
-    covariance, C : ndarray, shape (3, 3)
-        Of the left error of the attitude at the last epoch with respect to n0, rad^2; and that
-        attitude, ``C_n0b``.
+    C, covariance : ndarray, shape (3, 3)
+        Attitude at the last epoch with respect to n0, ``C_n0b``, and the covariance of its left
+        error, rad^2.
     gyro_bias : ndarray, shape (3,)
         Of the gyros at the last epoch, rad/s; that of `estimate` is the one at t0.
 
