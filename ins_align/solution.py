@@ -66,7 +66,7 @@ class Course:
     chain : Chain
     whitened : Whitened
     time : ndarray, shape (K,)
-    dx, P, estimate, chi2, dof, nonlinearity, bent, C, covariance, gyro_bias
+    dx, P, estimate, chi2, dof, nonlinearity, bent, C, gyro_bias, covariance
         As in `Solution`, with a leading axis of K.
 
     """
