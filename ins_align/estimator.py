@@ -105,7 +105,9 @@ class MapEstimator:
     # should be and at least so much of it is white, as what does not fit the model is not; from
     # then on it follows when they differ by this factor.
     LOUD, WHITE, FOLLOW = 3.0, 0.7, 1.3
-    MAX_REJECTED = 0.3
+    # A fit that refuses more than the first share of its epochs takes them all. A solution that
+    # refused more than the second is fitted again: the few that agree may do so by chance.
+    MAX_REJECTED, OVERFIT = 0.3, 0.5
     # Chi-square per degree of freedom from which on a fit looks for outliers among its residuals.
     MISFIT = 4.0
     # From this chi-square per degree of freedom on the minimum may be a wrong one, as those are a
@@ -253,8 +255,7 @@ class MapEstimator:
         if self.count >= max(self.TUNE_FROM, self._last_tuned * (1 + self.TUNE_GROWTH)):
             self._tune(s)
         growth = self.GROWTH_FAR if s.nonlinearity > self.FAR else self.GROWTH
-        # Where most are outliers the few that agree do so by chance.
-        overfit = sum(s.rejected) > 0.5 * self.count
+        overfit = sum(s.rejected) > self.OVERFIT * self.count
         if ((s.nonlinearity > self.NONLINEARITY or self._misfits(s) or overfit)
                 and self.count >= self._last_fit * (1 + growth)):
             self._fit()

@@ -19,8 +19,8 @@ import platform
 import random
 
 # Before numpy is there: OpenBLAS 0.3.23, which numpy 1.26 brings along, has kernels for the newest
-# processors whose sums depend on where in memory a matrix lies, so that no two runs agree to the
-# last bit. Those for older processors do not.
+# processors whose sums depend, in the last bit, on where in memory a matrix lies. Those for older
+# processors have not.
 if version('numpy').startswith('1.') and platform.machine() == 'x86_64':
     os.environ.setdefault('OPENBLAS_CORETYPE', 'Haswell')
 
