@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Serialised ROS messages to arrays, IMU messages many at a time."""
+"""Serialised ROS messages to arrays and tuples, many messages of one layout at a time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar
 
 from ins_align.bag_files import Topic
-from ins_align.messages import imu_from_msg, MessageError, stamp_from_msg
+from ins_align.config import Config
+from ins_align.messages import (
+    Fix, fix_from_msg, fixes, imu_from_msg, MessageError, stamp_from_msg, velocities, Velocity,
+    velocity_from_msg)
 import numpy as np
 
 # sensor_msgs/Imu behind its header: orientation 4 and its covariance 9, angular velocity 3 and 9,
@@ -30,6 +33,11 @@ _RATE_OFFSET = 8 * (4 + 9)
 _FORCE_OFFSET = _RATE_OFFSET + 8 * (3 + 9)
 _CDR_LITTLE_ENDIAN = b'\x00\x01'  # OMG DDSI-RTPS 2.3, 10.2: encapsulation of plain CDR
 _FRAME_LENGTH = slice(12, 16)  # of the frame_id, in both serialisations
+# Velocity messages: strings at the front, then float64 alone; of these the place of the velocity
+# (3), that of the covariance of the twist (36) and how many there are.
+_VELOCITIES = {'TwistStamped': (1, 0, None, 6),
+               'TwistWithCovarianceStamped': (1, 0, 6, 6 + 36),
+               'Odometry': (2, 7 + 36, 7 + 36 + 6, 7 + 36 + 6 + 36)}
 
 
 class ImuSamples(NamedTuple):
@@ -121,7 +129,7 @@ def _decode(messages: Sequence[bytes], topic: Topic, fields: tuple[tuple[int, in
 
     """
     start = body_start(messages[0], topic.encoding) if messages else None
-    raw = None if start is None else _stacked(messages)
+    raw = None if start is None else _stacked(messages, topic.encoding)
     if start is not None and raw is not None:
         return _columns(raw, start, fields) + [np.ones(len(messages), bool)]
     count = len(messages)
@@ -141,12 +149,13 @@ def _decode(messages: Sequence[bytes], topic: Topic, fields: tuple[tuple[int, in
     return [column if decoded.all() else column[decoded] for column in columns] + [decoded]
 
 
-def _stacked(messages: Sequence[bytes]) -> np.ndarray | None:
-    """Return the bytes of messages of one layout in rows; None if there is more than one."""
-    if len(set(map(len, messages))) > 1:
+def _stacked(messages: Sequence[bytes], encoding: str) -> np.ndarray | None:
+    """Return the bytes of messages in rows; None if their lengths or encapsulations differ."""
+    length = len(messages[0])
+    if length < _FRAME_LENGTH.stop or len(set(map(len, messages))) > 1:
         return None
-    raw = np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), -1)
-    alike = ((raw[:, :2] == raw[0, :2]).all()
+    raw = np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), length)
+    alike = ((encoding != 'cdr' or (raw[:, :2] == raw[0, :2]).all())
              and (raw[:, _FRAME_LENGTH] == raw[0, _FRAME_LENGTH]).all())
     return raw if alike else None
 
@@ -161,22 +170,107 @@ def body_start(message: bytes, encoding: str) -> int | None:
     if len(message) < 16:
         return None
     frame_length = int.from_bytes(message[_FRAME_LENGTH], 'little')
-    start = 16 + frame_length
-    if encoding == 'cdr':
-        if message[:2] != _CDR_LITTLE_ENDIAN:
-            return None
-        start += -(start - 4) % 8  # float64 is aligned from behind the encapsulation
+    if encoding == 'cdr' and message[:2] != _CDR_LITTLE_ENDIAN:
+        return None
+    start = _aligned(16 + frame_length, 8, encoding)
     return start if len(message) == start + _BODY_BYTES else None
 
 
 def _columns(raw: np.ndarray, start: int, fields: tuple[tuple[int, int], ...],
              ) -> list[np.ndarray]:
     """Decode messages in rows of bytes, whose numbers start at one place."""
-    def column(offset: int, size: int, kind: str) -> np.ndarray:
-        return np.ascontiguousarray(raw[:, offset:offset + size]).view(kind)
-
     # Both begin with four other bytes: the encapsulation, or the sequence number of ROS 1.
-    seconds = column(4, 4, '<i4')[:, 0].astype(np.int64)
-    nanoseconds = column(8, 4, '<u4')[:, 0]
+    seconds = _column(raw, 4, '<i4')[:, 0].astype(np.int64)
+    nanoseconds = _column(raw, 8, '<u4')[:, 0]
     return [seconds * 1_000_000_000 + nanoseconds,
-            *(column(start + offset, 8 * width, '<f8') for offset, width in fields)]
+            *(_column(raw, start + offset, '<f8', width) for offset, width in fields)]
+
+
+def _column(raw: np.ndarray, start: int, kind: str, width: int = 1) -> np.ndarray:
+    size = width * np.dtype(kind).itemsize
+    return np.ascontiguousarray(raw[:, start:start + size]).view(kind)
+
+
+def decode_fixes(messages: Sequence[bytes], topic: Topic) -> list[Fix | str]:
+    """Decode serialised sensor_msgs/NavSatFix, or say why not as the counts name it."""
+    same = _same_layout(messages, topic.encoding, 1)
+    if same is not None:
+        raw, _, status = same
+        # Behind the header an int8 and a uint16, 12 numbers and a byte.
+        start = _aligned(_aligned(status + 1, 2, topic.encoding) + 2, 8, topic.encoding)
+        kind = start + 8 * 12
+        if _ends(raw, kind + 1, topic.encoding):
+            stamps, places, covariances = _columns(raw, start, ((0, 3), (8 * 3, 9)))
+            return [*fixes(stamps, places, covariances.reshape(-1, 3, 3), raw[:, kind],
+                           raw[:, status].view(np.int8))]
+    return [_by_library(message, topic, fix_from_msg, 'fix') for message in messages]
+
+
+def decode_velocities(messages: Sequence[bytes], topic: Topic,
+                      config: Config) -> list[Velocity | str]:
+    """Decode the messages that ``config.velocity_type`` names like `decode_fixes`."""
+    strings, place, covariance, count = _VELOCITIES[config.velocity_type]
+    same = _same_layout(messages, topic.encoding, strings)
+    if same is not None:
+        raw, names, end = same
+        start = _aligned(end, 8, topic.encoding)
+        if _ends(raw, start + 8 * count, topic.encoding):
+            fields = [(8 * place, 3)] + ([] if covariance is None else [(8 * covariance, 36)])
+            stamps, linear, *twist = _columns(raw, start, tuple(fields))
+            try:
+                return [*velocities(stamps, names[-1], linear,
+                                    twist[0].reshape(-1, 6, 6) if twist else None, config)]
+            except MessageError:
+                return ['velocity_body_frame'] * len(messages)
+    return [_by_library(message, topic, lambda msg: velocity_from_msg(msg, config), 'velocity')
+            for message in messages]
+
+
+def _by_library(message: bytes, topic: Topic, convert: Callable[[Any], Any], name: str) -> Any:
+    try:
+        msg = deserialize(message, topic)
+    except MessageError:
+        return f'{name}_undecodable'
+    try:
+        return convert(msg)
+    except MessageError:
+        return 'velocity_body_frame'
+
+
+def _same_layout(messages: Sequence[bytes], encoding: str, strings: int,
+                 ) -> tuple[np.ndarray, list[str], int] | None:
+    """
+    Return messages in rows of bytes, the strings at their front and where these end.
+
+    None if they are not all alike in this, or are serialised in a way that this module does not
+    know.
+    """
+    raw = _stacked(messages, encoding) if messages else None
+    if raw is None or (encoding == 'cdr' and messages[0][:2] != _CDR_LITTLE_ENDIAN):
+        return None
+    names = []
+    end = _FRAME_LENGTH.start
+    for _ in range(strings):
+        start = _aligned(end, 4, encoding) + 4
+        end = start + int.from_bytes(messages[0][start - 4:start], 'little')
+        name = messages[0][start:end]
+        if encoding == 'cdr':  # where a string ends with a zero, which its length counts
+            if not name.endswith(b'\0'):
+                return None
+            name = name[:-1]
+        try:
+            names.append(name.decode())
+        except UnicodeDecodeError:
+            return None
+    front = raw[:, _FRAME_LENGTH.start:end]
+    return (raw, names, end) if (front == front[0]).all() else None
+
+
+def _aligned(position: int, size: int, encoding: str) -> int:
+    """Return where the next value of a size lies, in CDR as counted behind the encapsulation."""
+    return position + (-(position - 4) % size if encoding == 'cdr' else 0)
+
+
+def _ends(raw: np.ndarray, end: int, encoding: str) -> bool:
+    """Whether messages are so long; some serialisations of CDR fill the last four bytes."""
+    return end <= raw.shape[1] <= (end + 3 if encoding == 'cdr' else end)

@@ -15,12 +15,12 @@
 
 from __future__ import annotations
 
-import math
 import re
 from typing import Any, NamedTuple
 
 from ins_align.config import Config
 import numpy as np
+from numpy.typing import ArrayLike
 
 ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 # The same without products, in which one component that is not finite would spoil the others.
@@ -86,20 +86,36 @@ def imu_from_msg(msg: Any) -> tuple[int, np.ndarray, np.ndarray]:
 
 def fix_from_msg(msg: Any) -> Fix:
     """Convert sensor_msgs/NavSatFix; a covariance of unknown type or without sense is None."""
-    covariance = None
-    if msg.position_covariance_type != 0:
-        covariance = np.array(msg.position_covariance, dtype=float).reshape(3, 3)
-        covariance = _usable_covariance(covariance, None)
-    return Fix(stamp_from_msg(msg), float(msg.latitude), float(msg.longitude),
-               float(msg.altitude), covariance, int(msg.status.status))
+    return fixes([stamp_from_msg(msg)], [[msg.latitude, msg.longitude, msg.altitude]],
+                 np.array(msg.position_covariance, float).reshape(1, 3, 3),
+                 [msg.position_covariance_type], [msg.status.status])[0]
+
+
+def fixes(stamps_ns: ArrayLike, places: ArrayLike, covariances: np.ndarray,
+          covariance_types: ArrayLike, status: ArrayLike) -> list[Fix]:
+    """
+    Make fixes of the columns of N messages.
+
+    Parameters
+    ----------
+    stamps_ns, covariance_types, status : array_like of int, shape (N,)
+        The last two as in sensor_msgs/NavSatFix.
+    places : array_like, shape (N, 3)
+        Latitude and longitude, degrees; altitude, m.
+    covariances : ndarray, shape (N, 3, 3)
+        As sent, m^2.
+
+    """
+    columns = (stamps_ns, *np.asarray(places, float).T, covariance_types, status)
+    return [Fix(stamp, latitude, longitude, altitude, covariance if kind != 0 else None, mode)
+            for (stamp, latitude, longitude, altitude, kind, mode), covariance
+            in zip(zip(*(np.asarray(column).tolist() for column in columns)),
+                   _usable_covariances(covariances, None))]
 
 
 def velocity_from_msg(msg: Any, config: Config) -> Velocity:
     """
-    Convert the velocity message that ``config.velocity_type`` names.
-
-    A variance that is 0 (or less than that of any sensor), negative (-1 marks "unknown") or not
-    finite takes the configured value; where all three are like that, the covariance is None.
+    Convert the velocity message that ``config.velocity_type`` names, like `velocities`.
 
     Raises
     ------
@@ -113,57 +129,88 @@ def velocity_from_msg(msg: Any, config: Config) -> Velocity:
         linear = msg.twist.linear
     else:
         linear = msg.twist.twist.linear
-        covariance = np.array(msg.twist.covariance, dtype=float).reshape(6, 6)[:3, :3]
+        covariance = np.array(msg.twist.covariance, dtype=float).reshape(1, 6, 6)
         if config.velocity_type == 'Odometry':
             frame = msg.child_frame_id  # the frame of nav_msgs/Odometry's twist
+    return velocities([stamp_from_msg(msg)], frame, [[linear.x, linear.y, linear.z]], covariance,
+                      config)[0]
+
+
+def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
+               covariances: np.ndarray | None, config: Config) -> list[Velocity]:
+    """
+    Make velocities of the columns of N messages.
+
+    A variance that is 0 (or less than that of any sensor), negative (-1 marks "unknown") or not
+    finite takes the configured value; where all three are like that, the covariance is None.
+
+    Parameters
+    ----------
+    stamps_ns : array_like of int, shape (N,)
+        Times of measurement.
+    frame : str
+        In which they say that they are.
+    linear : array_like, shape (N, 3)
+        m/s; east, north, up or as ``config.velocity_frame`` says.
+    covariances : ndarray, shape (N, 6, 6), or None
+        Of a twist.
+    config : Config
+        What axes they are in, and standard deviations that are not stated.
+
+    Raises
+    ------
+    MessageError
+        If the frame is that of a body.
+
+    """
     if _BODY_FRAME.search(frame):
         raise MessageError(
             f'the velocity is given in the body frame {frame[:80]!r}: an alignment needs it in a '
             'world frame, east-north-up or north-east-down')
-    velocity = np.array([linear.x, linear.y, linear.z], dtype=float)
+    velocity = np.array(linear, dtype=float)
+    usable: list[np.ndarray | None] = [None] * len(velocity)
     if config.velocity_frame == 'ned':
-        velocity = velocity[NED_ORDER] * NED_SIGNS
-    if covariance is not None:
+        velocity = velocity[:, NED_ORDER] * NED_SIGNS
+    if covariances is not None:
+        covariances = covariances[:, :3, :3]
         if config.velocity_frame == 'ned':
-            covariance = covariance[NED_ORDER][:, NED_ORDER] * np.outer(NED_SIGNS, NED_SIGNS)
-        covariance = _usable_covariance(
-            covariance, (config.velocity_std, config.velocity_std, config.velocity_std_vertical))
-    return Velocity(stamp_from_msg(msg), velocity, covariance)
+            covariances = (covariances[:, NED_ORDER][:, :, NED_ORDER]
+                           * np.outer(NED_SIGNS, NED_SIGNS))
+        usable = _usable_covariances(
+            covariances, (config.velocity_std, config.velocity_std, config.velocity_std_vertical))
+    return [Velocity(*columns) for columns in zip(np.asarray(stamps_ns).tolist(), velocity,
+                                                  usable)]
 
 
-def _usable_covariance(covariance: np.ndarray,
-                       default_std: tuple[float, float, float] | None) -> np.ndarray | None:
+def _usable_covariances(covariances: np.ndarray, default_std: tuple[float, float, float] | None,
+                        ) -> list[np.ndarray | None]:
     """
-    Return a symmetric positive definite (3, 3) covariance or None if nothing is known.
+    Return symmetric positive definite (3, 3) covariances, None where nothing is known.
 
     Parameters
     ----------
-    covariance : ndarray, shape (3, 3)
+    covariances : ndarray, shape (N, 3, 3)
         As sent, with whatever drivers put in for "unknown".
     default_std : three floats or None
         Stands in for single unknown variances; None: one unknown variance makes all unknown.
 
     """
-    variances = covariance.diagonal().tolist()
-    known = [SMALLEST_VARIANCE <= variance < math.inf for variance in variances]
-    if not any(known) or (default_std is None and not all(known)):
-        return None
-    if default_std is not None and not all(known):
-        return np.diag([_bounded(variance) if given else std ** 2 for variance, given, std
-                        in zip(variances, known, default_std)])
-    bounded = list(map(_bounded, variances))
-    diagonal = np.diag(bounded)
-    entries = covariance.ravel().tolist()
-    if bounded != variances or not any(entries[1:4] + entries[5:8]):
-        return diagonal
-    symmetric = 0.5 * covariance + 0.5 * covariance.T
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    known = (variances >= SMALLEST_VARIANCE) & (variances < np.inf)
+    count = np.count_nonzero(known, axis=1)
+    default = np.array([std ** 2 for std in default_std or (1.0, 1.0, 1.0)])
+    filled = np.where(known, np.clip(variances, MIN_VARIANCE, MAX_VARIANCE), default)
+    usable = filled[:, :, None] * np.eye(3)
     # Correlations without sense must not turn into a negative variance in some direction.
-    if np.isfinite(symmetric).all():
-        scale = 1.0 / np.sqrt(variances)
-        if np.linalg.eigvalsh(symmetric * scale * scale[:, None])[0] > 1e-9:
-            return symmetric
-    return diagonal
-
-
-def _bounded(variance: float) -> float:
-    return min(max(variance, MIN_VARIANCE), MAX_VARIANCE)
+    correlated = np.flatnonzero(
+        (count == 3) & (filled == variances).all(axis=1)
+        & covariances[:, ~np.eye(3, dtype=bool)].any(axis=1)
+        & np.isfinite(covariances).all(axis=(1, 2)))
+    if correlated.size:
+        symmetric = 0.5 * covariances[correlated]
+        symmetric += symmetric.transpose(0, 2, 1)
+        scale = 1.0 / np.sqrt(filled[correlated])
+        sound = np.linalg.eigvalsh(symmetric * scale[:, None, :] * scale[:, :, None])[:, 0] > 1e-9
+        usable[correlated[sound]] = symmetric[sound]
+    there = count == 3 if default_std is None else count > 0
+    return [usable[k] if there[k] else None for k in range(len(usable))]

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import dataclasses
 from dataclasses import dataclass
-import itertools
+from operator import itemgetter
 import os
 from typing import NamedTuple
 
@@ -26,8 +26,8 @@ from ins_align.bag_files import BagError, Topic
 from ins_align.bags import Bag, Block, Topics
 from ins_align.config import Config
 from ins_align.decoding import (
-    decode_imu, decode_orientations, deserialize, ImuSamples, Orientations)
-from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
+    decode_fixes, decode_imu, decode_orientations, decode_velocities, ImuSamples, Orientations)
+from ins_align.messages import Fix, Velocity
 import numpy as np
 
 
@@ -115,34 +115,28 @@ def read(request: Request) -> Iterator[Part]:
 
 def _decoded(block: Block, wanted: Sequence[Topic], topics: Topics, config: Config, done: float,
              warnings: tuple[str, ...]) -> Part:
-    """Decode a block, the IMU's messages all at once."""
-    kinds = np.array([0 if topic is topics.imu else 1 if topic is topics.reference else 2
-                      for topic in wanted])[np.array(block.topics, int)]
-    imu_messages, reference_messages = (
-        list(itertools.compress(block.messages, (kinds == kind).tolist())) for kind in (0, 1))
+    """Decode a block, the messages of a topic all at once."""
+    indices = np.array(block.topics, int)
+
+    def places_and_messages(topic: Topic | None) -> tuple[list[int], list[bytes]]:
+        if topic is None:
+            return [], []
+        places = np.flatnonzero(indices == wanted.index(topic)).tolist()
+        return places, [block.messages[place] for place in places]
+
+    imu_places, imu_messages = places_and_messages(topics.imu)
     samples = decode_imu(imu_messages, topics.imu)
-    before = np.zeros(len(kinds), np.int64)
-    before[kinds == 0] = samples.decoded
+    before = np.zeros(indices.size, np.int64)
+    before[imu_places] = samples.decoded
     before = np.cumsum(before)
-    gnss = tuple((int(before[index]), _gnss_message(block.messages[index],
-                                                    wanted[block.topics[index]], topics, config))
-                 for index in np.flatnonzero(kinds == 2).tolist())
-    return Part(topics, config, samples, gnss,
-                decode_orientations(reference_messages, topics.reference or topics.imu), done,
-                warnings)
-
-
-def _gnss_message(data: bytes, topic: Topic, topics: Topics,
-                  config: Config) -> Fix | Velocity | str:
-    """Return a GNSS message, or why it is none as the counts name it."""
-    name = 'fix' if topic is topics.fix else 'velocity'
-    try:
-        message = deserialize(data, topic)
-    except MessageError:
-        return f'{name}_undecodable'
-    if topic is topics.fix:
-        return fix_from_msg(message)
-    try:
-        return velocity_from_msg(message, config)
-    except MessageError:
-        return 'velocity_body_frame'
+    gnss: list[tuple[int, Fix | Velocity | str]] = []
+    places, messages = places_and_messages(topics.fix)
+    gnss += zip(places, decode_fixes(messages, topics.fix))
+    if topics.velocity is not None:
+        places, messages = places_and_messages(topics.velocity)
+        gnss += zip(places, decode_velocities(messages, topics.velocity, config))
+    gnss.sort(key=itemgetter(0))
+    _, orientations = places_and_messages(topics.reference)
+    return Part(topics, config, samples,
+                tuple((int(before[place]), message) for place, message in gnss),
+                decode_orientations(orientations, topics.reference or topics.imu), done, warnings)

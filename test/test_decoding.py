@@ -11,16 +11,18 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Bulk decoding of IMU messages against the rosbags library."""
+"""Bulk decoding of IMU and GNSS messages against the rosbags library."""
 
 from hypothesis import given, settings, strategies as st
 from ins_align import decoding
 from ins_align.bag_files import Topic
-from ins_align.decoding import body_start, decode_imu, decode_orientations, deserialize
+from ins_align.config import Config
+from ins_align.decoding import (
+    body_start, decode_fixes, decode_imu, decode_orientations, decode_velocities, deserialize)
 from ins_align.messages import MessageError
 import numpy as np
 import pytest
-from recordings import IMU, make_imu, START_NS, typestore
+from recordings import FIX, IMU, make_header, make_imu, START_NS, typestore
 
 TOPICS = {'cdr': Topic('/imu', IMU, 'cdr'), 'ros1': Topic('/imu', IMU, 'ros1')}
 
@@ -136,3 +138,127 @@ def test_any_bytes(encoding, edits):
     assert len(decoded.stamps_ns) == len(expected)
     if expected:
         assert_same(decoded, [np.concatenate(parts) for parts in zip(*expected)])
+
+
+# GNSS
+
+VELOCITIES = {'TwistStamped': 'geometry_msgs/msg/TwistStamped',
+              'TwistWithCovarianceStamped': 'geometry_msgs/msg/TwistWithCovarianceStamped',
+              'Odometry': 'nav_msgs/msg/Odometry'}
+GNSS = [FIX, *VELOCITIES]
+
+
+def serialized_gnss(encoding, kind, count=5, frame_id='gps', seed=0, little_endian=True):
+    """Serialise messages in which every number is another one."""
+    rng = np.random.default_rng(seed)
+    store = typestore(encoding == 'ros1')
+    msgtype = VELOCITIES.get(kind, kind)
+
+    def made(name, *values):
+        return store.types[f'geometry_msgs/msg/{name}'](*values)
+
+    def covariance(size):
+        factor = rng.normal(size=(size, size))
+        return (factor @ factor.T).ravel()
+
+    raws = []
+    for k in range(count):
+        header = make_header(store, START_NS + k * 200_000_001,
+                             'map' if kind == 'Odometry' else frame_id, k)
+        twist = made('Twist', *(made('Vector3', *rng.normal(size=3)) for _ in range(2)))
+        uncertain = made('TwistWithCovariance', twist, covariance(6))
+        if kind == FIX:
+            status = store.types['sensor_msgs/msg/NavSatStatus'](k - 1, 0xfff0 + k)
+            rest = status, *rng.uniform(-90, 90, 3), covariance(3), k % 4
+        elif kind == 'Odometry':
+            pose = made('Pose', made('Point', *rng.normal(size=3)),
+                        made('Quaternion', *rng.normal(size=4)))
+            rest = frame_id, made('PoseWithCovariance', pose, covariance(6)), uncertain
+        else:
+            rest = (twist if kind == 'TwistStamped' else uncertain),
+        message = store.types[msgtype](header, *rest)
+        raws.append(bytes(store.serialize_ros1(message, msgtype) if encoding == 'ros1' else
+                          store.serialize_cdr(message, msgtype, little_endian=little_endian)))
+    return raws
+
+
+def decode_gnss(raws, encoding, kind):
+    topic = Topic('/gnss', VELOCITIES.get(kind, kind), encoding)
+    if kind == FIX:
+        return decode_fixes(raws, topic)
+    return decode_velocities(raws, topic, Config(velocity_type=kind, velocity_frame='ned'))
+
+
+def gnss_by_library(raws, encoding, kind):
+    """Decode one by one with nothing taken from bytes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(decoding, '_same_layout', lambda *arguments: None)
+        return [decode_gnss([raw], encoding, kind)[0] for raw in raws]
+
+
+def assert_same_gnss(messages, expected):
+    assert len(messages) == len(expected)
+    for mine, theirs in zip(messages, expected):
+        assert type(mine) is type(theirs)
+        if isinstance(mine, str):
+            assert mine == theirs
+            continue
+        for one, other in zip(mine, theirs):
+            assert type(one) is type(other)
+            np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize('encoding', ['cdr', 'ros1'])
+@pytest.mark.parametrize('kind', GNSS)
+@pytest.mark.parametrize('frame_id', ['', 'a', 'ab', 'gps', 'gnss', 'a/long/name/of/a/frame', 'ü'])
+def test_gnss_as_the_library(encoding, kind, frame_id, monkeypatch):
+    raws = serialized_gnss(encoding, kind, frame_id=frame_id)
+    expected = gnss_by_library(raws, encoding, kind)
+    assert not any(isinstance(message, str) for message in expected)
+    monkeypatch.setattr(decoding, 'deserialize', None)  # the bulk path needs no library
+    assert_same_gnss(decode_gnss(raws, encoding, kind), expected)
+
+
+@pytest.mark.parametrize('encoding', ['cdr', 'ros1'])
+@pytest.mark.parametrize('kind', GNSS)
+def test_gnss_of_several_layouts_keeps_its_order(encoding, kind):
+    raws = [b''] + [raw for group in zip(serialized_gnss(encoding, kind, seed=1),
+                                         serialized_gnss(encoding, kind, frame_id='imu', seed=2),
+                                         serialized_gnss(encoding, kind, frame_id='long', seed=3))
+                    for raw in group] + [b'\xff' * 200]
+    messages = decode_gnss(raws, encoding, kind)
+    assert_same_gnss(messages, gnss_by_library(raws, encoding, kind))
+    name = 'fix' if kind == FIX else 'velocity'
+    assert messages[0] == messages[-1] == f'{name}_undecodable'
+    if kind != FIX:
+        assert messages[2::3] == ['velocity_body_frame'] * 5
+        assert decode_gnss(raws[2::3], encoding, kind) == ['velocity_body_frame'] * 5
+
+
+@pytest.mark.parametrize('kind', GNSS)
+def test_gnss_with_its_last_four_bytes_filled_up(kind):
+    raws = serialized_gnss('cdr', kind)
+    expected = decode_gnss(raws, 'cdr', kind)
+    for fill, good in ((1, True), (3, True), (4, False)):
+        messages = decode_gnss([raw + bytes(fill) for raw in raws], 'cdr', kind)
+        assert_same_gnss(messages, expected if good else gnss_by_library(
+            [raw + bytes(fill) for raw in raws], 'cdr', kind))
+        assert isinstance(messages[0], str) is not good
+
+
+@pytest.mark.parametrize('kind', GNSS)
+def test_gnss_big_endian_goes_to_the_library(kind):
+    assert_same_gnss(decode_gnss(serialized_gnss('cdr', kind, little_endian=False), 'cdr', kind),
+                     decode_gnss(serialized_gnss('cdr', kind), 'cdr', kind))
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.sampled_from(['cdr', 'ros1']), st.sampled_from(GNSS), st.lists(st.tuples(
+    st.integers(0, 120), st.binary(max_size=8)), max_size=4), st.booleans())
+def test_any_gnss_bytes(encoding, kind, edits, everywhere):
+    """Whatever the bytes: the same as the library makes of them, message by message."""
+    raws = serialized_gnss(encoding, kind, 3)
+    for at, replacement in edits:
+        raws[:3 if everywhere else 1] = [raw[:at] + replacement + raw[at + len(replacement):]
+                                         for raw in raws[:3 if everywhere else 1]]
+    assert_same_gnss(decode_gnss(raws, encoding, kind), gnss_by_library(raws, encoding, kind))
