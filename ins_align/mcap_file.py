@@ -30,7 +30,7 @@ class McapFile(ChunkedFile):
     """An mcap file with ROS messages."""
 
     _RECORD = struct.Struct('<BQ')
-    _MESSAGE = struct.Struct('<BQHIQQ')
+    _MESSAGE = struct.Struct('<BQH4xQ8x')  # neither sequence number nor time of publication
     _CHUNK = struct.Struct('<QQQII')
     _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _DATA_END = 1, 2, 3, 4, 5, 6, 15
     _LAST_OP = 15
@@ -56,7 +56,7 @@ class McapFile(ChunkedFile):
                 self._complete = True
                 break
             if op == self._MESSAGE_OP and len(head) == self._MESSAGE.size:
-                plain = self._extend(plain, start, position, self._MESSAGE.unpack(head)[4])
+                plain = self._extend(plain, start, position, self._MESSAGE.unpack(head)[3])
             elif op in (self._SCHEMA, self._CHANNEL):
                 if length <= MAX_DEFINITION_BYTES:
                     self._file.seek(start)
@@ -140,7 +140,7 @@ class McapFile(ChunkedFile):
         unpack, head_size = self._MESSAGE.unpack_from, self._MESSAGE.size
         position, size = 0, len(data)
         while position + head_size <= size:
-            op, length, channel, _, log_time, _ = unpack(data, position)
+            op, length, channel, log_time = unpack(data, position)
             start, position = position, position + 9 + length
             if op == 0 or position > size:
                 break
