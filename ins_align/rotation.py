@@ -183,9 +183,8 @@ def exp_so3(vector: ArrayLike) -> Array:
     """
     v = np.asarray(vector, dtype=float)
     if v.ndim > 1:
-        angle2 = _squared_norm(v)
-        a, b, _ = _trigonometric_factors(angle2)
-        return _rodrigues(v, angle2, a, b)
+        squares = _squared_norm(v)
+        return _rodrigues(v, squares, *_trigonometric_factors(squares)[:2])
     x, y, z = v.tolist()                          # a single one is quicker without arrays
     angle2 = x * x + y * y + z * z
     if angle2 < _SMALL_ANGLE ** 2:
