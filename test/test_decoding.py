@@ -16,6 +16,7 @@
 from hypothesis import given, settings, strategies as st
 from ins_align import decoding
 from ins_align.bag_files import Topic
+from ins_align.bags import VELOCITY_TYPES
 from ins_align.config import Config
 from ins_align.decoding import (
     body_start, decode_fixes, decode_imu, decode_orientations, decode_velocities, deserialize)
@@ -142,17 +143,14 @@ def test_any_bytes(encoding, edits):
 
 # GNSS
 
-VELOCITIES = {'TwistStamped': 'geometry_msgs/msg/TwistStamped',
-              'TwistWithCovarianceStamped': 'geometry_msgs/msg/TwistWithCovarianceStamped',
-              'Odometry': 'nav_msgs/msg/Odometry'}
-GNSS = [FIX, *VELOCITIES]
+GNSS = [FIX, *VELOCITY_TYPES]
 
 
 def serialized_gnss(encoding, kind, count=5, frame_id='gps', seed=0, little_endian=True):
     """Serialise messages in which every number is another one."""
     rng = np.random.default_rng(seed)
     store = typestore(encoding == 'ros1')
-    msgtype = VELOCITIES.get(kind, kind)
+    msgtype = VELOCITY_TYPES.get(kind, kind)
 
     def made(name, *values):
         return store.types[f'geometry_msgs/msg/{name}'](*values)
@@ -183,7 +181,7 @@ def serialized_gnss(encoding, kind, count=5, frame_id='gps', seed=0, little_endi
 
 
 def decode_gnss(raws, encoding, kind):
-    topic = Topic('/gnss', VELOCITIES.get(kind, kind), encoding)
+    topic = Topic('/gnss', VELOCITY_TYPES.get(kind, kind), encoding)
     if kind == FIX:
         return decode_fixes(raws, topic)
     return decode_velocities(raws, topic, Config(velocity_type=kind, velocity_frame='ned'))

@@ -157,6 +157,23 @@ def test_a_day_of_products_stays_a_rotation():
     assert np.allclose(matrix, exact, atol=1e-9)
 
 
+@pytest.mark.parametrize('shape', [(), (3,), (9, 11), (10, 10), (38, 38)])
+@pytest.mark.parametrize('count', [0, 1, 2, 40])
+def test_running_sum_is_the_same_to_the_bit_however_it_is_split(shape, count):
+    random = np.random.default_rng(count)
+    start, steps = np.asarray(random.normal(size=shape)), random.normal(size=(count,) + shape)
+    expected, so_far = [], start
+    for step in steps:
+        so_far = so_far + step
+        expected.append(so_far)
+    sums = rotation.running_sum(start, steps)
+    assert sums.shape == steps.shape
+    assert np.array_equal(sums, np.reshape(expected, steps.shape))
+    if count > 1:
+        rest = rotation.running_sum(sums[count // 2 - 1], steps[count // 2:])
+        assert np.array_equal(rest, sums[count // 2:])
+
+
 finite = st.floats(-50.0, 50.0)
 
 
