@@ -251,8 +251,8 @@ class AlignmentNode(Node):
     def _velocity(self, msg: Any) -> Velocity | None:
         try:
             return velocity_from_msg(msg, self._config)
-        except MessageError:
-            self._aligner.reject('velocity_body_frame')
+        except MessageError as error:
+            self._aligner.reject('velocity_body_frame', str(error))
             return None
 
     def _change_imu_frame(self, frame_id: str) -> None:

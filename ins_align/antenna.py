@@ -14,13 +14,13 @@
 """Where the GNSS antenna is: GNSS messages put together to the epochs that a method takes."""
 
 from collections import Counter, deque
+from dataclasses import dataclass
 import math
 
 from ins_align.buffers import GnssEpoch
 from ins_align.config import Config
 from ins_align.earth import carried, GRAVITY_EQUATOR, Place, SEMI_MAJOR_AXIS, way
 from ins_align.messages import Fix, Velocity
-from ins_align.methods import AntennaEpoch
 from ins_align.plausibility import VelocityCheck
 from ins_align.rotation import Array
 import numpy as np
@@ -38,6 +38,35 @@ _UNKNOWN_VERTICAL_STD = 1e3
 BETTER_THAN_USUAL, USUAL_EPOCHS = 100.0, 11
 
 
+@dataclass(frozen=True)
+class AntennaEpoch:
+    """
+    Where the antenna is and how it moves at a GNSS epoch, as a method takes it.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    latitude, longitude, altitude : float
+        Of the antenna, radians and metres; always there.
+    v_n : ndarray, shape (3,), or None
+        Antenna velocity, ENU, m/s.
+    velocity_covariance, position_covariance : ndarray, shape (3, 3)
+        ENU.
+    position_measured : bool
+        Whether the position is a measurement to align with.
+
+    """
+
+    stamp_ns: int
+    latitude: float
+    longitude: float
+    altitude: float
+    v_n: Array | None
+    velocity_covariance: Array
+    position_measured: bool
+    position_covariance: Array
+
+
 class Antenna:
     """
     Follows the antenna from epoch to epoch, with or without a fix in each.
@@ -47,7 +76,7 @@ class Antenna:
     config : Config
     counts : Counter
         Where is counted what is not believed: ``fix_jump``, ``fix_covariance``,
-        ``velocity_covariance``.
+        ``velocity_covariance``, ``velocity_no_vertical``.
 
     """
 
@@ -103,7 +132,7 @@ class Antenna:
             self._seen_ns = message.stamp_ns
         if v_n is not None:
             self._v_n, self._speed = v_n, math.hypot(*v_n.tolist())
-            self._look_for_vertical(v_n)
+            self._look_for_vertical(v_n, velocity is not None and velocity.vertical)
             if believed:
                 variances = position_covariance.diagonal().tolist()
                 self._check.add(message.stamp_ns * 1e-9, self._place, v_n,
@@ -111,10 +140,12 @@ class Antenna:
         return AntennaEpoch(message.stamp_ns, *self._place, v_n, self._covariance_of(velocity),
                             believed, position_covariance)
 
-    def _look_for_vertical(self, v_n: Array) -> None:
+    def _look_for_vertical(self, v_n: Array, measured: bool) -> None:
         """Notice a receiver that moves and never says anything but 0 of the vertical."""
         east, north, up = v_n.tolist()
-        if up != 0.0:
+        if not measured:
+            self._counts['velocity_no_vertical'] += 1
+        elif up != 0.0:
             self._vertical_seen = True
             self._vertical = self._config.velocity_vertical == 'measured'
         elif not self._vertical_seen and (east != 0.0 or north != 0.0):
@@ -149,7 +180,7 @@ class Antenna:
         covariance = self._velocity_noise.believed(stated)
         if covariance is not stated and stated is not None:
             self._counts['velocity_covariance'] += 1
-        if not self._vertical:
+        if not self._vertical or (velocity is not None and not velocity.vertical):
             covariance = covariance.copy()
             covariance[2, :2] = covariance[:2, 2] = 0.0
             covariance[2, 2] = _UNKNOWN_VERTICAL_STD ** 2

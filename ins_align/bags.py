@@ -42,6 +42,7 @@ VELOCITY_TYPES = {
 REFERENCE_NAMESPACE = '/reference/'
 REFERENCE_TOPIC = '/reference/imu'  # truth or the best that is known: to compare with, never input
 
+LOOK_NS = 60_000_000_000  # of a recording in which topics that are left out are looked for
 MAX_METADATA_BYTES = 1 << 24
 # A compressed file may unpack to this much, or to more at no more than this ratio.
 UNPACKED_BYTES_FREE = 1 << 30
@@ -211,6 +212,9 @@ class Bag:
         """
         Find the topics by message type, or by name where one is given.
 
+        Velocities that cannot be used, or that are left out for one of another type, are among
+        the `warnings` afterwards.
+
         Raises
         ------
         BagError
@@ -226,6 +230,8 @@ class Bag:
             others = [kind for kind in VELOCITY_TYPES.values() if kind != preferred]
             if velocity is None:
                 velocity_topic = self._choose('velocity', '--velocity-topic', [preferred], None)
+                if velocity_topic is not None:
+                    self._warn_of_others(velocity_topic, others)
             if velocity_topic is None:
                 kinds = others if velocity is None else [preferred, *others]
                 velocity_topic = self._choose('velocity', '--velocity-topic', kinds, velocity)
@@ -244,7 +250,10 @@ class Bag:
 
     def _choose(self, what: str, option: str, kinds: list[str], name: str | None) -> Topic | None:
         if name is not None:
-            return self._named(what, option, kinds, name)
+            topic = self._named(what, option, kinds, name)
+            if what == 'velocity':
+                self._measures(topic)  # for the warning: it is read as the user wishes
+            return topic
         candidates = [topic for topic in self.topics if topic.msgtype in kinds
                       and REFERENCE_NAMESPACE not in topic.name]
         if what == 'velocity' or len(candidates) > 1:
@@ -269,11 +278,26 @@ class Bag:
                            f'{topic.msgtype.replace("/msg/", "/")}, but {what} needs {wanted}')
         return topic
 
-    def _measures(self, topic: Topic) -> bool:
-        """Look into a topic's first message for whether it can be what its type promises."""
+    def _warn_of_others(self, velocity: Topic, kinds: list[str]) -> None:
+        """Say which velocities of other types are left out."""
+        # A topic without messages is found out by reading all of the recording: not for a warning.
+        stop_ns = (self.start_ns or 0) + LOOK_NS
+        names = sorted(_with_type(topic) for topic in self.topics if topic.msgtype in kinds
+                       and REFERENCE_NAMESPACE not in topic.name
+                       and self._measures(topic, stop_ns, say=False))
+        if names:
+            self._warn(f'the velocity is read from {_with_type(velocity)}, not from '
+                       f'{", ".join(names)}: --velocity-topic chooses')
+
+    def _measures(self, topic: Topic, stop_ns: int | None = None, say: bool = True) -> bool:
+        """
+        Look into a topic's first message for whether it can be what its type promises.
+
+        With `say` there is a warning of a message that cannot be used.
+        """
         if 'cmd' in topic.name.rsplit('/', 1)[-1]:
             return False  # /cmd_vel: a wish, not a measurement
-        first = next(self.messages([topic]), None)
+        first = next(self.messages([topic], stop_ns=stop_ns), None)
         if first is None:
             return False
         try:
@@ -285,14 +309,24 @@ class Bag:
             if topic.msgtype in VELOCITY_TYPES.values():
                 velocity_from_msg(message,
                                   Config(velocity_type=topic.msgtype.rsplit('/', 1)[-1]))
-        except MessageError:
+        except MessageError as error:
+            if say:
+                self._warn(f'{topic.name} cannot be used: {error}')
             return False
         return True
+
+    def _warn(self, text: str) -> None:
+        if text not in self._warnings:
+            self._warnings.append(text)
 
     def _listing(self) -> str:
         names = sorted(topic.name for topic in self.topics)
         more = f' and {len(names) - 20} more' if len(names) > 20 else ''
         return f'it has {", ".join(names[:20])}{more}' if names else 'it has no topics'
+
+
+def _with_type(topic: Topic) -> str:
+    return f'{topic.name} ({topic.msgtype.rsplit("/", 1)[-1]})'
 
 
 def _unpacked(path: Path, stack: ExitStack, warnings: list[str]) -> Path:

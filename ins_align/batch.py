@@ -30,6 +30,7 @@ from pathlib import Path
 import signal
 from typing import Any
 
+from ins_align.ahead import ProcessDied
 from ins_align.bag_files import BagError
 from ins_align.config import Config
 from ins_align.replay import replay
@@ -67,14 +68,17 @@ class Outcome:
     error: str = ''
 
 
-def process(task: Task, progress: Callable[[float], None] | None = None) -> Outcome:
+def process(task: Task, progress: Callable[[float], None] | None = None,
+            read_ahead: bool = False) -> Outcome:
     """Replay one recording and write its files; whatever the user can put right is an error."""
     try:
         result = replay(task.bag, task.config, imu_topic=task.imu_topic, fix_topic=task.fix_topic,
                         velocity_topic=task.velocity_topic, start=task.start,
-                        duration=task.duration, progress=progress)
+                        duration=task.duration, progress=progress, read_ahead=read_ahead)
     except BagError as error:
         return _failed(task, str(error))
+    except ProcessDied:
+        return _died(task)
     try:
         if task.csv:
             text = result.to_csv().encode()
@@ -85,6 +89,11 @@ def process(task: Task, progress: Callable[[float], None] | None = None) -> Outc
     except OSError as error:
         return _failed(task, f'cannot write {error.filename}: {error.strerror}')
     return Outcome(result.to_json(), summary(result), result.warnings)
+
+
+def _died(task: Task) -> Outcome:
+    return _failed(task, f'{task.bag}: a process died on the way, perhaps for want of memory; '
+                         '--jobs 1 takes less')
 
 
 def _failed(task: Task, error: str) -> Outcome:
@@ -101,25 +110,26 @@ def process_all(tasks: Sequence[Task], jobs: int, progress: Callable[[float], No
     tasks : sequence of Task
         One a recording.
     jobs : int
-        Processes at a time; 1: this one.
+        Processes at a time; 1: this one. Where there are two for each recording, one reads
+        ahead.
     progress : callable
         Called with the number of recordings done, whole ones and parts.
 
     """
     if jobs == 1 or len(tasks) == 1:
         for index, task in enumerate(tasks):
-            yield process(task, partial(_advance, progress, index))
+            yield process(task, partial(_advance, progress, index), read_ahead=jobs > 1)
             progress(index + 1.0)
         return
     with ProcessPoolExecutor(min(jobs, len(tasks)), initializer=_leave_interrupts) as executor:
         try:
-            futures = [executor.submit(process, task) for task in tasks]
+            futures = [executor.submit(process, task, read_ahead=jobs >= 2 * len(tasks))
+                       for task in tasks]
             for index, (task, future) in enumerate(zip(tasks, futures)):
                 try:
                     outcome = future.result()
                 except BrokenProcessPool:
-                    outcome = _failed(task, f'{task.bag}: a process died on the way, perhaps for '
-                                            'want of memory; --jobs 1 takes less')
+                    outcome = _died(task)
                 yield outcome
                 progress(index + 1.0)
         except BaseException:

@@ -92,21 +92,31 @@ class ImuBuffer:
         self._new_stamps.append(stamp_ns)
         self._new_samples.append((*gyro, *accel))
 
-    def add_many(self, stamps_ns: np.ndarray, gyro: Array, accel: Array) -> None:
-        """Append samples, shapes (N,), (N, 3), (N, 3); the same as one by one."""
+    def add_many(self, stamps_ns: np.ndarray, gyro: Array, accel: Array) -> int:
+        """
+        Append samples, shapes (N,), (N, 3), (N, 3); the same as one by one.
+
+        Returns
+        -------
+        int
+            How many were taken: all, or those before the one at which the clock has jumped.
+
+        """
         if stamps_ns.size == 0:
-            return
+            return 0
         ordered = (np.all(stamps_ns[1:] > stamps_ns[:-1])
                    and (self.newest_ns is None or stamps_ns[0] > self.newest_ns))
         if not ordered:
-            for stamp_ns, g, a in zip(stamps_ns.tolist(), gyro, accel):
-                if self.jumped_to_ns is None:
-                    self.add(stamp_ns, g, a)
-            return
+            for k, (stamp_ns, g, a) in enumerate(zip(stamps_ns.tolist(), gyro, accel)):
+                self.add(stamp_ns, g, a)
+                if self.jumped_to_ns is not None:
+                    return k
+            return int(stamps_ns.size)
         self._suspect_ns = None
         self._flatten()
         self._new_arrays.append((np.asarray(stamps_ns, np.int64), np.hstack([gyro, accel])))
         self.newest_ns = int(stamps_ns[-1])
+        return int(stamps_ns.size)
 
     def _old_sample(self, stamp_ns: int) -> None:
         """One sample from long ago is late; a second one after it means a clock set back."""
@@ -239,6 +249,9 @@ class GnssBuffer:
     def add_velocity(self, velocity: Velocity, imu_newest_ns: int | None) -> None:
         """Take a velocity, or count why not."""
         self._counts['velocity'] += 1
+        east, north, up = velocity.velocity
+        if math.isnan(up):
+            velocity = velocity._replace(velocity=np.array([east, north, 0.0]), vertical=False)
         if not np.all(np.abs(velocity.velocity) < MAX_SPEED):
             self._counts['velocity_nan'] += 1
             return

@@ -26,6 +26,7 @@ import math
 from ins_align.config import Config
 from ins_align.methods import Fit
 from ins_align.rotation import Array
+from ins_align.told import seem_late
 
 
 class State(str, Enum):
@@ -43,6 +44,8 @@ class State(str, Enum):
 MAX_MISFIT = 4.0
 # Share of epochs that may be rejected as outliers.
 MAX_REJECTED = 0.25
+# What was declared is withdrawn when its sigma is so many times the threshold.
+WITHDRAWN_AT = 2.0
 # Redundant rows before anything is declared.
 MIN_DOF = 12
 # A delay is to be expected within so many of its sigmas; and further off (s) it is more than a
@@ -119,13 +122,10 @@ class Declaration:
             self._recent_nis += (min(nis, 10.0) - self._recent_nis) / RECENT
         contradiction = self._contradiction(fit)
         self.contradicted = bool(contradiction)
-        factor = fit.factor
-        tilt, tilt_now = (math.degrees(_largest_std(P)) * factor for P in (initial, current))
-        heading, heading_now = (math.degrees(math.sqrt(P[2, 2])) * factor
-                                for P in (initial, current))
+        tilt, heading = _sigmas_deg(initial, fit.factor)
+        tilt_now, heading_now = _sigmas_deg(current, fit.factor)
         tilt, heading = max(tilt, tilt_now), max(heading, heading_now)
-        rejected = fit.rejected_velocity + fit.rejected_position
-        just_rejected, self._rejected = rejected > self._rejected, rejected
+        just_rejected, self._rejected = fit.rejected > self._rejected, fit.rejected
         good = (not contradiction and not just_rejected and fit.converged
                 and fit.dof >= MIN_DOF)
         max_tilt, max_heading = self.config.tilt_std_threshold, self.config.heading_std_threshold
@@ -142,15 +142,44 @@ class Declaration:
             doubt = unconfirmed()
             self.aligned = not doubt and tilt <= max_tilt and heading <= max_heading
             self.later_start = not doubt and not self.aligned
-        if self.aligned:
-            # What was declared stays declared until the data contradict it or its sigma has
-            # clearly grown.
-            self.aligned = heading <= 2 * max_heading
-        if self.levelled:
-            self.levelled = tilt <= 2 * max_tilt
+        self._withdraw(tilt, heading)
         if doubt:
             return Verdict(State.LEVELLED if self.levelled else State.ALIGNING, doubt)
         return self._verdict(tilt, heading, fit)
+
+    def update_without_gnss(self, silent_s: float, initial: Array, current: Array,
+                            fit: Fit) -> Verdict:
+        """
+        Judge an epoch without a measurement: nothing is declared, and what gets lost withdrawn.
+
+        Parameters
+        ----------
+        silent_s : float
+            Seconds since the last measurement.
+        initial, current, fit
+            As for `update`.
+
+        Returns
+        -------
+        Verdict
+
+        """
+        silence = f'no GNSS for {silent_s:.0f} s'
+        if self.levelled or self.aligned:
+            tilt, heading = (max(worse) for worse in zip(*(
+                _sigmas_deg(P, fit.factor) for P in (initial, current))))
+            self._withdraw(tilt, heading)
+        if self.levelled or self.aligned:
+            verdict = self._verdict(tilt, heading, fit)
+            return Verdict(verdict.state, f'{verdict.reason}; {silence}')
+        return Verdict(State.ALIGNING, silence)
+
+    def _withdraw(self, tilt: float, heading: float) -> None:
+        """Keep what was declared until its sigma has clearly grown."""
+        max_tilt = WITHDRAWN_AT * self.config.tilt_std_threshold
+        self.levelled = self.levelled and tilt <= max_tilt
+        self.aligned = (self.aligned and tilt <= max_tilt
+                        and heading <= WITHDRAWN_AT * self.config.heading_std_threshold)
 
     def _verdict(self, tilt: float, heading: float, fit: Fit) -> Verdict:
         config = self.config
@@ -179,16 +208,15 @@ class Declaration:
         """Return what in the data contradicts the model; empty when nothing does."""
         if fit.dof < MIN_DOF:
             return ''
-        rejected = fit.rejected_velocity + fit.rejected_position
-        if rejected > MAX_REJECTED * fit.offered:
-            return (f'{rejected} of {fit.offered} GNSS epochs do not fit the rest: check the '
+        if fit.rejected > MAX_REJECTED * fit.offered:
+            return (f'{fit.rejected} of {fit.offered} GNSS epochs do not fit the rest: check the '
                     'velocity frame, the IMU axes and signs, the lever arm, the GNSS delay')
         config = self.config
         unexplained = abs(fit.delay - config.gnss_delay)
         if unexplained > min(DELAY_SIGMAS * config.gnss_delay_std, MAX_DELAY) > 0:
-            return (f'the GNSS stamps seem to be {fit.delay:.2f} s late, gnss_delay is '
-                    f'{config.gnss_delay:g} and gnss_delay_std {config.gnss_delay_std:g}: check '
-                    'the clocks, or set gnss_delay')
+            return f'{seem_late(fit.delay, config)}, or set gnss_delay'
+        if fit.objection:
+            return fit.objection
         misfit = max(fit.chi2 / fit.dof, self._recent_nis)
         if misfit > MAX_MISFIT:
             return (f'the residuals are {math.sqrt(misfit):.1f} times what the stated noise '
@@ -204,10 +232,11 @@ def _understated(fit: Fit) -> str:
                    if factor > 1.0)
 
 
-def _largest_std(P: Array) -> float:
-    """Largest sigma about a horizontal axis: from the larger eigenvalue of the leading 2 x 2."""
-    (a, b), (_, c) = P[:2, :2].tolist()
-    return math.sqrt(0.5 * (a + c) + math.hypot(0.5 * (a - c), b))
+def _sigmas_deg(P: Array, factor: float) -> tuple[float, float]:
+    """Sigma of tilt, about the horizontal axis where it is largest, and of heading, inflated."""
+    (ee, en, _), (_, nn, _), (_, _, uu) = P.tolist()
+    tilt = math.sqrt(0.5 * (ee + nn) + math.hypot(0.5 * (ee - nn), en))
+    return math.degrees(tilt) * factor, math.degrees(math.sqrt(uu)) * factor
 
 
 def _since(since_s: float | None, time_s: float, good: bool) -> float | None:

@@ -168,7 +168,7 @@ class LocalLevel:
     """
     The non-rotating frame n0: the local level frozen at a start position and instant.
 
-    ``C_n0n(t) = C_en(0)^T Rz(W t) C_en(t)`` needs no integration (method.md, section 1).
+    ``C_n0n(t) = C_en(0)^T Rz(W t) C_en(t)`` needs no integration (docs, "Theory").
 
     Parameters
     ----------

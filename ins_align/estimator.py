@@ -21,13 +21,13 @@ their sensitivity to x at once, and the normal equations accumulate (docs, "Theo
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 import math
 
 from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals, SensorErrors
-from ins_align.rotation import Array, cross
+from ins_align.rotation import apply, Array, cross
 from ins_align.solution import Course, NoiseLevels, Solution
 from ins_align.unknowns import (ACCEL_MATRIX, DELAY, GYRO_BIAS, GYRO_MATRIX, LEVER_ARM, Prior,
                                 SIZE, START_POSITION, START_VELOCITY, Unknowns)
@@ -146,7 +146,7 @@ class MapEstimator:
         self._gnss = Measurements.empty(capacity)
         # Outliers when they came.
         self._refused = np.zeros((capacity, 2), bool)
-        self.count = 0
+        self.count = self.measured = 0              # epochs, and those with a measurement
         self.solution: Solution | None = None
         self._last_fit = self._last_tuned = self._last_afresh = 0
         self.noise = noise
@@ -194,9 +194,10 @@ class MapEstimator:
         self._intervals.put(places, intervals.take(slice(0, count)))
         self._sensor_errors[places] = self.sensor_errors.vector()
         self._gnss.put(places, gnss.take(slice(0, count)))
+        measured: list[bool] = np.any(gnss.present[:count], axis=1).tolist()
         s = self.solution
         if s is None:
-            yield from self._first(count)
+            yield from self._first(measured)
             return
         rows = s.rows(self._gnss.take(places), self._intervals.take(places))
         wanted = gnss.present[:count, :s.kinds].copy()
@@ -214,22 +215,25 @@ class MapEstimator:
                     wanted[done, wild[0]] = False
                     self._refused[self.count, wild[0]] = True
                     s.rejected[wild[0]] += 1
+                    s.rejected_epochs += not refused
                     refused[wild[0]] = tests[wild[0]]
                     ahead = 1
                     break
                 s.move_to(course, k)
                 self.count += 1
+                self.measured += measured[done]
                 done += 1
                 yield self._taken(s, tests | refused)
                 if self.solution is not s:
                     return
                 refused = {}
 
-    def _first(self, count: int) -> Iterator[Innovation]:
-        """Append epochs until there is a solution."""
-        for _ in range(count):
+    def _first(self, measured: list[bool]) -> Iterator[Innovation]:
+        """Append epochs, with or without a measurement, until there is a solution."""
+        for is_measured in measured:
             self.count += 1
-            if self.prior.information[0, 0] > 0 or self.count >= self.FIRST_FIT:
+            self.measured += is_measured
+            if self.prior.information[0, 0] > 0 or self.measured >= self.FIRST_FIT:
                 self._fit()
             yield NOTHING_NEW
             if self.solution is not None:
@@ -255,7 +259,7 @@ class MapEstimator:
         if self.count >= max(self.TUNE_FROM, self._last_tuned * (1 + self.TUNE_GROWTH)):
             self._tune(s)
         growth = self.GROWTH_FAR if s.nonlinearity > self.FAR else self.GROWTH
-        overfit = sum(s.rejected) > self.OVERFIT * self.count
+        overfit = s.rejected_epochs > self.OVERFIT * self.measured
         if ((s.nonlinearity > self.NONLINEARITY or self._misfits(s) or overfit)
                 and self.count >= self._last_fit * (1 + growth)):
             self._fit()
@@ -332,7 +336,7 @@ class MapEstimator:
         for _ in range(self.MAX_ITERATIONS):
             s = self._start(point)
             whitened = self._run(s, None if P is None else Gate(s.dx, P), refused)
-            if sum(s.rejected) > self.MAX_REJECTED * self.count:
+            if s.rejected_epochs > self.MAX_REJECTED * self.measured:
                 # Not a few outliers but a wrong picture: look at everything again.
                 s, P = self._start(point), None
                 refused[:] = False
@@ -356,7 +360,7 @@ class MapEstimator:
             usual = np.median(of_kind[of_kind > 0.0]) if of_kind.any() else 0.0
             wild[:, kind] = of_kind > GATE * max(1.0, usual / MEDIAN_CHI2_3)
         refused = refused[:, :squares.shape[1]]
-        few = np.count_nonzero(refused | wild) <= self.MAX_REJECTED * self.count
+        few = np.count_nonzero(refused | wild) <= self.MAX_REJECTED * self.measured
         if few:
             refused |= wild
         return bool(few and wild.any())
@@ -369,15 +373,15 @@ class MapEstimator:
         gate = old.P if old is not None and resolved and self.gated else None
         here, before = self.estimate(), self.prior.mean
         starts = [here] if old is not None or self.prior.information[0, 0] > 0 else []
-        enough = self.count >= self.FIRST_FIT
+        enough = self.measured >= self.FIRST_FIT
         if enough and not resolved:
             starts.append(replace(here, C=self._rough_attitude(here)))
         elif (enough and old is not None and old.chi2 > self.DOUBTFUL * max(old.dof, 1)
                 and self.count >= self.AFRESH_GROWTH * self._last_afresh):
             self._last_afresh = self.count
             delays = self.OTHER_DELAYS if DELAY.start in self.columns else (0.0,)
-            for other in (replace(before, delay=before.delay + delay) for delay in delays):
-                starts.append(replace(other, C=self._rough_attitude(other)))
+            rough = replace(before, C=self._rough_attitude(before))
+            starts += [replace(rough, delay=before.delay + delay) for delay in delays]
         fits = []
         for start in starts:
             refused = self._refused[:self.count].copy()
@@ -451,8 +455,7 @@ class MapEstimator:
             lever = (cross(point.sensors.rate(interval.omega), point.lever_b) if kind == 0
                      else point.lever_b)
             integral = chain.v if kind == 0 else chain.p
-            a = (integral + (chain.R @ np.broadcast_to(
-                lever, integral.shape)[..., None])[..., 0])[use]
+            a = (integral + apply(chain.R, lever))[use]
             both = np.hstack([gnss.s[use, rows], a])
             basis = np.vander(gnss.time[use], 1 + kind)
             both = both - basis @ np.linalg.lstsq(basis, both, rcond=None)[0]
@@ -473,8 +476,7 @@ class MapEstimator:
                                           else grown and not self.converged):
             self._fit()
 
-    def fitted_afresh(self, prior: Prior, intervals: Intervals,
-                      estimate_lever_arm: bool = False) -> Solution:
+    def fitted_afresh(self, prior: Prior, intervals: Intervals) -> Solution:
         """
         Fit the stored epochs once more, with another prior and other intervals; nothing changes.
 
@@ -486,24 +488,47 @@ class MapEstimator:
             Another one.
         intervals : Intervals
             Integrated with sensor errors of zero.
-        estimate_lever_arm : bool
-            Whether the lever arm is an unknown even where it is none here.
 
         """
         other = MapEstimator(prior, use_position=self.size == 9,
-                             estimate_lever_arm=(estimate_lever_arm
-                                                 or LEVER_ARM.start in self.columns),
+                             estimate_lever_arm=LEVER_ARM.start in self.columns,
                              estimate_delay=DELAY.start in self.columns,
                              estimate_matrices=GYRO_MATRIX.start in self.columns,
                              capacity=self.count, noise=self.noise,
                              rate_random_walk=self._rate_random_walk)
         other._intervals, other._gnss = intervals, self._gnss.take(slice(0, self.count))
-        other.count = self.count
+        other.count, other.measured = self.count, self.measured
         other.gated = False
         other._fit()
         other._fit()
         assert other.solution is not None
         return other.solution
+
+    def loosened(self, free: Iterable[tuple[slice, float]]) -> Solution:
+        """
+        Solve once more, linearised where it is, for unknowns that are less known; nothing changes.
+
+        Parameters
+        ----------
+        free : iterable of (slice, float)
+            Blocks of the 37 unknowns, which need not be among those that are estimated, and by how
+            much they may be off beside what is known of them, 1 sigma.
+
+        Raises
+        ------
+        RuntimeError
+            Before the first solution.
+
+        """
+        if self.solution is None:
+            raise RuntimeError('no solution yet')
+        prior, columns = self.prior, self.columns
+        for block, std in free:
+            prior, columns = prior.loosened(block, std), np.union1d(columns, np.r_[block])
+        other = Solution(self.solution.point, prior, columns, self.size, self.noise,
+                         self._rate_random_walk)
+        self._run(other, None, self._refused[:self.count])
+        return other
 
     def raw_intervals(self) -> Intervals:
         """Return the stored intervals as they would be with sensor errors of zero."""

@@ -36,6 +36,9 @@ import numpy as np
 # A step this many times the usual one holds lost samples; what the motion can do meanwhile
 # (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
 GAP_STEPS = 2.5
+# Samples come in bunches, stamped on arrival, where the usual step is so much shorter than the
+# longest but for one in twenty: then those are the usual pauses.
+BUNCHED, PAUSES = 0.2, 0.95
 GAP_ANGULAR_ACCELERATION, GAP_JERK = 2.0, 20.0
 # Standard deviation of stamps over the median of what the steps between them deviate.
 JITTER_OF_MEDIAN = 1.4826 / math.sqrt(2)
@@ -124,7 +127,7 @@ class ImuCutter:
         return self.cut([stamp_ns], [0.0])[0]
 
     def cut(self, epochs_ns: list[int],
-            gravity_drift: list[float]) -> tuple[ImuSteps, list[tuple[float, int]]]:
+            gravity_drift: list[float]) -> tuple[ImuSteps, list[tuple[float, int, float]]]:
         """
         Return the steps up to each epoch since the one before.
 
@@ -138,8 +141,8 @@ class ImuCutter:
         Returns
         -------
         ImuSteps
-        list of (float, int)
-            Sum and number of the magnitudes of the specific force before each epoch.
+        list of (float, int, float)
+            Sum and number of the magnitudes of the specific force before each epoch, and seconds.
 
         """
         stamps = self._buffer.stamps
@@ -156,7 +159,8 @@ class ImuCutter:
         excess = self._excess(stamps, samples, first, ends[1:])
         gap, jitter = self._of_stamps(stamps, first, ends[1:], steps.dt)
         beyond = self._beyond_range(stamps, ends_ns, steps.dt)
-        by_force = self._g_sensitivity.noise(np.diff(ends_ns) * 1e-9, recent)
+        seconds = np.diff(ends_ns) * 1e-9
+        by_force = self._g_sensitivity.noise(seconds, recent)
         noise = Noise(
             _together(self._stated[0], by_force, GAP_ANGULAR_ACCELERATION * gap,
                       jitter * _rms(steps.omega_dot), beyond[0]),
@@ -165,7 +169,7 @@ class ImuCutter:
             excess[:, :1], excess[:, 1:])
         magnitudes = np.sqrt(np.sum(np.square(accel), axis=1))
         sums = np.diff(np.concatenate([[0.0], np.cumsum(magnitudes)])[ends - 2])
-        forces = list(zip(sums.tolist(), np.diff(ends).tolist()))
+        forces = list(zip(sums.tolist(), np.diff(ends).tolist(), seconds.tolist()))
         self._upto_ns = self._buffer.used_ns = epochs_ns[-1]
         self.forget_before(self._upto_ns)
         return ImuSteps(steps, noise, recent), forces
@@ -185,9 +189,8 @@ class ImuCutter:
         it does to a sample whose stamp jitters: its change per second. Densities then.
         """
         between = np.diff(stamps) * 1e-9
-        usual = np.array([_median(between[i:j - 1]) for i, j in zip(first, last)])[:, None]
-        jitter = np.array([_median(np.abs(between[i:j - 1] - median))
-                           for i, j, median in zip(first, last, usual)])[:, None]
+        usual, jitter = np.array([_usual_step(between[i:j - 1]) for i, j in zip(first, last)]).T
+        usual, jitter = usual[:, None], jitter[:, None]
         gap = np.where(dt > GAP_STEPS * usual, dt, 0.0)
         self._counts['imu_gap'] += int(np.count_nonzero(gap))
         # An error of acceleration * dt^2 over the step, as a density: squared, over dt.
@@ -217,7 +220,11 @@ def _rms(slope: Array) -> Array:
     return np.sqrt(np.mean(np.square(slope[:, 1:]), axis=2))
 
 
-def _median(values: Array) -> float:
-    """Upper median."""
-    half = values.size // 2
-    return float(np.partition(values, half)[half])
+def _usual_step(steps: Array) -> tuple[float, float]:
+    """Return the usual step, of bunches their pause, and the median of what steps deviate."""
+    half, rare = steps.size // 2, int(PAUSES * steps.size)
+    ordered = np.partition(steps, (half, rare))
+    usual, pause = float(ordered[half]), float(ordered[rare])
+    if usual < BUNCHED * pause:
+        return pause, 0.3 * pause                # as much as evenly spread over it
+    return usual, float(np.partition(np.abs(steps - usual), half)[half])

@@ -58,6 +58,7 @@ class Velocity(NamedTuple):
     stamp_ns: int
     velocity: np.ndarray  # (3,), ENU, m/s
     covariance: np.ndarray | None  # (3, 3), ENU, m^2/s^2; None: not known
+    vertical: bool = True  # whether it is measured
 
 
 def stamp_from_msg(msg: Any) -> int:

@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import math
 from typing import Protocol
 
+from ins_align.antenna import AntennaEpoch
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimator import FIRST_NOISE, Innovation, MapEstimator, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
@@ -30,8 +31,9 @@ from ins_align.handover import prior_from_now, prior_without_attitude
 from ins_align.imu_steps import ImuSteps
 from ins_align.preintegration import Noise, preintegrate, SensorErrors
 from ins_align.rotation import Array, orthonormalized
-from ins_align.signs import LeverArmCheck, SignCheck, TOLD_STD
+from ins_align.signs import SignCheck
 from ins_align.solution import NoiseLevels
+from ins_align.told import ToldCheck
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
                                 Prior, SIZE, UNIFORM_ANGLE_STD, Unknowns)
 from ins_align.whitening import Measurements
@@ -41,38 +43,12 @@ import numpy as np
 WANDER, WANDER_TIME = 0.3, 100.0
 # After t0 has moved, the fit so far counts like this many rows.
 PAST_DOF = 300
+# Beside velocities positions gain little and hurt when their errors wander: where a method may
+# choose, it takes them when no velocity came for this long (ns).
+VELOCITY_STOPPED_NS = 10_000_000_000
 # Epochs that are integrated at one go: few right after the linearisation point has moved, because
 # then it will soon again.
 MAX_AHEAD = 64
-
-
-@dataclass(frozen=True)
-class AntennaEpoch:
-    """
-    Where the antenna is and how it moves at a GNSS epoch, as a method takes it.
-
-    Attributes
-    ----------
-    stamp_ns : int
-    latitude, longitude, altitude : float
-        Of the antenna, radians and metres; always there.
-    v_n : ndarray, shape (3,), or None
-        Antenna velocity, ENU, m/s.
-    velocity_covariance, position_covariance : ndarray, shape (3, 3)
-        ENU.
-    position_measured : bool
-        Whether the position is a measurement to align with.
-
-    """
-
-    stamp_ns: int
-    latitude: float
-    longitude: float
-    altitude: float
-    v_n: Array | None
-    velocity_covariance: Array
-    position_measured: bool
-    position_covariance: Array
 
 
 @dataclass(frozen=True)
@@ -85,10 +61,12 @@ class Fit:
     converged: bool
     rejected_velocity: int
     rejected_position: int
+    rejected: int               # epochs with any of these
     offered: int                # epochs that were offered to the model, rejected ones included
     delay: float                # of the GNSS, seconds; the told one where none is estimated
     # Variances of velocities and positions over the stated ones.
     gnss_noise: tuple[float, float] = (1.0, 1.0)
+    objection: str = ''         # what the data say against what is told, in words
 
     @property
     def factor(self) -> float:
@@ -105,7 +83,7 @@ class Fit:
 
 def _no_fit(offered: int, delay: float) -> Fit:
     """Return what is known before there is a solution."""
-    return Fit(math.nan, 0, NOTHING_NEW, False, 0, 0, offered, delay)
+    return Fit(math.nan, 0, NOTHING_NEW, False, 0, 0, 0, offered, delay)
 
 
 @dataclass(frozen=True)
@@ -150,7 +128,7 @@ class Method(Protocol):
         """Hear whether the data contradict the model, and whether the attitude is good enough."""
 
     def unconfirmed(self) -> str:
-        """Return what the data say against signs or lever arm, or do not say for them yet."""
+        """Return what speaks against a heading: of signs, or of what is told for certain."""
 
     def nuisance(self) -> Nuisance:
         """Return biases, lever arm and delay."""
@@ -186,6 +164,7 @@ class MapMethod:
         """Start at t0."""
         self._config = config
         self._use_position = use_position
+        self._velocity_ns = epoch.stamp_ns      # the last one
         self._capacity = capacity
         self.moved = 0
         noise = config.imu_noise
@@ -199,10 +178,10 @@ class MapMethod:
             config.lever_arm_std, 0.0, config.gnss_delay_std, noise.gyro_scale_std,
             _force_at_rest(imu))
         self._signs = SignCheck()
-        self._lever_arm = LeverArmCheck()
+        self._told = ToldCheck(config)
         self._ahead = 1
         self._offered = 0
-        self._rejected = [0, 0]
+        self._rejected = [0, 0, 0]          # velocities, positions, epochs before t0
         self._past = 0.0, 0
         self._innovation = NOTHING_NEW
         self._start(epoch, prior or self._first_prior)
@@ -270,8 +249,8 @@ class MapMethod:
             np.array([epoch.stamp_ns - self.t0_ns for epoch in epochs]) * 1e-9,
             *(np.array([getattr(epoch, name) for epoch in epochs])
               for name in ('latitude', 'longitude', 'altitude')))
-        present = np.array([[epoch.v_n is not None,
-                             epoch.position_measured and self._use_position]
+        use_position = self._use_position
+        present = np.array([[epoch.v_n is not None, epoch.position_measured and use_position]
                             for epoch in epochs])
         v_n = np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n for epoch in epochs])
         covariance = np.array([[epoch.velocity_covariance, epoch.position_covariance]
@@ -285,7 +264,19 @@ class MapMethod:
             self._track, self._last_epoch = track.at(k), epochs[k]
             self._last_imu = imu.take(slice(k, k + 1))
             self._offered += bool(present[k].any())
+            self._look_for_velocity(epochs[k])
             yield epochs[k]
+            if self._use_position != use_position:
+                return                              # the next ones have positions too
+
+    def _look_for_velocity(self, epoch: AntennaEpoch) -> None:
+        """Go on with positions from a later t0 where velocities have stopped."""
+        if epoch.v_n is not None:
+            self._velocity_ns = epoch.stamp_ns
+        elif (self._config.use_position == 'auto' and epoch.position_measured
+              and epoch.stamp_ns - self._velocity_ns > VELOCITY_STOPPED_NS):
+            self._use_position = True
+            self._renewed |= self._estimator.size == 6 and self._estimator.solution is not None
 
     def _move_start(self) -> None:
         """Move t0 to the last epoch; what was learnt becomes the prior."""
@@ -298,9 +289,9 @@ class MapMethod:
             prior = prior_from_now(self._estimator, track.C_n0n, -track.still_v, -track.s_p,
                                    fit.significant_scale, self._wander * track.time)
             self._past = PAST_DOF * fit.chi2 / max(fit.dof, 1), PAST_DOF
-        self._rejected = [fit.rejected_velocity, fit.rejected_position]
+        self._rejected = [fit.rejected_velocity, fit.rejected_position, fit.rejected]
         self._signs.restart()
-        self._lever_arm.restart()
+        self._told.restart()
         self.moved += 1
         start = replace(self._last_epoch, v_n=None, position_measured=False)
         self._start(start, prior, self._estimator.noise)
@@ -328,23 +319,23 @@ class MapMethod:
         solution = self._estimator.solution
         if solution is None:
             return _no_fit(self._offered, self._config.gnss_delay)
-        rejected = solution.rejected
+        self._told.ask(self._estimator)
+        velocities, positions, epochs = (before + since for before, since in zip(
+            self._rejected, (*solution.rejected, solution.rejected_epochs)))
         past_chi2, past_dof = self._past
         return Fit(past_chi2 + solution.chi2, past_dof + solution.dof, self._innovation,
-                   self._estimator.converged,
-                   self._rejected[0] + rejected[0], self._rejected[1] + rejected[1],
-                   self._offered, self._delay(solution.estimate), self._estimator.noise.gnss)
+                   self._estimator.converged, velocities, positions, epochs, self._offered,
+                   self._delay(solution.estimate), self._estimator.noise.gnss,
+                   self._told.objection)
 
     def settle(self) -> None:
         """Relinearise now if that is worth it at all."""
         self._estimator.settle()
 
     def unconfirmed(self) -> str:
-        """Return what the data say against signs or lever arm, or do not say for them yet."""
-        doubt = '' if self._config.trust_imu_axes else self._signs.doubt(self._estimator)
-        if not doubt and self._config.lever_arm_std < TOLD_STD:
-            doubt = self._lever_arm.doubt(self._estimator)
-        return doubt
+        """Return what speaks against a heading: of signs, or of what is told for certain."""
+        signs = '' if self._config.trust_imu_axes else self._signs.doubt(self._estimator)
+        return signs or self._told.unconfirmed
 
     def nuisance(self) -> Nuisance:
         """Return biases, lever arm and delay."""
@@ -371,6 +362,11 @@ class MapMethod:
         return None if self._lost else prior_without_attitude(self._estimator)
 
 
+def _mean_variance(covariance: Array) -> float:
+    """Mean of the three axes' variances."""
+    return float(np.trace(covariance)) / 3
+
+
 def _force_at_rest(imu: ImuSteps) -> Array:
     """Specific force of a vehicle that stands as it did at t0, about, shape (3,)."""
     force = imu.steps.f[0, -1] if imu.recent is None else imu.recent.gained[0, -1]
@@ -381,8 +377,9 @@ class NoteMethod:
     """
     The note's velocity (``vif``) or position (``pif``) integration formula with lever arm.
 
-    Sensor biases are not known to it. Its sigma comes from the centred moments and the residuals.
-    ``pif`` takes positions where no velocity comes; the start velocity is then always free.
+    Errors of the IMU are not known to it: its sigma comes from the centred moments, the noise of
+    the receiver and the residuals. ``pif`` takes positions where no velocity comes; the start
+    velocity is then always free.
 
     Parameters
     ----------
@@ -409,7 +406,6 @@ class NoteMethod:
         self._body = BodyIntegrals(self._lever_b, imu.steps.omega[0, -1])
         place = epoch.latitude, epoch.longitude, epoch.altitude
         self._track = InertialTrack.start(*place)
-        self._start_place = place
         self._navigation: NavigationIntegrals | None = None
         if epoch.v_n is not None:
             self._navigation = NavigationIntegrals(*place, epoch.v_n)
@@ -421,7 +417,9 @@ class NoteMethod:
         self._moments = AttitudeMoments(nuisance)
         self._nuisance = nuisance
         self._offered = 0
-        self._variance = 0.0
+        self._variance = 0.0                # of what the receiver says, summed over pairs
+        self._start_variance = _mean_variance(epoch.position_covariance if self._from_positions
+                                              else epoch.velocity_covariance)
         self._solution: tuple[Array, Array] | None = None
         self._residual = 0.0
         if self._free or self._from_positions:
@@ -449,7 +447,7 @@ class NoteMethod:
             regressors = (1.0, time) if self._free else (time,)
             first = 0.0 if self._free else 1.0
             self._moments.add(self._track.s_p, body.a_p - first * self._lever_b, regressors)
-            self._variance += float(np.trace(epoch.position_covariance)) / 3
+            self._variance += _mean_variance(epoch.position_covariance)
         elif epoch.v_n is not None and self._navigation is not None:
             navigation = self._navigation
             if self._position_form:
@@ -461,7 +459,7 @@ class NoteMethod:
                 self._moments.add(navigation.s_v, body.a_v, (1.0,))
             else:
                 self._moments.add(navigation.beta_v, body.alpha_v)
-            self._variance += float(np.trace(epoch.velocity_covariance)) / 3
+            self._variance += _mean_variance(epoch.velocity_covariance)
         else:
             return
         self._offered += 1
@@ -471,9 +469,22 @@ class NoteMethod:
         A_n = C @ A @ C.T
         information = np.trace(A_n) * np.eye(3) - A_n
         self._residual = residual
-        variance = self._variance / self._offered
-        self._solution = C, np.linalg.inv(information / variance
+        white, common = self._noise()
+        # What is common to all pairs does not average out.
+        self._solution = C, np.linalg.inv(information / (white + self._moments.count * common)
                                           + np.eye(3) / UNIFORM_ANGLE_STD ** 2)
+
+    def _noise(self) -> tuple[float, float]:
+        """Return the variance of a pair that is white, and that which all pairs have together."""
+        variance = self._variance / self._offered
+        start = 0.0 if self._free else self._start_variance
+        if not self._position_form or self._from_positions:
+            return variance, start
+        # Integrated velocities walk at random; a free start takes out all but 1/15 of it, and what
+        # the first one is off grows with time.
+        time = float(self._track.time)
+        walk = variance * time / self._offered * time
+        return 0.0, walk / 15 if self._free else walk / 2 + start * time ** 2 / 3
 
     def initial(self) -> tuple[Array, Array] | None:
         """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
@@ -492,9 +503,8 @@ class NoteMethod:
         dof = 3 * self._moments.count - 3 - 3 * self._nuisance
         if self._solution is None or dof <= 0:
             return _no_fit(self._offered, self._config.gnss_delay)
-        variance = self._variance / self._offered
-        return Fit(self._residual / variance, dof, NOTHING_NEW, True, 0, 0, self._offered,
-                   self._config.gnss_delay)
+        return Fit(self._residual / sum(self._noise()), dof, NOTHING_NEW, True, 0, 0, 0,
+                   self._offered, self._config.gnss_delay)
 
     def settle(self) -> None:
         """Nothing to bring: the estimate is closed form."""

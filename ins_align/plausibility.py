@@ -20,9 +20,10 @@ from ins_align.earth import Place, way
 from ins_align.rotation import Array, Index
 import numpy as np
 
-# The specific force averages gravity unless the vehicle falls or its units are wrong (m/s^2).
-FORCE_RANGE = 4.0, 30.0
-FORCE_SAMPLES = 500
+# The specific force averages gravity, over this time (s) and so many samples, unless the vehicle
+# falls, flies loops (up to 6 g) or its units are wrong (m/s^2).
+FORCE_RANGE = 4.0, 60.0
+FORCE_TIME, FORCE_SAMPLES = 5.0, 20
 # Distance over which velocity and position are compared: at least this, and so many sigmas.
 MIN_DISTANCE = 10.0
 DISTANCE_SIGMAS = 8.0
@@ -213,18 +214,19 @@ class ForceCheck:
 
     def __init__(self) -> None:
         """Start with no samples."""
-        self._sum = 0.0
+        self._sum = self._seconds = 0.0
         self._count = 0
         self.fault = ''
 
-    def add(self, total: float, count: int) -> None:
-        """Take the sum of so many magnitudes."""
+    def add(self, total: float, count: int, seconds: float) -> None:
+        """Take the sum of so many magnitudes in so many seconds."""
         self._sum += total
         self._count += count
-        if self._count < FORCE_SAMPLES:
+        self._seconds += seconds
+        if self._seconds < FORCE_TIME or self._count < FORCE_SAMPLES:
             return
         mean = self._sum / self._count
-        self._sum, self._count = 0.0, 0
+        self._sum, self._count, self._seconds = 0.0, 0, 0.0
         self.fault = '' if FORCE_RANGE[0] < mean < FORCE_RANGE[1] else (
             f'the specific force averages {mean:.3g} m/s^2, gravity is 9.8: check the unit (g?) '
             'and that gravity is not taken out')
@@ -273,9 +275,11 @@ class VelocityCheck:
             return
         bad = math.hypot(moved_e - went_e, moved_n - went_n) > tolerance
         as_ned = math.hypot(moved_e - went_n, moved_n - went_e) < tolerance
-        self.bad_in_a_row = self.bad_in_a_row + 1 if bad else 0
-        self._as_ned_in_a_row = self._as_ned_in_a_row + 1 if bad and as_ned else 0
         self._origin = None                   # the next journey begins here
+        if as_ned and not bad:
+            return                            # to north-east both frames say the same
+        self.bad_in_a_row = self.bad_in_a_row + 1 if bad else 0
+        self._as_ned_in_a_row = self._as_ned_in_a_row + 1 if as_ned else 0
 
     @property
     def fault(self) -> str:

@@ -52,11 +52,14 @@ class Prediction:
         Of the gyroscopes, rad/sqrt(s).
     rate_variance : float
         What else may be wrong with the rate, steadily, (rad/s)^2.
+    rate : three floats
+        As measured at the epoch, rad/s.
 
     """
 
     def __init__(self, stamp_ns: int, C_nb: Array, covariance: Array, gyro_bias: Array,
-                 gyro_matrix: Array, angle_random_walk: float, rate_variance: float) -> None:
+                 gyro_matrix: Array, angle_random_walk: float, rate_variance: float,
+                 rate: Sequence[float]) -> None:
         """Stand at the epoch."""
         self.stamp_ns = stamp_ns
         x, y, z, w = quaternion_from_matrix(C_nb).tolist()
@@ -65,12 +68,13 @@ class Prediction:
         self._bias = tuple(np.asarray(gyro_bias, float).tolist())
         self._matrix = (np.eye(3) - gyro_matrix).tolist()
         self._epoch_ns = stamp_ns
+        self._rate = tuple(rate)            # as measured last
         self._white_variance = angle_random_walk ** 2
         self._rate_variance = rate_variance
 
     def carry(self, stamp_ns: int, gyro: Sequence[float]) -> bool:
         """
-        Carry on to one sample, with its rate for all of the time since the last one.
+        Carry on to one sample, with the mean of its rate and that of the last one.
 
         Parameters
         ----------
@@ -91,6 +95,9 @@ class Prediction:
                 abs(x) < MAX_RATE and abs(y) < MAX_RATE and abs(z) < MAX_RATE):
             return False
         dt = (stamp_ns - self.stamp_ns) * 1e-9
+        last_x, last_y, last_z = self._rate
+        self._rate = x, y, z
+        x, y, z = 0.5 * (last_x + x), 0.5 * (last_y + y), 0.5 * (last_z + z)
         (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._matrix
         bias_x, bias_y, bias_z = self._bias
         x, y, z = ((xx * x + xy * y + xz * z - bias_x) * dt,
@@ -112,7 +119,10 @@ class Prediction:
         if stamps_ns.size == 0:
             return
         dt = np.diff(stamps_ns, prepend=self.stamp_ns) * 1e-9
-        turns = (apply(np.array(self._matrix), gyro) - self._bias) * dt[:, None]
+        rates = np.vstack([self._rate, gyro])
+        self._rate = tuple(rates[-1].tolist())
+        rates = 0.5 * (rates[:-1] + rates[1:])
+        turns = (apply(np.array(self._matrix), rates) - self._bias) * dt[:, None]
         half = 0.5 * np.sqrt(np.einsum('ij,ij->i', turns, turns))
         # numpy's sinc is that of pi x.
         steps = np.column_stack([0.5 * turns * np.sinc(half / np.pi)[:, None], np.cos(half)])

@@ -15,8 +15,8 @@
 From IMU samples to intervals between GNSS epochs.
 
 ROS gives angular rate and specific force at instants, with jitter and gaps. Between neighbouring
-samples both are taken as linear in time; a GNSS stamp inside a sampling step splits it by
-interpolation. All samples of an interval, and all intervals of a batch, are handled as arrays.
+samples both are taken as cubics in time; a GNSS stamp inside a step splits it there. All samples
+of an interval, and all intervals of a batch, are handled as arrays.
 """
 
 from dataclasses import dataclass, fields
@@ -29,6 +29,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 
+# Neighbouring steps whose lengths differ by more than this share are taken as one to the slope.
+UNEVEN = 0.1
 # So many steps of the IMU are one to the derivatives.
 DERIVATIVE_STEPS = 4
 
@@ -280,7 +282,10 @@ def _slopes(samples: Array, spacing: Array) -> Array:
     """Central differences at uneven spacing, one-sided at both ends."""
     rise = np.diff(samples, axis=0) / spacing[:, None]
     before, after = spacing[:-1, None], spacing[1:, None]
-    inner = (after * rise[:-1] + before * rise[1:]) / (before + after)
+    # Where one of two steps is much the shorter, its noise would make the slope.
+    uneven = np.minimum(before, after) < UNEVEN * np.maximum(before, after)
+    near, far = np.where(uneven, before, after), np.where(uneven, after, before)
+    inner = (near * rise[:-1] + far * rise[1:]) / (before + after)
     return np.concatenate([rise[:1], inner, rise[-1:]])
 
 

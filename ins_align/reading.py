@@ -80,7 +80,8 @@ def read(request: Request) -> Iterator[Part]:
     Raises
     ------
     BagError
-        If the recording cannot be read or lacks a topic.
+        If the recording cannot be read or lacks a topic, or if a part was asked for that holds no
+        message of these topics.
 
     """
     with Bag(request.path) as bag:
@@ -102,15 +103,29 @@ def read(request: Request) -> Iterator[Part]:
         if stop_ns is not None:
             end_ns = min(end_ns, stop_ns)
         done = 0.0
+        empty = request.start is not None or request.duration is not None
         try:
             for block in bag.blocks(wanted, start_ns, stop_ns):
                 if end_ns > start_ns:
                     done = min(max((block.times_ns[-1] - start_ns) / (end_ns - start_ns), 0.0),
                                1.0)
                 yield _decoded(block, wanted, topics, config, done, tuple(bag.warnings))
+                empty = False
         except OSError as error:
             raise BagError(f'{request.path} cannot be read: {error.strerror}') from None
+        if empty:
+            raise BagError(f'{request.path} has no IMU or GNSS messages {_part(request, bag)}')
         yield _decoded(Block((), (), ()), wanted, topics, config, 1.0, tuple(bag.warnings))
+
+
+def _part(request: Request, bag: Bag) -> str:
+    """Say which part of a recording was asked for, and how long all of it is."""
+    start = request.start or 0.0
+    part = (f'after {start:g} s' if request.duration is None
+            else f'between {start:g} s and {start + request.duration:g} s')
+    if bag.start_ns is None or bag.end_ns is None:
+        return part
+    return f'{part}: it is {(bag.end_ns - bag.start_ns) * 1e-9:.1f} s long'
 
 
 def _decoded(block: Block, wanted: Sequence[Topic], topics: Topics, config: Config, done: float,

@@ -15,18 +15,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 import io
 import math
 import os
-from typing import Any
+from typing import Any, NamedTuple
 
-from ins_align.aligner import Aligner
+from ins_align.ahead import run_ahead
+from ins_align.alignment import Alignment
 from ins_align.bags import Topics
 from ins_align.config import Config
 from ins_align.declaration import State
-from ins_align.decoding import ImuSamples, Orientations
+from ins_align.decoding import Orientations
+from ins_align.intake import Intake, Step
 from ins_align.messages import Fix
 from ins_align.reading import Part, read, Request
 from ins_align.results import Attitude, Epoch, Status
@@ -169,7 +172,8 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
            imu_topic: str | None = None, fix_topic: str | None = None,
            velocity_topic: str | None = None,
            start: float | None = None, duration: float | None = None,
-           progress: Callable[[float], None] | None = None) -> ReplayResult:
+           progress: Callable[[float], None] | None = None,
+           read_ahead: bool = False) -> ReplayResult:
     """
     Align a recording.
 
@@ -185,6 +189,8 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
         Part of the recording, seconds from its start, by recorded time.
     progress : callable, optional
         Called with how much has been read, 0 to 1.
+    read_ahead : bool
+        Let another process read and prepare: the same result in less time.
 
     Returns
     -------
@@ -193,19 +199,70 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
     Raises
     ------
     BagError
-        If the recording cannot be read or lacks a topic.
+        If the recording cannot be read, lacks a topic, or has no messages in the part asked for.
+    ProcessDied
+        If the other process is killed.
 
     """
     request = Request(path, config or Config(), imu_topic, fix_topic, velocity_topic, start,
                       duration)
     run: _Run | None = None
-    for part in read(request):
+    for part in run_ahead(_prepared, request) if read_ahead else _prepared(request):
         run = run or _Run(str(path), part.config, part.topics)
         run.feed(part)
         if progress is not None:
             progress(part.done)
     assert run is not None
-    return run.result(part.warnings)
+    return run.result(part)
+
+
+class _Prepared(NamedTuple):
+    """What an alignment takes of consecutive messages of a recording."""
+
+    topics: Topics
+    config: Config
+    steps: list[Step]
+    fixes: list[tuple[int, float, float]]  # stamp, latitude, longitude, degrees
+    orientations: Orientations
+    counts: Counter[str]  # of all messages so far
+    done: float  # how much of the recording this ends at, 0 to 1
+    warnings: tuple[str, ...]  # so far
+
+
+def _prepared(request: Request) -> Iterator[_Prepared]:
+    """Read a recording and prepare it; the last part has all counts and warnings."""
+    intake: Intake | None = None
+    for part in read(request):
+        intake = intake or Intake(part.config)
+        _feed(intake, part)
+        fixes = [(message.stamp_ns, message.latitude_deg, message.longitude_deg)
+                 for _, message in part.gnss if isinstance(message, Fix)]
+        intake.prepare()
+        yield _Prepared(part.topics, part.config, intake.take_steps(), fixes, part.orientations,
+                        Counter(intake.counts), part.done, part.warnings)
+    assert intake is not None
+    intake.prepare(last=True)
+    yield _Prepared(part.topics, part.config, intake.take_steps(), [], part.orientations,
+                    Counter(intake.counts), part.done, part.warnings)
+
+
+def _feed(intake: Intake, part: Part) -> None:
+    """Give an intake the messages in the order in which they were recorded."""
+    imu = part.imu
+    for _ in range(np.count_nonzero(~imu.decoded)):
+        intake.reject('imu_undecodable')
+    position = 0
+    for before, message in (*part.gnss, (len(imu.stamps_ns), None)):
+        if before > position:
+            between = slice(position, before)
+            intake.add_imu_array(imu.stamps_ns[between], imu.gyro[between], imu.accel[between])
+            position = before
+        if isinstance(message, str):
+            intake.reject(message)
+        elif isinstance(message, Fix):
+            intake.add_fix(message)
+        elif message is not None:
+            intake.add_velocity(message)
 
 
 class _Run:
@@ -213,47 +270,28 @@ class _Run:
 
     def __init__(self, path: str, config: Config, topics: Topics) -> None:
         self._path, self._config, self._topics = path, config, topics
-        self._aligner = Aligner(config)
+        self._alignment = Alignment(config)
         self._epochs: list[Epoch] = []
         self._reference: Reference | None = None
         self._fixes: list[tuple[int, float, float]] = []
 
-    def feed(self, part: Part) -> None:
-        """Give a part to the aligner."""
-        aligner, imu = self._aligner, part.imu
-        for _ in range(np.count_nonzero(~imu.decoded)):
-            aligner.reject('imu_undecodable')
-        position = 0
-        for before, message in part.gnss:
-            self._add_imu(imu, position, before)
-            position = before
-            if isinstance(message, str):
-                aligner.reject(message)
-            elif isinstance(message, Fix):
-                self._fixes.append((message.stamp_ns, message.latitude_deg,
-                                    message.longitude_deg))
-                aligner.add_fix(message)
-            else:
-                aligner.add_velocity(message)
-        self._add_imu(imu, position, len(imu.stamps_ns))
-        self._epochs += aligner.update()
+    def feed(self, part: _Prepared) -> None:
+        """Align with a part."""
+        for step in part.steps:
+            self._epochs += self._alignment.go(step)
+        self._fixes += part.fixes
         if part.orientations.stamps_ns.size:
             self._reference = self._reference or Reference()
             self._reference.add(part.orientations)
 
-    def _add_imu(self, imu: ImuSamples, start: int, end: int) -> None:
-        if end > start:
-            self._aligner.add_imu(imu.stamps_ns[start:end], imu.gyro[start:end],
-                                  imu.accel[start:end])
-
-    def result(self, warnings: tuple[str, ...]) -> ReplayResult:
+    def result(self, last: _Prepared) -> ReplayResult:
         """Return what came of all parts."""
-        self._epochs += self._aligner.flush()
         first_fix_ns = self._fixes[0][0] if self._fixes else 0
         track = np.array([(stamp - first_fix_ns, latitude, longitude)
                           for stamp, latitude, longitude in self._fixes]).reshape(-1, 3)
-        return ReplayResult(self._path, self._aligner.status(), tuple(self._epochs), warnings,
-                            self._reference, self._topics, track, first_fix_ns, self._config)
+        return ReplayResult(self._path, self._alignment.status(last.counts), tuple(self._epochs),
+                            last.warnings, self._reference, self._topics, track, first_fix_ns,
+                            self._config)
 
 
 def _attitude_json(attitude: Attitude | None) -> dict[str, Any] | None:

@@ -11,10 +11,9 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Whether the data show that the signs of the IMU's axes are right, and the told lever arm."""
+"""Whether the data show that the signs of the IMU's axes are right, and when to ask them."""
 
 from ins_align.estimator import MapEstimator
-from ins_align.rotation import Array
 
 # What is in doubt is judged again when the data have grown by the first share, and by the second
 # beyond so many epochs; signs are confirmed when every other choice has so much more chi-square.
@@ -27,21 +26,26 @@ WRONG = {
     (-1, 1): 'the angular rates reversed',
     (-1, -1): 'one IMU axis reversed (left-handed axes?)',
 }
-# A lever arm that is told to be known better than this (m) is in doubt when one that is free has
-# so much less chi-square: three unknowns, one in 100 000 by chance.
-TOLD_STD, LEVER_GAIN = 0.3, 26.0
 
 
-class _Occasions:
-    """When to judge again: not at every epoch, for it takes fits of all that is stored."""
+class Occasions:
+    """
+    When to judge again: not at every epoch, for it takes fits of all that is stored.
 
-    def __init__(self) -> None:
-        """Judge at the next question."""
-        self._next = 0.0
+    Parameters
+    ----------
+    first : int
+        Epochs that the first judgement waits for.
+
+    """
+
+    def __init__(self, first: int = 0) -> None:
+        """Nothing was judged yet."""
+        self._next = float(first)
 
     def come(self, estimator: MapEstimator) -> bool:
         """Whether it is time, and if so, set the next one."""
-        if estimator.count < max(self._next, estimator.FIRST_FIT):
+        if estimator.measured < estimator.FIRST_FIT or estimator.count < self._next:
             return False
         self._next = estimator.count * (1 + GROWTH[estimator.count > SOON])
         return True
@@ -62,7 +66,7 @@ class SignCheck:
 
     def restart(self) -> None:
         """Judge at the next question: the estimator is another one."""
-        self._occasions = _Occasions()
+        self._occasions = Occasions()
 
     def doubt(self, estimator: MapEstimator) -> str:
         """Return why the data do not show yet that the signs are right, or nothing."""
@@ -78,49 +82,6 @@ class SignCheck:
             else:
                 self._doubt = f'the data fit better with {WRONG[rival]}: check the IMU axes'
         return self._doubt
-
-
-class LeverArmCheck:
-    """Asks now and then whether another lever arm than the told one would fit the data better."""
-
-    def __init__(self) -> None:
-        """Start with nothing judged."""
-        self.restart()
-
-    def restart(self) -> None:
-        """Judge at the next question: the estimator is another one."""
-        self._doubt = ''
-        self._occasions = _Occasions()
-
-    def doubt(self, estimator: MapEstimator) -> str:
-        """Return what the data say against the told lever arm, or nothing."""
-        if self._occasions.come(estimator):
-            gain, lever = lever_arm_evidence(estimator)
-            self._doubt = '' if gain < LEVER_GAIN else (
-                'the data fit better with a lever arm of '
-                f'[{", ".join(f"{metres:.2f}" for metres in lever)}] m: check lever_arm (its '
-                'signs, the axes of the IMU), or raise lever_arm_std')
-        return self._doubt
-
-
-def lever_arm_evidence(estimator: MapEstimator) -> tuple[float, Array]:
-    """
-    Fit the stored epochs afresh with the lever arm as told, and with it as good as unknown.
-
-    Returns
-    -------
-    gain : float
-        By how much the chi-square gets less, in units of what is usual.
-    lever_b : ndarray, shape (3,)
-        The lever arm that the data ask for, metres.
-
-    """
-    raw = estimator.raw_intervals()
-    told = estimator.fitted_afresh(estimator.prior, raw)
-    free = estimator.fitted_afresh(estimator.prior.with_free_lever_arm(), raw,
-                                   estimate_lever_arm=True)
-    return ((told.chi2 - free.chi2) / max(1.0, free.chi2 / max(free.dof, 1)),
-            free.estimate.lever_b)
 
 
 def sign_evidence(estimator: MapEstimator) -> dict[tuple[int, int], float]:

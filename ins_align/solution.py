@@ -109,6 +109,8 @@ class Solution:
     whitener : Whitener
     rejected : list of int
         Velocities and positions that were taken for outliers.
+    rejected_epochs : int
+        Epochs with any of these.
     time : float
         Of the last epoch, seconds since t0.
     dx : ndarray, shape (n,)
@@ -145,7 +147,7 @@ class Solution:
         self._gyro = np.flatnonzero((columns >= GYRO.start) & (columns < GYRO.stop))
         self.chain = Chain.start()
         self.whitener = Whitener(columns, size, rate_random_walk > 0)
-        self.rejected = [0, 0]
+        self.rejected, self.rejected_epochs = [0, 0], 0
         self.time = 0.0
         self.dx = np.zeros(columns.size)
         self.P = np.zeros((columns.size, columns.size))
@@ -179,8 +181,10 @@ class Solution:
             nis, _ = gate.test(whitened.innovation, whitened.S)
             if not np.all(nis < GATE * gate_scale):
                 whitened = self.whitener.whitened(rows, wanted, gate, gate_scale)
-        for kind, count in enumerate(np.count_nonzero(present & ~whitened.used, axis=0).tolist()):
+        rejected = present & ~whitened.used
+        for kind, count in enumerate(np.count_nonzero(rejected, axis=0).tolist()):
             self.rejected[kind] += count
+        self.rejected_epochs += int(np.count_nonzero(rejected.any(axis=1)))
         self.move_to(self._course(rows, whitened, slice(-1, None)), 0)
         return whitened
 

@@ -28,8 +28,6 @@ from numpy.typing import ArrayLike
 
 # A heading is never known worse than uniform on the circle.
 UNIFORM_ANGLE_STD = math.pi / math.sqrt(3)
-# Of a lever arm that is not known, metres per axis.
-FREE_LEVER_STD = 2.0
 # Over the error of the gyros' scale factors: their misalignment; scale factors and misalignment of
 # the accelerometers.
 GYRO_MISALIGNMENT, ACCEL_ERRORS = 0.3, 0.3
@@ -46,7 +44,7 @@ class Unknowns:
         Initial attitude ``C_nb(0)``.
     sensors : SensorErrors
     start_velocity, start_position : ndarray, shape (3,)
-        Of the IMU at t0 in n0, relative to the antenna's track (c_v, c_p of method.md).
+        Of the IMU at t0 in n0, relative to the antenna's track (c_v, c_p of docs, "Theory").
     lever_b : ndarray, shape (3,)
         Metres.
     delay : float or, in many at a time, ndarray
@@ -136,13 +134,13 @@ class Prior:
                        start_position=zero)
         return prior_of(mean, covariance * np.outer(sign, sign), unknowns, False)
 
-    def with_free_lever_arm(self) -> 'Prior':
-        """Return what is known but for the lever arm, which is as good as unknown."""
+    def loosened(self, block: slice, std: float) -> 'Prior':
+        """Return what is known if a block of unknowns may be off by `std` besides, 1 sigma."""
         known, of_known = self._known()
-        unknowns = np.union1d(known, np.r_[LEVER_ARM])
+        unknowns = np.union1d(known, np.r_[block])
         covariance = np.zeros((SIZE, SIZE))
         covariance[np.ix_(known, known)] = of_known
-        covariance[LEVER_ARM, LEVER_ARM] += FREE_LEVER_STD ** 2 * np.eye(3)
+        covariance[block, block] += std ** 2 * np.eye(block.stop - block.start)
         return prior_of(self.mean, covariance[np.ix_(unknowns, unknowns)], unknowns,
                         self.heading_free)
 

@@ -73,4 +73,4 @@ def normalised_error(attitude, simulation):
 
 def estimator_of(aligner):
     """Return the estimator inside an aligner: the only place that looks there."""
-    return aligner._method._estimator
+    return aligner._alignment._method._estimator

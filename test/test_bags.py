@@ -23,6 +23,7 @@ from ins_align.bag_files import decompress, ros2_type
 from ins_align.bags import Bag, BagError
 from ins_align.config import Config
 from ins_align.decoding import decode_imu
+import numpy as np
 import pytest
 from recordings import (
     FIX, FORMATS, IMU, make_twist, mcap_record, mcap_string, real_recording, START_NS, TWIST,
@@ -510,7 +511,55 @@ def test_velocity_of_another_type_is_found(tmp_path):
 
 
 @pytest.mark.parametrize('frames, name', [('base_link', '/odom'), ('', '/cmd_vel')])
-def test_velocity_that_is_none_of_an_antenna(tmp_path, frames, name):
+@pytest.mark.parametrize('by_name', [False, True])
+def test_velocity_that_is_none_of_an_antenna(tmp_path, frames, name, by_name):
     with velocity_bag(tmp_path, frames=frames, name=name) as bag:
-        assert bag.choose_topics(Config()).velocity is None
-        assert bag.choose_topics(Config(), velocity=name).velocity.name == name
+        topics = bag.choose_topics(Config(), velocity=name if by_name else None)
+        assert (topics.velocity is None) != by_name
+        if not frames:
+            assert bag.warnings == []
+            return
+        warning, = bag.warnings
+        assert warning.startswith('/odom cannot be used: the velocity is given in the body frame ')
+        assert "'base_link'" in warning
+
+
+def all_types(tmp_path, child='map', names=('/a', '/b', '/c')):
+    """Write a velocity of each type."""
+    store = typestore()
+    types = store.types
+    message = make_twist(store, START_NS, (1.0, 2.0, 3.0))
+    pose = types['geometry_msgs/msg/PoseWithCovariance'](types['geometry_msgs/msg/Pose'](
+        types['geometry_msgs/msg/Point'](0.0, 0.0, 0.0),
+        types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)), np.zeros(36))
+    messages = [message, types[STAMPED](message.header, message.twist.twist),
+                types[ODOMETRY](message.header, child, pose, message.twist)]
+    kinds = dict(zip(names, (TWIST, STAMPED, ODOMETRY)))
+    write_messages(tmp_path / 'a', 'mcap', [(name, START_NS, message) for name, message
+                                            in zip(names, messages)],
+                   {'/imu': IMU, '/fix': FIX, **kinds})
+    return Bag(tmp_path / 'a')
+
+
+@pytest.mark.parametrize('child, names, left', [
+    ('map', ('/a', '/b', '/c'), '/b (TwistStamped), /c (Odometry)'),
+    ('base_link', ('/a', '/b', '/c'), '/b (TwistStamped)'),
+    ('map', ('/a', '/cmd_vel', '/c'), '/c (Odometry)'),
+    ('base_link', ('/a', '/reference/b', '/c'), '')])
+def test_velocities_of_several_types(tmp_path, child, names, left):
+    with all_types(tmp_path, child, names) as bag:
+        assert bag.choose_topics(Config()).velocity.name == '/a'
+        assert bag.warnings == ([f'the velocity is read from /a (TwistWithCovarianceStamped), not '
+                                 f'from {left}: --velocity-topic chooses'] if left else [])
+    with Bag(tmp_path / 'a') as bag:
+        bag.choose_topics(Config(), velocity='/a')
+        bag.choose_topics(Config(use_velocity=False))
+        assert bag.warnings == []
+
+
+def test_odometry_in_the_axes_of_the_vehicle(tmp_path):
+    with all_types(tmp_path, 'base_link') as bag:
+        config = Config(velocity_type='Odometry', use_velocity='auto')
+        with pytest.raises(BagError, match='more than one velocity topic'):
+            bag.choose_topics(config)
+        assert bag.warnings[0].startswith('/c cannot be used: ')

@@ -217,6 +217,14 @@ def test_broken_velocities_are_counted():
     assert buffer.release(10) == [] and counts['velocity_nan'] == 3
 
 
+def test_velocity_without_its_vertical_is_kept():
+    buffer, counts = gnss_buffer()
+    buffer.add_velocity(velocity(5, (1.0, 2.0, np.nan)), None)
+    kept = buffer.release(10, last=True)[0].velocity
+    assert kept.velocity.tolist() == [1.0, 2.0, 0.0] and not kept.vertical
+    assert counts['velocity'] == 1 and counts['velocity_nan'] == 0
+
+
 def test_duplicates_are_counted_and_the_first_is_kept():
     buffer, counts = gnss_buffer()
     buffer.add_fix(fix(5, altitude_m=1.0), None)

@@ -24,7 +24,7 @@ import pytest
 def fit(**changes):
     changes['innovation'] = Innovation(changes.pop('nis', 1.0), np.zeros(3))
     values = {'chi2': 300.0, 'dof': 300, 'converged': True, 'rejected_velocity': 0,
-              'rejected_position': 0, 'offered': 102, 'delay': 0.0}
+              'rejected_position': 0, 'rejected': 0, 'offered': 102, 'delay': 0.0}
     return Fit(**{**values, **changes})
 
 
@@ -116,8 +116,7 @@ def test_no_later_start_while_the_signs_are_in_doubt():
 
 
 @pytest.mark.parametrize('changes, words', [
-    ({'chi2': 3000.0}, 'residuals'), ({'rejected_velocity': 40}, '40 of 102'),
-    ({'rejected_velocity': 20, 'rejected_position': 20}, '40 of 102')])
+    ({'chi2': 3000.0}, 'residuals'), ({'rejected': 40}, '40 of 102')])
 def test_contradicting_data_are_not_declared_and_withdraw(changes, words):
     bad = fit(**changes)
     verdict = judge(Declaration(Config()), 0.0, 10.0, GOOD, bad)
@@ -144,6 +143,37 @@ def test_declared_heading_survives_a_little_more_sigma_and_not_twice_as_much():
     assert judge(declaration, 3.2, 1.0, covariance(0.1, 1.5)).state is State.ALIGNED
     assert judge(declaration, 5.0, 0.0, covariance(0.1, 2.5)).state is State.LEVELLED
     assert judge(declaration, 6.0, 0.0, covariance(0.1, 1.5)).state is State.LEVELLED
+
+
+def test_declared_heading_goes_with_the_tilt():
+    declaration = Declaration(Config(heading_std_threshold=10.0))
+    assert judge(declaration, 0.0, 3.0, GOOD).state is State.ALIGNED
+    tilted = covariance(5.0, 5.0)
+    assert judge(declaration, 3.2, 0.0, tilted).state is State.ALIGNING
+
+
+def test_without_gnss_nothing_is_declared_and_what_gets_lost_is_withdrawn():
+    declaration = Declaration(Config(hold_time=2.0))
+    for silent in (2.0, 4.0, 60.0):
+        verdict = declaration.update_without_gnss(silent, GOOD, GOOD, fit())
+        assert verdict.state is State.ALIGNING and verdict.reason == f'no GNSS for {silent:g} s'
+    assert judge(declaration, 60.2, 3.0, GOOD).state is State.ALIGNED
+    kept = declaration.update_without_gnss(2.0, GOOD, covariance(0.1, 1.9), fit())
+    assert kept.state is State.ALIGNED and 'sigma 1.9' in kept.reason
+    assert 'no GNSS for 2 s' in kept.reason
+    lost = declaration.update_without_gnss(4.0, GOOD, covariance(0.1, 2.1), fit())
+    assert lost.state is State.LEVELLED and 'no GNSS' in lost.reason
+    again = declaration.update_without_gnss(6.0, GOOD, GOOD, fit())
+    assert again.state is State.LEVELLED
+    fallen = declaration.update_without_gnss(8.0, GOOD, covariance(1.1, 2.1), fit())
+    assert fallen.state is State.ALIGNING
+
+
+def test_an_objection_withdraws_and_is_the_reason():
+    declaration = Declaration(Config(hold_time=2.0))
+    assert judge(declaration, 0.0, 3.0, GOOD).state is State.ALIGNED
+    verdict = judge(declaration, 3.2, 0.0, GOOD, fit(objection='another lever arm', nis=99.0))
+    assert verdict.state is State.ALIGNING and verdict.reason == 'another lever arm'
 
 
 def test_not_before_there_is_redundancy():

@@ -161,7 +161,7 @@ def test_handover_gives_the_attitude_of_one_that_never_handed_over(changes, walk
     s = simulated('flight', imu_grade='tactical', duration=30.0, seed=2, position_std=0.5,
                   rate_random_walk=walk * PRESETS['tactical'].gyro_bias_std)
     one = aligned(s, **changes)[0].status()
-    monkeypatch.setattr('ins_align.aligner.MapMethod', partial(MapMethod, capacity=70))
+    monkeypatch.setattr('ins_align.alignment.MapMethod', partial(MapMethod, capacity=70))
     other = aligned(s, **changes)[0].status()
     assert other.counts['rebases'] >= 2 and one.counts['rebases'] == 0
     assert np.allclose(other.current.sigma_deg, one.current.sigma_deg, rtol=0.03)
@@ -178,7 +178,7 @@ def test_handover_feigns_no_information(scenario, monkeypatch):
     """RTK knows the sum of tilt and bias far better than each: a little turn would tell them."""
     s = simulated(scenario, imu_grade='mems', duration=60.0, seed=0, position_std=0.02)
     one = {epoch.stamp_ns: epoch.current for epoch in aligned(s, velocity=False)[1]}
-    monkeypatch.setattr('ins_align.aligner.MapMethod', partial(MapMethod, capacity=50))
+    monkeypatch.setattr('ins_align.alignment.MapMethod', partial(MapMethod, capacity=50))
     aligner, epochs = aligned(s, velocity=False)
     assert aligner.status().counts['rebases'] >= 4
     ratios = [np.sqrt(np.diag(epoch.current.covariance) / np.diag(one[epoch.stamp_ns].covariance))
@@ -189,7 +189,7 @@ def test_handover_feigns_no_information(scenario, monkeypatch):
 
 def test_handover_while_standing_still_keeps_tilt_and_biases(monkeypatch):
     """Standing long must neither spoil the estimate nor delay it."""
-    monkeypatch.setattr('ins_align.aligner.MapMethod', partial(MapMethod, capacity=60))
+    monkeypatch.setattr('ins_align.alignment.MapMethod', partial(MapMethod, capacity=60))
     s = simulated('car', imu_grade='mems', duration=75.0, stand_still=40.0, seed=4)
     status = aligned(s)[0].status()
     assert status.counts['rebases'] >= 3
@@ -198,7 +198,7 @@ def test_handover_while_standing_still_keeps_tilt_and_biases(monkeypatch):
 
 
 def test_store_is_bounded(monkeypatch):
-    monkeypatch.setattr('ins_align.aligner.MapMethod', partial(MapMethod, capacity=40))
+    monkeypatch.setattr('ins_align.alignment.MapMethod', partial(MapMethod, capacity=40))
     aligner, _ = aligned(simulated('car', imu_grade='mems', duration=30.0, seed=2))
     estimator = estimator_of(aligner)
     assert estimator.count <= 40

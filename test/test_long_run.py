@@ -82,7 +82,8 @@ def test_preintegrated_intervals_chained_through_a_day():
 def test_attitude_carried_through_a_day():
     """Sixteen million samples at a rate that stays, against the angle in closed form."""
     rate, period_ns, lot = np.array([0.3, -0.2, 0.5]), 5_000_000, 1_728_000
-    carried = Prediction(0, np.eye(3), np.eye(3), np.zeros(3), np.zeros((3, 3)), 1e-4, 1e-12)
+    carried = Prediction(0, np.eye(3), np.eye(3), np.zeros(3), np.zeros((3, 3)), 1e-4, 1e-12,
+                         rate)
     gyro = np.broadcast_to(rate, (lot, 3))
     stamps = np.arange(1, lot + 1) * period_ns
     for k in range(10):

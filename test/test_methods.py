@@ -46,6 +46,17 @@ def test_noise_free_flight_is_aligned_to_a_thousandth_of_a_degree(place, method)
     assert error_deg(at_ten.current, s) < 1e-3
 
 
+@pytest.mark.parametrize('method', METHODS)
+def test_sigma_is_no_smaller_than_the_noise_of_the_receiver_makes_the_error(method):
+    """Of an IMU whose errors do not matter: the formulas know none."""
+    squares = 0.0
+    for seed in range(8):
+        s = simulated('flight', imu_grade='navigation', duration=30.0, seed=seed,
+                      heading_deg=40.0 * seed, gyro_bias_std=1e-9, accel_bias_std=1e-6)
+        squares += normalised_error(aligned(s, **METHODS[method])[0].status().initial, s)
+    assert squares < chi2.ppf(0.999, 3 * 8)
+
+
 @pytest.mark.parametrize('options', (
     {'mount_rpy_deg': (10.0, -70.0, 130.0)}, {'imu_jitter': 0.4}, {'gnss_rate': 1.0},
     {'gnss_phase': 0.01}, {'gnss_latency': 0.4}, {'imu_rate': 200.0, 'gnss_rate': 10.0}))
@@ -99,9 +110,9 @@ def test_what_the_note_does_not_estimate_it_says_to_be_as_configured():
 
 def test_a_posteriori_factor_only_widens():
     good = Fit(chi2=50.0, dof=100, innovation=NOTHING_NEW, converged=True, rejected_velocity=0,
-               rejected_position=0, offered=40, delay=0.0)
+               rejected_position=0, rejected=0, offered=40, delay=0.0)
     bad = Fit(chi2=400.0, dof=100, innovation=NOTHING_NEW, converged=True, rejected_velocity=0,
-              rejected_position=0, offered=40, delay=0.0)
+              rejected_position=0, rejected=0, offered=40, delay=0.0)
     empty = Fit(chi2=0.0, dof=0, innovation=NOTHING_NEW, converged=True, rejected_velocity=0,
-                rejected_position=0, offered=2, delay=0.0)
+                rejected_position=0, rejected=0, offered=2, delay=0.0)
     assert good.factor == 1.0 and bad.factor == 2.0 and empty.factor == np.inf

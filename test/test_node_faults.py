@@ -61,8 +61,10 @@ def test_faulty_drivers(tmp_path):
     assert {name: listener.count(name) for name in faults} == faults
     assert listener.count('imu_gap') >= 1
     assert listener.status['state'] == 'ALIGNED'
-    attitude, = listener.attitudes
-    check_attitude(attitude, simulation)
+    # The 0.2 s that the IMU lost may withdraw it for a moment: then it is published again.
+    assert listener.attitudes
+    for attitude in listener.attitudes:
+        check_attitude(attitude, simulation)
 
 
 def spoilt(messages):
@@ -172,7 +174,7 @@ def test_velocity_in_a_body_frame_is_refused(tmp_path):
                                                         for _, topic, _ in messages)
     assert listener.count('velocity') == 0
     assert listener.status['state'] == 'WAITING_FOR_GNSS'
-    assert 'velocity' in listener.status['reason']
+    assert "velocity is given in the body frame 'base_link'" in listener.status['reason']
     assert not listener.attitudes
 
 

@@ -25,11 +25,12 @@ def forces(scale, count=600):
     """Return the sum of so many magnitudes of specific force, and their number."""
     random = np.random.default_rng(0)
     f = scale * ([0.0, 0.0, 9.81] + random.standard_normal((count, 3)))
-    return float(np.sum(np.linalg.norm(f, axis=1))), count
+    return float(np.sum(np.linalg.norm(f, axis=1))), count, count / 100.0
 
 
 @pytest.mark.parametrize('scale, wrong', [(1.0, False), (1 / 9.81, True), (1000.0, True),
-                                          (-1.0, False), (2.0, False), (0.0, True)])
+                                          (-1.0, False), (2.0, False), (3.5, False),
+                                          (0.0, True)])
 def test_force_in_another_unit_is_found(scale, wrong):
     check = ForceCheck()
     check.add(*forces(scale))
@@ -38,7 +39,7 @@ def test_force_in_another_unit_is_found(scale, wrong):
         assert 'm/s^2' in check.fault and any(c.isdigit() for c in check.fault)
 
 
-def test_force_check_waits_for_enough_samples_and_forgives():
+def test_force_check_waits_for_five_seconds_and_forgives():
     check = ForceCheck()
     check.add(*forces(0.1, 100))
     assert not check.fault
@@ -98,6 +99,17 @@ def test_straight_drive_to_the_north_east_tells_nothing():
         check.add(0.2 * k, (0.8 + 1.4 * k / RADIUS, 0.2 + 1.4 * k / (RADIUS * np.cos(0.8)), 0.0),
                   np.array([7.0, 7.0, 0.0]), 0.5)
     assert not check.fault
+
+
+def test_the_wrong_frame_stays_found_on_the_way_to_the_north_east():
+    """There both frames say the same: no evidence for either."""
+    check = drive(VelocityCheck(), lambda v: v[[1, 0, 2]] * [1.0, 1.0, -1.0], seconds=60.0)
+    assert 'exchanged' in check.fault
+    place = np.array([0.9, 0.3])
+    for k in range(300):
+        check.add(100.0 + 0.2 * k, (*place, 0.0), np.array([7.0, 7.0, 0.0]), 0.5)
+        place += 1.4 / RADIUS * np.array([1.0, 1.0 / np.cos(place[0])])
+    assert 'exchanged' in check.fault
 
 
 def test_gaps_are_not_bridged():

@@ -24,17 +24,19 @@ MATRIX = np.array([[0.01, 2e-3, 0.0], [3e-3, -0.01, 1e-3], [-4e-3, 0.0, 5e-3]])
 RANDOM = np.random.default_rng(7)
 GYRO = RANDOM.normal(scale=2.0, size=(400, 3))
 STAMPS = np.cumsum(RANDOM.integers(1, 2 * STEP_NS, 400))
+RATE = (0.5, -1.0, 2.0)
 START = Rotation.from_rotvec([0.3, -0.2, 2.5])
 COVARIANCE = np.array([[4.0, 0.5, 0.2], [0.5, 3.0, -0.1], [0.2, -0.1, 9.0]]) * 1e-6
 
 
 def prediction():
-    return Prediction(0, START.as_matrix(), COVARIANCE, BIAS, MATRIX, 2e-3, 1e-6)
+    return Prediction(0, START.as_matrix(), COVARIANCE, BIAS, MATRIX, 2e-3, 1e-6, RATE)
 
 
 def truth(count):
     """Return the attitude after so many samples."""
-    turns = (GYRO - GYRO @ MATRIX.T - BIAS) * (np.diff(STAMPS, prepend=0) * 1e-9)[:, None]
+    mean = 0.5 * (np.vstack([RATE, GYRO[:-1]]) + GYRO)
+    turns = (mean - mean @ MATRIX.T - BIAS) * (np.diff(STAMPS, prepend=0) * 1e-9)[:, None]
     attitude = START
     for turn in turns[:count]:
         attitude = attitude * Rotation.from_rotvec(turn)
@@ -54,6 +56,20 @@ def test_one_by_one_and_many_at_once(count):
         assert each.matrices()[0] == pytest.approx(truth(count), abs=1e-12)
         assert each.quaternion_xyzw[3] >= 0.0
         assert np.linalg.norm(each.quaternion_xyzw) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_a_rate_that_swings_is_followed():
+    """To and fro about one axis, for which the angle is known, up to where the rate is largest."""
+    swing, frequency, period = 3.0, 2 * np.pi * 2.0, 0.01
+    stamps = np.arange(1, 1013) * 10_000_000
+    gyro = np.outer(swing * np.sin(frequency * stamps * 1e-9), [0.0, 0.6, 0.8])
+    carried = Prediction(0, np.eye(3), COVARIANCE, np.zeros(3), np.zeros((3, 3)), 0.0, 0.0,
+                         np.zeros(3))
+    carried.carry_many(stamps, gyro)
+    angle = swing / frequency * (1 - np.cos(frequency * stamps[-1] * 1e-9))
+    turned = Rotation.from_quat(carried.quaternion_xyzw).as_rotvec() @ [0.0, 0.6, 0.8]
+    # The rate at the end of each step alone would be off by half a step of the largest rate.
+    assert abs(turned - angle) < 0.05 * 0.5 * period * swing
 
 
 def test_covariance_grows_with_the_noise_of_the_gyros():
@@ -96,7 +112,7 @@ def test_follower_knows_which_round_of_a_loop_it_is_in():
         for stamp_ns in range(STEP_NS, 100 * STEP_NS, STEP_NS):
             assert follower.follow(stamp_ns, (0.0, 0.0, 1.0)) is None
     still = Prediction(90 * STEP_NS, np.eye(3), COVARIANCE, np.zeros(3), np.zeros((3, 3)), 0.0,
-                       0.0)
+                       0.0, (0.0, 0.0, 1.0))
     follower.adopt(still)
     now = follower.follow(100 * STEP_NS, (0.0, 0.0, 1.0))
     assert Rotation.from_quat(now.quaternion_xyzw).as_rotvec() == pytest.approx([0, 0, 0.05])

@@ -15,8 +15,11 @@
 
 import dataclasses
 import json
+from pathlib import Path
+import re
 import sqlite3
 
+import ins_align
 from ins_align import sqlite_file
 from ins_align.aligner import Aligner, Attitude
 from ins_align.bag_files import BagError
@@ -69,6 +72,18 @@ def test_blocks_do_not_matter(flight, result, monkeypatch, block):
     assert numbers(replay(flight, CONFIG)) == numbers(result)
 
 
+def test_another_process_that_reads_does_not_matter(flight, result):
+    done = []
+    other = replay(flight, CONFIG, read_ahead=True, progress=done.append)
+    assert numbers(other) == numbers(result)
+    assert done[-1] == 1.0 and done == sorted(done)
+
+
+def test_errors_of_the_process_that_reads(tmp_path):
+    with pytest.raises(BagError, match='does not exist'):
+        replay(tmp_path / 'none', CONFIG, read_ahead=True)
+
+
 def test_format_does_not_matter(simulation, result, tmp_path):
     write_bag(simulation, tmp_path / 'flight', 'mcap')
     assert numbers(replay(tmp_path / 'flight', CONFIG)) == numbers(result)
@@ -112,6 +127,34 @@ def test_json_and_csv_agree(result):
     assert last['state'] == result.status.state.value
 
 
+def documented(title):
+    """Return the names in the first column of the README's table with this title."""
+    readme = (Path(__file__).parents[1] / 'README.md').read_text(encoding='utf-8')
+    table = re.search(rf'^\| {title} \|.*\n\|[-|]+\n((?:\|.*\n)+)', readme, re.MULTILINE)
+    return [name for row in table[1].splitlines()
+            for name in re.findall(r'`(\w+)`', row.split('|')[1])]
+
+
+def test_readme_names_every_field(result):
+    content = result.to_json()
+    attitude = [name for name in content['final_attitude'] if name != 'stamp']
+    fields = documented('field')
+    assert sorted(fields) == sorted([*content, *attitude])
+    columns = CSV_HEADER.split(',')
+    assert documented('column')[:10] == columns[:10]
+    assert [f'current_{name}' for name in columns[3:10]] == columns[10:]
+    assert documented('column')[10:] == [columns[10], columns[-1]]
+
+
+def test_readme_names_every_count(result):
+    counts = documented('count')
+    assert set(result.status.counts) <= set(counts)
+    source = ''.join(path.read_text() for path in Path(ins_align.__file__).parent.glob('*.py'))
+    named = re.findall(r"""(?:counts\[|reject\()'(\w+)'[\])]""", source)
+    assert len(named) > 20
+    assert set(named) <= set(counts)
+
+
 def test_window_is_by_recorded_time(flight, simulation):
     part = replay(flight, CONFIG, start=10.0, duration=5.0)
     assert part.status.counts['imu'] == 500
@@ -148,7 +191,7 @@ def test_what_cannot_be_decoded_is_counted(flight, tmp_path):
 
 
 def test_body_frame_velocity_is_counted(flight, tmp_path):
-    """Named by the user, refused message by message, with the reason in the counts."""
+    """Found by type it is left out; named by the user it is refused message by message."""
     path = write_recording(tmp_path / 'a', 'sqlite3', 3.0)
     database = sqlite3.connect(path / 'a.db3')
     rows = database.execute('SELECT messages.id, data FROM messages JOIN topics ON '
@@ -158,9 +201,14 @@ def test_body_frame_velocity_is_counted(flight, tmp_path):
                          (data.replace(b'gps\0', b'imu\0'), key))
     database.commit()
     database.close()
-    assert replay(path).topics.velocity is None
-    counts = replay(path, velocity_topic='/fix_velocity').status.counts
-    assert counts['velocity_body_frame'] == len(rows) == 15
+    found, named = replay(path), replay(path, velocity_topic='/fix_velocity')
+    assert found.topics.velocity is None
+    assert named.status.counts['velocity_body_frame'] == len(rows) == 15
+    for result in (found, named):
+        warning, = result.warnings
+        assert "/fix_velocity cannot be used: the velocity is given in the body frame 'imu'" \
+            in warning
+    assert replay(path, Config(use_velocity=False)).warnings == ()
 
 
 def test_positions_only(flight):

@@ -18,9 +18,9 @@ from dataclasses import replace
 from alignment import LEVER, some_unknowns
 from ins_align.rotation import exp_so3
 from ins_align.unknowns import (ACCEL_BIAS, ACCEL_ERRORS, ACCEL_MATRIX, ATTITUDE, DELAY,
-                                first_prior, FREE_LEVER_STD, GYRO_BIAS, GYRO_MATRIX,
-                                GYRO_MISALIGNMENT, inverse_spd, LEVER_ARM, Prior, prior_of, SIZE,
-                                START_POSITION, START_VELOCITY)
+                                first_prior, GYRO_BIAS, GYRO_MATRIX, GYRO_MISALIGNMENT,
+                                inverse_spd, LEVER_ARM, Prior, prior_of, SIZE, START_POSITION,
+                                START_VELOCITY)
 import numpy as np
 import pytest
 
@@ -100,15 +100,17 @@ def test_prior_of_a_known_heading_is_about_axes_of_the_body(turn):
     assert np.allclose(to_mean[3:], 0.0)
 
 
-@pytest.mark.parametrize('lever_std', (0.0, 0.05))
-def test_prior_with_a_free_lever_arm_forgets_that_alone(lever_std):
-    prior = first_prior(1e-3, 0.05, LEVER, lever_std, 0.02, 0.1, 0.01)
-    free = prior.with_free_lever_arm()
-    before, after = np.diag(prior.information), np.diag(free.information)
-    assert np.allclose(after[LEVER_ARM], 1 / (FREE_LEVER_STD ** 2 + lever_std ** 2))
-    others = np.delete(np.arange(SIZE), np.r_[LEVER_ARM])
+@pytest.mark.parametrize('block, told_std', (
+    (LEVER_ARM, 0.0), (LEVER_ARM, 0.05), (DELAY, 0.0), (DELAY, 0.02)))
+def test_a_loosened_prior_forgets_one_block_alone(block, told_std):
+    lever_std, delay_std = (told_std, 0.1) if block is LEVER_ARM else (0.5, told_std)
+    prior = first_prior(1e-3, 0.05, LEVER, lever_std, 0.02, delay_std, 0.01)
+    loose = prior.loosened(block, 2.0)
+    before, after = np.diag(prior.information), np.diag(loose.information)
+    assert np.allclose(after[block], 1 / (2.0 ** 2 + told_std ** 2))
+    others = np.delete(np.arange(SIZE), np.r_[block])
     assert np.allclose(after[others], before[others], rtol=1e-9)
-    assert np.array_equal(free.mean.lever_b, prior.mean.lever_b)
+    assert np.array_equal(loose.mean.vector(), prior.mean.vector())
 
 
 def test_inverse_of_rows_of_any_scale():

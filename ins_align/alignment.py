@@ -1,0 +1,229 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+An alignment: prepared steps in, attitudes and states out.
+
+A method estimates, a declaration judges; this lets the one go from epoch to epoch and hears the
+other, and tells what has become of it.
+"""
+
+from collections import Counter
+import math
+
+from ins_align.antenna import AntennaEpoch
+from ins_align.config import Config
+from ins_align.declaration import Declaration, State, Verdict
+from ins_align.intake import Afresh, Loss, Run, Start, Step, Wait
+from ins_align.methods import MapMethod, Method, NoteMethod, Nuisance
+from ins_align.plausibility import ForceCheck
+from ins_align.preintegration import SensorErrors
+from ins_align.results import Attitude, Epoch, Status
+from ins_align.unknowns import Prior
+import numpy as np
+
+_NOTHING_YET = Verdict(State.WAITING_FOR_IMU, 'no IMU sample yet')
+
+
+class Alignment:
+    """
+    Goes the steps that an intake has prepared.
+
+    Parameters
+    ----------
+    config : Config
+
+    Attributes
+    ----------
+    counts : Counter
+        ``restarts``, ``withdrawals``.
+    declared : Attitude or None
+        The initial attitude as it was declared.
+    current : Attitude or None
+        At the last epoch.
+
+    """
+
+    def __init__(self, config: Config) -> None:
+        """Wait for the first step."""
+        self.config = config
+        self.counts: Counter[str] = Counter()
+        self._events: list[str] = []
+        self._epochs: Counter[str] = Counter()      # of alignments that are over
+        self._method: Method | None = None
+        self._first_t0_ns: int | None = None
+        self._forget(None)
+
+    def _forget(self, prior: Prior | None) -> None:
+        """Forget everything but the counts and a prior."""
+        if self._method is not None:
+            self._epochs.update(_epoch_counts(self._method))
+        self._prior = prior
+        self._method = None
+        self._declaration = Declaration(self.config)
+        self._force_check = ForceCheck()
+        self._verdict = _NOTHING_YET
+        self._start_ns = 0                          # the first t0 since it started over
+        self._measured_ns = 0                       # the last epoch with a measurement
+        self._initial: Attitude | None = None
+        self._stamp_ns: int | None = None
+        self._time_to_align_s: float | None = None
+        self.declared: Attitude | None = None
+        self.current: Attitude | None = None
+
+    def reconfigure(self, config: Config) -> None:
+        """Take other thresholds and another hold time."""
+        self.config = self._declaration.config = config
+
+    def go(self, step: Step) -> list[Epoch]:
+        """Go a step; return the epochs with GNSS that were in it."""
+        if isinstance(step, Run):
+            return self._advance(step)
+        if isinstance(step, Start):
+            return [self._start(step)]
+        if isinstance(step, Wait):
+            self._set_verdict(step.verdict)
+        elif isinstance(step, Loss):
+            self._lose(step.why)
+        elif isinstance(step, Afresh):
+            self._events.append(step.event)
+            self._first_t0_ns = None
+            self._forget(None)
+        return []
+
+    def _start(self, step: Start) -> Epoch:
+        epoch = step.first.epoch
+        self._start_ns = epoch.stamp_ns
+        if self._first_t0_ns is None:
+            self._first_t0_ns = epoch.stamp_ns
+        if self.config.method == 'map':
+            self._method = MapMethod(self.config, epoch, step.imu, step.use_position, self._prior)
+        else:
+            self._method = NoteMethod(self.config, epoch, step.imu, epoch.v_n is None)
+        return self._judge(self._method, epoch, step.first.fault)
+
+    def _advance(self, run: Run) -> list[Epoch]:
+        method = self._method
+        assert method is not None
+        done = []
+        taken = method.advance([located.epoch for located in run.located], run.imu)
+        for epoch, located, forces in zip(taken, run.located, run.forces):
+            self._force_check.add(*forces)
+            judged = self._judge(method, epoch, located.fault)
+            if not located.dry:
+                done.append(judged)
+        return done
+
+    def _lose(self, why: str) -> None:
+        """Start over; what was learnt of the sensors is kept."""
+        prior = self._prior
+        if self._method is not None:
+            self.counts['restarts'] += 1
+            self._events.append(f'alignment starts over: {why}')
+            prior = self._method.prior_without_attitude()
+        self._forget(prior)
+
+    def _judge(self, method: Method, epoch: AntennaEpoch, fault: str) -> Epoch:
+        """Results and state after an epoch; `fault` is what is known to be wrong with the GNSS."""
+        assert self._first_t0_ns is not None
+        self._stamp_ns = stamp_ns = epoch.stamp_ns
+        time_s = (stamp_ns - self._start_ns) * 1e-9
+        fit = method.fit()
+        if not fit.converged:
+            method.settle()
+            fit = method.fit()
+        initial, current = method.initial(), method.current()
+        measured = epoch.v_n is not None or epoch.position_measured
+        if measured:
+            self._measured_ns = stamp_ns
+        if initial is None or current is None:
+            self._initial = self.current = None
+            verdict = Verdict(State.ALIGNING, f'{fit.offered} GNSS epochs so far: more are '
+                                              'needed')
+        else:
+            if measured:
+                verdict = self._declaration.update(time_s, initial[1], current[1], fit,
+                                                   method.unconfirmed)
+                if self._declaration.later_start:
+                    method.renew()
+            else:
+                verdict = self._declaration.update_without_gnss(
+                    (stamp_ns - self._measured_ns) * 1e-9, initial[1], current[1], fit)
+            scale = fit.factor ** 2 if math.isfinite(fit.factor) else 1.0
+            self._initial = Attitude(method.t0_ns, initial[0], initial[1] * scale)
+            self.current = Attitude(stamp_ns, current[0], current[1] * scale)
+        fault = self._force_check.fault or fault
+        if fault:
+            self._declaration.levelled = self._declaration.aligned = False
+            verdict = Verdict(State.FAULT, fault)
+        method.judged(self._declaration.contradicted or bool(fault),
+                      verdict.state in (State.LEVELLED, State.ALIGNED))
+        if verdict.state is State.ALIGNED and self.declared is None:
+            self.declared = self._initial
+            self._time_to_align_s = time_s
+        elif verdict.state is not State.ALIGNED and self.declared is not None:
+            self.declared = self._time_to_align_s = None
+            self.counts['withdrawals'] += 1
+        self._set_verdict(verdict)
+        sensors = method.sensor_errors()
+        return Epoch(stamp_ns, (stamp_ns - self._first_t0_ns) * 1e-9, verdict.state,
+                     self._initial, self.current, fit.innovation.normalised,
+                     sensors.gyro_bias, sensors.accel_bias)
+
+    def _set_verdict(self, verdict: Verdict) -> None:
+        if verdict.state is not self._verdict.state:
+            self._events.append(f'{verdict.state.value}: {verdict.reason}')
+        self._verdict = verdict
+
+    # Output
+
+    def take_events(self) -> list[str]:
+        """Return and forget the sentences worth a log line since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def sensor_errors(self) -> SensorErrors:
+        """Return the errors of gyros and accelerometers at the last epoch; none before one."""
+        return SensorErrors.none() if self._method is None else self._method.sensor_errors()
+
+    def nuisance(self) -> Nuisance:
+        """Return biases, lever arm and delay; what is told of them before the first epoch."""
+        if self._method is not None:
+            return self._method.nuisance()
+        config, zero = self.config, np.zeros(3)
+        gyro_std, accel_std, lever_std = (np.full(3, std) for std in (
+            config.imu_noise.gyro_bias_std, config.imu_noise.accel_bias_std,
+            config.lever_arm_std))
+        return Nuisance(zero, gyro_std, zero, accel_std, np.array(config.lever_arm), lever_std,
+                        config.gnss_delay, config.gnss_delay_std)
+
+    def status(self, of_messages: Counter[str]) -> Status:
+        """Return the state, the reason for it, the estimates and all counts."""
+        counts = Counter(of_messages)
+        for more in (self.counts, self._epochs, _epoch_counts(self._method)):
+            counts.update(more)
+        return Status(self._verdict.state, self._verdict.reason, self._stamp_ns,
+                      None if self._method is None else self._method.t0_ns,
+                      self._time_to_align_s, self._initial, self.current,
+                      **vars(self.nuisance()), counts=dict(counts))
+
+
+def _epoch_counts(method: Method | None) -> Counter[str]:
+    """Return what became of the epochs of an alignment."""
+    if method is None:
+        return Counter(epochs_used=0, epochs_rejected_velocity=0, epochs_rejected_position=0,
+                       rebases=0)
+    fit = method.fit()
+    return Counter(epochs_used=fit.offered - fit.rejected,
+                   epochs_rejected_velocity=fit.rejected_velocity,
+                   epochs_rejected_position=fit.rejected_position, rebases=method.moved)
