@@ -17,11 +17,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 import json
 import os
 from pathlib import Path
 import sys
-from typing import Any, NoReturn, TYPE_CHECKING
+from typing import Any, NoReturn, TextIO, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ins_align.batch import Outcome, Task
@@ -117,26 +118,47 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status.
 
     """
-    arguments = parser().parse_args(argv)
+    arguments, unknown = parser().parse_known_args(argv)
+    if unknown:
+        arguments.parser.error(f'unrecognized arguments: {" ".join(unknown)}')
     try:
-        return int(arguments.run(arguments))
+        status = int(arguments.run(arguments))
+        with _readers_may_leave(sys.stdout):
+            sys.stdout.flush()
+        return status
     except (UsageError, ModuleNotFoundError) as error:
         if isinstance(error, ModuleNotFoundError):
             error = _missing(error)
-        print(f'ins_align {arguments.command}: {error}', file=sys.stderr)
+        with _readers_may_leave(sys.stderr):
+            print(f'ins_align {arguments.command}: {error}', file=sys.stderr)
         return UNUSABLE
     except KeyboardInterrupt:
         return INTERRUPTED
-    except BrokenPipeError:
-        # Whoever read our output has left; keep Python from complaining when it flushes.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # an experiment, which says what it does while it writes
+        _to_nobody(sys.stdout)
         return UNUSABLE
+
+
+@contextmanager
+def _readers_may_leave(stream: TextIO) -> Iterator[None]:
+    """Let whoever reads our output leave, as ``| head`` does: the work and its status stay."""
+    try:
+        yield
+    except BrokenPipeError:
+        _to_nobody(stream)
+
+
+def _to_nobody(stream: TextIO) -> None:
+    """Keep Python from complaining whenever it writes, and when it flushes at the end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
     top = Parser(prog='ins_align', description=DESCRIPTION,
                  formatter_class=argparse.RawDescriptionHelpFormatter)
+    top.add_argument('--version', action=_Version, nargs=0, dest=argparse.SUPPRESS,
+                     help='tell the version')
     commands = top.add_subparsers(dest='command', metavar='COMMAND', required=True,
                                   help=argparse.SUPPRESS)
     _add_info(commands)
@@ -151,26 +173,42 @@ def _add_command(commands: Any, name: str, run: Callable[[argparse.Namespace], i
     command: argparse.ArgumentParser = commands.add_parser(
         name, description=description, epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter)
-    command.set_defaults(run=run)
+    command.set_defaults(run=run, parser=command)
     return command
 
 
+class _Version(argparse.Action):
+    """Tells the version of the package that is installed."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        """Leave with exit status 0."""
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            print(f'{parser.prog} {version("ins_align")}')
+        except PackageNotFoundError:
+            print(f'{parser.prog} is not installed: its version is in package.xml')
+        parser.exit()
+
+
 def _seconds(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
     if not 0.0 <= value < 1e9:
-        raise ValueError
+        raise argparse.ArgumentTypeError(f'must be a number of seconds, 0 or above, got {text!r}')
     return value
 
 
 def _count(text: str) -> int:
-    value = int(text)
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
     if value < 1:
-        raise ValueError
+        raise argparse.ArgumentTypeError(f'must be a whole number, 1 or above, got {text!r}')
     return value
-
-
-# What argparse calls them in its messages.
-_seconds.__name__, _count.__name__ = 'number of seconds', 'number of 1 or more'
 
 
 def _add_info(commands: Any) -> None:
@@ -200,7 +238,7 @@ def _add_replay(commands: Any) -> None:
                        help='skip this many seconds of the recording')
     group.add_argument('--duration', type=_seconds, metavar='S', help='read this many seconds')
     group.add_argument('--jobs', type=_count, metavar='N',
-                       help='recordings at a time, each in a process (default: one a processor)')
+                       help='processes; two can share a recording (default: one a processor)')
     group.add_argument('--dask', metavar='ADDRESS',
                        help='process the recordings on the Dask cluster with this scheduler')
     group = command.add_argument_group('output')
@@ -265,10 +303,14 @@ SIMULATE_OPTIONS = {
 
 
 def _add_experiment(commands: Any) -> None:
+    from ins_align.experiments import MEASUREMENTS, NAMES
+
     command = _add_command(
         commands, 'experiment', run_experiment,
         'Repeat a published or documented experiment: its figure and its numbers.', '')
-    command.add_argument('name', metavar='NAME', help='an unknown name lists those there are')
+    command.add_argument('name', metavar='NAME',
+                         help=f'{", ".join(NAMES)}; all: these one after the other; '
+                              f'{", ".join(MEASUREMENTS)}: measure the machine too, with ROS')
     command.add_argument('--out', required=True, metavar='DIR', help='where to write')
     command.add_argument('--data', metavar='DIR', help='folder of the real recordings')
     command.add_argument('--runs', type=_count, metavar='N', help='of a Monte Carlo experiment')
@@ -290,13 +332,16 @@ def run_info(arguments: argparse.Namespace) -> int:
         except BagError as error:
             if not several:
                 raise UsageError(error) from None
-            print(f'ins_align info: {error}', file=sys.stderr)
+            with _readers_may_leave(sys.stderr):
+                print(f'ins_align info: {error}', file=sys.stderr)
             objects.append({'bag': bag, 'error': str(error)})
             status = UNUSABLE
             continue
-        for warning in info.warnings:
-            print(f'ins_align info: warning: {warning}', file=sys.stderr)
-        print(describe(info) + '\n')
+        with _readers_may_leave(sys.stderr):
+            for warning in info.warnings:
+                print(f'ins_align info: warning: {warning}', file=sys.stderr)
+        with _readers_may_leave(sys.stdout):
+            print(describe(info) + '\n')
         objects.append(info.to_json())
     if arguments.json:
         _write_json(arguments.json, objects if several else objects[0])
@@ -326,12 +371,15 @@ def run_replay(arguments: argparse.Namespace) -> int:
             if outcome.error:
                 if not several:
                     raise UsageError(outcome.error)
-                progress.note(f'ins_align replay: {outcome.error}')
+                with _readers_may_leave(sys.stderr):
+                    progress.note(f'ins_align replay: {outcome.error}')
                 statuses.append(UNUSABLE)
             else:
-                for warning in outcome.warnings:
-                    progress.note(f'ins_align replay: warning: {warning}')
-                progress.say(outcome.summary + '\n')
+                with _readers_may_leave(sys.stderr):
+                    for warning in outcome.warnings:
+                        progress.note(f'ins_align replay: warning: {warning}')
+                with _readers_may_leave(sys.stdout):
+                    progress.say(outcome.summary + '\n')
                 statuses.append(ALIGNED if outcome.json['aligned'] else NOT_ALIGNED)
             objects.append(outcome.json)
     if arguments.json:
@@ -377,8 +425,14 @@ def _config(arguments: argparse.Namespace) -> Config:
 def _labels(bags: Sequence[str]) -> list[str]:
     """Name the recordings, all differently, for the names of output files."""
     names = [Path(bag).resolve().name.split('.')[0] or 'bag' for bag in bags]
-    return [name if names.count(name) == 1 else f'{name}_{index + 1}'
-            for index, name in enumerate(names)]
+    labels: list[str] = []
+    for index, name in enumerate(names):
+        label = name
+        # A number may make it the name of another recording.
+        while names.count(label) > (label == name) or label in labels:
+            label += f'_{index + 1}'
+        labels.append(label)
+    return labels
 
 
 def _with_label(path: str | None, label: str) -> str | None:
@@ -427,7 +481,7 @@ def run_simulate(arguments: argparse.Namespace) -> int:
     from ins_align.simulation_arguments import SimulationError
 
     options = {name: value for name, value in vars(arguments).items()
-               if name not in ('command', 'run', 'out', 'storage', 'scenario')}
+               if name not in ('command', 'run', 'parser', 'out', 'storage', 'scenario')}
     try:
         write_bag(simulate(arguments.scenario, **options), arguments.out, arguments.storage)
     except SimulationError as error:

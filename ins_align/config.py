@@ -117,7 +117,7 @@ class Config:
         1.0, 'how much later than newer IMU samples a GNSS or IMU message may arrive and '
         'still be used', 's', minimum=0.0, maximum=60.0)
     imu_grade: str = _parameter(
-        'mems', 'preset of the four figures below; custom: all four must be given',
+        'mems', 'preset of the six figures below; custom: the first four must be given',
         choices=(*PRESETS, 'custom'))
     angle_random_walk: float = _parameter(
         0.0, "angle random walk of the gyroscopes; 0: the preset's", 'deg/sqrt(h)',
@@ -164,8 +164,9 @@ class Config:
         False, 'the axes and signs of the IMU are known to be right: declare a heading without '
         'waiting for motion that shows it, also at rest', choices=(True, False))
     method: str = _parameter(
-        'map', 'vif, pif: velocity and position integration formula as published; '
-        "map: the estimator that also knows the IMU's errors", choices=('vif', 'pif', 'map'))
+        'map', 'vif, pif: velocity and position integration formula as published, whose sigmas '
+        "know nothing of the IMU's errors; map: the estimator that knows them",
+        choices=('vif', 'pif', 'map'))
     free_start: bool = _parameter(
         True, 'vif and pif: leave the noisy first velocity and rate out of every later vector; '
         'false: the published formula to the letter', choices=(True, False))
@@ -385,7 +386,8 @@ def _checked_vector(field: dataclasses.Field[Any], value: Any) -> tuple[float, f
 
 
 def _checked_number(name: str, value: Any, field: dataclasses.Field[Any]) -> float:
-    unit = f' {field.metadata["unit"]}'
+    unit = field.metadata['unit']
+    unit = f' {unit}' if unit not in ('', '1') else ''
     minimum, maximum = field.metadata['minimum'], field.metadata['maximum']
     if isinstance(value, bool) or not isinstance(value, Real):
         raise ConfigError(f'{name} must be a number{unit and f" ({unit.strip()})"}, '

@@ -32,12 +32,12 @@ from ins_align.earth import normal_gravity
 from ins_align.imu_survey import ImuFacts, survey_imu
 from ins_align.motion_survey import (
     find_manoeuvres, MANOEUVRE_SPEED, MANOEUVRE_TIME, Manoeuvres, on_grid, Series, track,
-    velocity_frame, velocity_from_positions, VelocityFrame, WEAK_SPEED)
+    velocity_frame, velocity_from_positions, VelocityFrame, WEAK_SPEED, without_spikes)
+from ins_align.prediction import MAX_GAP_NS
 from ins_align.report import format_table
 from ins_align.topic_survey import KINDS, MAX_ASTRAY, read_candidates, Recorded, Timing
 import numpy as np
 
-RESTART_GAP = 2.0  # s without IMU samples after which an alignment starts over
 MAX_LATENESS = 60.0  # s, the limit of the parameter gnss_lateness
 MAX_NO_FIX = 0.1  # share of positions without a fix that is worth a word
 FRAMES_THAT_FIT = ('enu', 'ned')
@@ -134,9 +134,11 @@ class _Survey:
         for topics in (imus, fixes, velocities):
             self._advise_choice(topics)
         command = self._command(chosen)
-        end_ns = self._bag.end_ns
+        # The end of a file that was cut off is known from what could be read of it.
+        end_ns = max([self._bag.end_ns or self._start_ns, *(
+            int(data.recorded_ns.max()) for data in self._candidates if data.recorded_ns.size)])
         return Info(
-            str(self._bag.path), 0.0 if end_ns is None else (end_ns - self._start_ns) * 1e-9,
+            str(self._bag.path), (end_ns - self._start_ns) * 1e-9,
             self._start_ns, (*imus, *fixes, *velocities),
             {kind: None if topic is None else topic.name for kind, topic in chosen.items()},
             lateness, found, _heading_in_words(found), tuple(self._notes),
@@ -207,7 +209,7 @@ class _Survey:
         if fix is None:
             return Series(np.zeros(0), np.zeros((0, 3)))
         series = self._series(self._data[fix.name])
-        return track(series.times, *series.vectors.T)
+        return without_spikes(track(series.times, *series.vectors.T))
 
     def _place(self, fix: TopicInfo | None) -> tuple[float, float]:
         """Return latitude, degrees, and altitude; somewhere on Earth if they are not known."""
@@ -246,7 +248,7 @@ class _Survey:
             return
         facts, timing = imu.imu, imu.timing
         self._notes.extend(facts.too_small)
-        if timing.longest_gap is not None and timing.longest_gap.duration_s > RESTART_GAP:
+        if timing.longest_gap is not None and timing.longest_gap.duration_s > MAX_GAP_NS * 1e-9:
             self._notes.append(
                 f'the IMU is silent for {timing.longest_gap.duration_s:.1f} s at '
                 f'{timing.longest_gap.start_s:.1f} s: an alignment starts over after that')

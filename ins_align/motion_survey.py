@@ -89,6 +89,26 @@ def position_noise(positions: Series) -> float:
     return float(np.median(np.abs(second)) / 0.6745 / math.sqrt(6.0))
 
 
+def without_spikes(positions: Series) -> Series:
+    """
+    Leave out positions that are far from the median of the five around them.
+
+    Far is half of a distance over which velocity and position are compared: less would turn it by
+    no more than noise does. A median keeps what goes one way, however fast. The first and the
+    last two positions have no five around them and stay.
+    """
+    vectors = positions.vectors
+    if vectors.shape[0] < 5:
+        return positions
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(vectors, 5, axis=0), axis=-1)
+    limit = 0.5 * _compared_distance(position_noise(positions))
+    off = np.abs(vectors[2:-2] - medians)
+    near = np.ones(vectors.shape[0], bool)
+    # Receivers are about half as good vertically.
+    near[2:-2] = (np.hypot(off[:, 0], off[:, 1]) < limit) & (off[:, 2] < 2.0 * limit)
+    return Series(positions.times[near], vectors[near])
+
+
 def velocity_from_positions(positions: Series) -> Series:
     """Differentiate positions over a time that leaves 0.35 m/s of their noise."""
     if positions.times.size < 2:
@@ -197,7 +217,7 @@ def _distances(velocities: Series, positions: Series) -> tuple[Array, Array, Arr
     if velocities.times.size < 2 or positions.times.size < 2:
         return none, none, np.zeros((0, 2))
     noise = position_noise(positions)
-    distance = max(MIN_DISTANCE, DISTANCE_SIGMAS * noise)
+    distance = _compared_distance(noise)
     steps = np.diff(velocities.times)
     middles = 0.5 * (velocities.vectors[1:] + velocities.vectors[:-1])
     speeds = np.hypot(*middles[:, :2].T)
@@ -226,6 +246,10 @@ def _distances(velocities: Series, positions: Series) -> tuple[Array, Array, Arr
     lengths = _length(moved[:, :2], max(MIN_STEP, STEP_SIGMAS * noise))
     return (moved[ends] - moved[starts], change[:, :3],
             np.column_stack([lengths[ends] - lengths[starts], change[:, 3]]))
+
+
+def _compared_distance(noise: float) -> float:
+    return max(MIN_DISTANCE, DISTANCE_SIGMAS * noise)
 
 
 def _length(places: Array, step: float) -> Array:

@@ -26,6 +26,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from ins_align.replay import ReplayResult
+    from ins_align.results import Epoch
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -40,6 +41,7 @@ AXES_OF_IMU = (('x', ROLL), ('y', PITCH), ('z', HEADING))
 INNOVATION_LIMIT = 5.0  # sigmas shown at least
 DECLARED_GREEN = '#009E73'
 METRES_PER_DEGREE = 6_371_000.0 * math.pi / 180.0  # of latitude, mean sphere: good for a picture
+BREAK_INTERVALS = 5.0  # a line ends where epochs are further apart than so many usual distances
 LOST_SIGMA_DEG = 60.0  # above this a heading is not worth drawing
 PLOT_SUFFIXES = ('.png', '.pdf', '.svg', '.jpg', '.jpeg', '.webp', '.eps', '.tif', '.tiff')
 
@@ -222,24 +224,34 @@ def plot(result: ReplayResult) -> Figure:
 
 
 class _Series:
-    """A result's epochs with an attitude, as arrays over time."""
+    """
+    A result's epochs with an attitude, as arrays over time.
+
+    Where an alignment starts over or hears nothing for long lies a row of nan, so that nothing is
+    drawn across.
+    """
 
     def __init__(self, result: ReplayResult) -> None:
         pairs = [(epoch, epoch.initial, epoch.current) for epoch in result.epochs
                  if epoch.current is not None and epoch.initial is not None]
-        self.time = np.array([epoch.t_s for epoch, _, _ in pairs])
-        angles = np.array([[now.roll_deg, now.pitch_deg, now.yaw_deg] for _, _, now in pairs])
-        self.angles = angles.reshape(-1, 3)
-        self.sigma = np.array([now.sigma_deg for _, _, now in pairs]).reshape(-1, 3)
-        self.initial_sigma = np.array(
-            [first.sigma_deg for _, first, _ in pairs]).reshape(-1, 3)
+        time = np.array([epoch.t_s for epoch, _, _ in pairs])
+        breaks = _breaks(result.epochs, time)
+
+        def rows(values: Sequence[Any]) -> np.ndarray:
+            return np.insert(np.array(values, float).reshape(-1, 3), breaks, np.nan, axis=0)
+
+        self.time = np.insert(time, breaks, np.nan)
+        self.angles = rows([[now.roll_deg, now.pitch_deg, now.yaw_deg] for _, _, now in pairs])
+        self.sigma = rows([now.sigma_deg for _, _, now in pairs])
+        self.initial_sigma = rows([first.sigma_deg for _, first, _ in pairs])
         # Roll and pitch turn about axes in the plane of level: the larger sigma holds for both.
         self.angle_sigma = np.stack([self.sigma[:, :2].max(axis=1, initial=0.0)] * 2
                                     + [self.sigma[:, 2]], axis=-1)
         self.innovations, self.gyro_bias, self.accel_bias = (
-            np.array([getattr(epoch, name) for epoch, _, _ in pairs]).reshape(-1, 3)
+            rows([getattr(epoch, name) for epoch, _, _ in pairs])
             for name in ('innovation', 'gyro_bias', 'accel_bias'))
-        self.aligned = np.array([epoch.state is State.ALIGNED for epoch, _, _ in pairs], bool)
+        self.aligned = np.insert(
+            np.array([epoch.state is State.ALIGNED for epoch, _, _ in pairs], bool), breaks, False)
         self.declared = [epoch.t_s for before, epoch in zip((None, *result.epochs), result.epochs)
                          if epoch.state is State.ALIGNED
                          and (before is None or before.state is not State.ALIGNED)]
@@ -247,8 +259,18 @@ class _Series:
         if result.reference is not None:
             none = (np.full(3, np.nan), np.full(3, np.nan))
             errors = [result.reference.errors_deg(now) or none for _, _, now in pairs]
-            self.errors = np.array([rpy for _, rpy in errors]).reshape(-1, 3)
+            self.errors = rows([rpy for _, rpy in errors])
             self.reference = np.remainder(self.angles - self.errors + 180.0, 360.0) - 180.0
+
+
+def _breaks(epochs: Sequence[Epoch], time: np.ndarray) -> np.ndarray:
+    """Return before which of the epochs with an attitude, at these times, a line ends."""
+    steps = np.diff(time)
+    far = steps > BREAK_INTERVALS * np.median(steps) if steps.size else steps > 0.0
+    # What starts over has no attitude at t0 for some epochs.
+    there = np.flatnonzero([epoch.current is not None and epoch.initial is not None
+                            for epoch in epochs])
+    return 1 + np.flatnonzero(far | (np.diff(there) > 1))
 
 
 def _plot_angles(axes: Axes, series: _Series, lines: tuple[tuple[int, str, str], ...]) -> None:
@@ -328,7 +350,7 @@ def _plot_bias(axes: Axes, time: np.ndarray, biases: np.ndarray, std: np.ndarray
                       label='1 sigma at the end' if column == 2 else None)
     # The first seconds tell nothing yet.
     settled = biases[len(biases) // 10:]
-    low, high = settled.min() - std.max(), settled.max() + std.max()
+    low, high = np.nanmin(settled) - std.max(), np.nanmax(settled) + std.max()
     margin = 0.1 * (high - low) or 1.0
     axes.set_ylim(low - margin, high + margin)
 
@@ -344,9 +366,10 @@ def _plot_errors(axes: Axes, series: _Series, errors: np.ndarray) -> None:
     for sign, label in ((1.0, 'heading, 3 sigma'), (-1.0, None)):
         axes.plot(series.time, sign * 3.0 * series.sigma[:, 2], color=HEADING, linewidth=0.8,
                   linestyle=':', label=label)
-    # What is seen of an error is its end: its first seconds are as large as an angle can be.
-    settled = finite & (series.time >= (series.declared[0] if series.declared
-                                        else np.median(series.time[finite])))
+    # What is seen of an error is its end: its first seconds, of every start, are as large as an
+    # angle can be.
+    settled = finite & (series.aligned if series.declared
+                        else series.time >= np.median(series.time[finite]))
     largest = np.abs(errors[settled if settled.any() else finite]).max()
     limit = max(1.0, 2.0 * largest)
     axes.set_ylim(-limit, limit)

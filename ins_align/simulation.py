@@ -503,5 +503,11 @@ def _parameter_file(simulation: Simulation) -> str:
     if preset is None or noise[:4] != preset[:4]:
         values['gyro_bias_std'] = math.degrees(noise.gyro_bias_std)
         values['accel_bias_std'] = float(noise.accel_bias_std)
+    if not meta['ideal']:
+        usual = preset or ImuNoise(0.0, 0.0, 0.0, 0.0)
+        if noise.gyro_scale_std > usual.gyro_scale_std:
+            values['gyro_scale_std'] = float(noise.gyro_scale_std)
+        if noise.rate_random_walk > usual.rate_random_walk:
+            values['rate_random_walk'] = math.degrees(noise.rate_random_walk) * 60
     return ''.join(['ins_align:\n  ros__parameters:\n',
                     *(f'    {name}: {value}\n' for name, value in values.items())])

@@ -74,9 +74,12 @@ def checked_arguments(arguments: dict[str, Any]) -> ImuNoise:
     check('velocity_frame', 'enu or ned', lambda value: value in VELOCITY_FRAMES)
     check('flip_axis', 'x, y, z or empty', lambda value: value in tuple(IMU_AXES))
     check('accel_sign', '1 or -1', lambda value: value in (1, -1))
-    duration = arguments['duration'] or 0.0
-    if duration * arguments['imu_rate'] > _MAX_SAMPLES:
-        raise SimulationError(f'{duration:g} s at {arguments["imu_rate"]:g} Hz are too many '
+    duration = arguments['duration']
+    if duration is None:
+        duration = SCENARIOS[arguments['scenario']].duration + arguments['stand_still']
+    rate = max(arguments['imu_rate'], arguments['gnss_rate'])
+    if duration * rate > _MAX_SAMPLES:
+        raise SimulationError(f'{duration:g} s at {rate:g} Hz are too many '
                               f'samples, the limit is {_MAX_SAMPLES}')
     grade = arguments['imu_grade']
     return grade if isinstance(grade, ImuNoise) else PRESETS[grade]

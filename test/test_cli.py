@@ -19,13 +19,14 @@ import json
 import os
 from pathlib import Path
 import pty
+import re
 import signal
 import struct
 import subprocess
 import sys
 import termios
 
-from ins_align.cli import main, SCENARIOS
+from ins_align.cli import _labels, main, SCENARIOS
 from ins_align.trajectory import trajectory_of
 import pytest
 from recordings import FIX, IMU, real_recording, TWIST, write_recording
@@ -86,6 +87,14 @@ def test_parameter_file_of_the_simulation(flight, capsys):
     assert main(['replay', str(flight), '--params', str(flight / 'ins_align.yaml')]) == 0
 
 
+def test_parameter_file_covers_scale_factors(tmp_path, capsys):
+    """With the preset alone, which has none, the residuals contradict the stated noise."""
+    path = tmp_path / 'flight'
+    assert main(['simulate', str(path), '--imu', 'navigation', '--gyro-scale-std', '0.01']) == 0
+    assert main(['replay', str(path), '--set', 'imu_grade=navigation']) == 1
+    assert main(['replay', str(path), '--params', str(path / 'ins_align.yaml')]) == 0
+
+
 def test_not_aligned(standing, tmp_path, capsys):
     assert main(['replay', str(standing), '--json', str(tmp_path / 'a.json')]) == 1
     result = json.loads((tmp_path / 'a.json').read_text())
@@ -100,8 +109,18 @@ def test_start_and_duration(flight, tmp_path, capsys):
     assert json.loads((tmp_path / 'a.json').read_text())['counts']['imu'] == 500
 
 
-def test_nothing_left_after_start(flight, tmp_path, capsys):
-    assert main(['replay', str(flight), '--start', '1000', '--json', str(tmp_path / 'a.json'),
+@pytest.mark.parametrize('part, where', [
+    (['--start', '1000'], 'after 1000 s'), (['--duration', '0'], 'between 0 s and 0 s'),
+    (['--start', '50', '--duration', '10'], 'between 50 s and 60 s')])
+def test_part_without_messages(flight, tmp_path, capsys, part, where):
+    assert main(['replay', str(flight), *part, '--json', str(tmp_path / 'a.json')]) == 2
+    assert one_sentence(capsys) == (f'ins_align replay: {flight} has no IMU or GNSS messages '
+                                    f'{where}: it is 40.0 s long\n')
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_too_little_for_an_attitude(flight, tmp_path, capsys):
+    assert main(['replay', str(flight), '--start', '39.9', '--json', str(tmp_path / 'a.json'),
                  '--csv', str(tmp_path / 'a.csv'), '--plot', str(tmp_path / 'a.png')]) == 1
     result = json.loads((tmp_path / 'a.json').read_text())
     assert result['initial_attitude'] is None and result['final_attitude'] is None
@@ -141,9 +160,41 @@ def test_jobs_do_not_change_the_output(flight, standing, tmp_path, capsys):
     assert set(outputs[0][2]) == {'a.json', 'a_flight_1.csv', 'a_flight_4.csv', 'a_standing.csv'}
 
 
+def test_a_recording_by_itself_is_read_ahead_of_its_alignment(flight, tmp_path, capsys):
+    outputs = []
+    for jobs in ('1', '2'):
+        assert main(['replay', str(flight), '--jobs', jobs, '--json', str(tmp_path / 'a.json'),
+                     '--csv', str(tmp_path / 'a.csv')]) == 0
+        files = {path.name: path.read_text() for path in tmp_path.iterdir()}
+        outputs.append((capsys.readouterr(), files))
+    assert outputs[0] == outputs[1]
+
+
+def _killed(request):
+    os.kill(os.getpid(), signal.SIGKILL)
+    yield
+
+
+def test_a_process_that_is_killed_while_it_reads(flight, monkeypatch, capsys):
+    monkeypatch.setattr('ins_align.replay._prepared', _killed)
+    assert main(['replay', str(flight), '--jobs', '2']) == 2
+    error = capsys.readouterr().err
+    assert error.count('\n') == 1 and 'a process died on the way' in error
+
+
 def test_same_name_twice(standing, tmp_path, capsys):
     assert main(['replay', str(standing), str(standing), '--csv', str(tmp_path / 'a.csv')]) == 1
     assert {path.name for path in tmp_path.iterdir()} == {'a_standing_1.csv', 'a_standing_2.csv'}
+
+
+@pytest.mark.parametrize('bags', [
+    ['x/a', 'y/a_1', 'z/a'], ['x/a', 'y/a_3', 'z/a'], ['a', 'a', 'a_2', 'a_1', 'a_2_2'],
+    ['a', 'b.mcap', 'c.0.db3'], ['a_1', 'a', 'a_1', 'a']])
+def test_no_recording_writes_over_the_files_of_another(bags):
+    labels = _labels(bags)
+    assert len(set(labels)) == len(bags)
+    for bag, label in zip(bags, labels):
+        assert label.startswith(Path(bag).name.split('.')[0])
 
 
 @pytest.mark.parametrize('arguments, message', [
@@ -175,6 +226,37 @@ def test_wrong_usage(capsys, arguments):
         main(arguments)
     assert info.value.code == 2
     assert '--help' in one_sentence(capsys)
+
+
+@pytest.mark.parametrize('arguments, sentence', [
+    (['replay', 'x', '--bogus'], 'ins_align replay: unrecognized arguments: --bogus; '
+     'see "ins_align replay --help"'),
+    (['info', 'x', '--bogus', '3'], 'ins_align info: unrecognized arguments: --bogus 3; '
+     'see "ins_align info --help"'),
+    (['replay', 'x', '--jobs', '0'], 'ins_align replay: argument --jobs: must be a whole number, '
+     '1 or above, got \'0\'; see "ins_align replay --help"'),
+    (['replay', 'x', '--start', 'a'], 'ins_align replay: argument --start: must be a number of '
+     'seconds, 0 or above, got \'a\'; see "ins_align replay --help"')])
+def test_wrong_usage_names_the_help_of_the_command(capsys, arguments, sentence):
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert one_sentence(capsys) == sentence + '\n'
+
+
+def test_version(capsys):
+    from importlib.metadata import version
+    with pytest.raises(SystemExit) as info:
+        main(['--version'])
+    assert not info.value.code
+    assert capsys.readouterr().out == f'ins_align {version("ins_align")}\n'
+
+
+def test_help_names_the_experiments(capsys):
+    from ins_align.experiments import MEASUREMENTS, NAMES
+    with pytest.raises(SystemExit):
+        main(['experiment', '--help'])
+    words = re.findall(r'\w+', capsys.readouterr().out)
+    assert {*NAMES, 'all', *MEASUREMENTS} <= set(words)
 
 
 @pytest.mark.parametrize('content, message', [
@@ -301,15 +383,33 @@ def test_interrupt(flight, jobs):
     assert errors == ''
 
 
-def test_reader_that_leaves(flight):
-    """As in ``ins_align replay ... | head -1``."""
-    process = subprocess.Popen([*COMMAND, 'replay', *[str(flight)] * 200],
-                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                               cwd=Path(__file__).parents[1])
-    process.stdout.readline()
-    process.stdout.close()
-    assert process.stderr.read() == ''
-    process.wait(timeout=60)
+@pytest.mark.parametrize('command, status', [
+    (['replay', '--params'], 0), (['replay', '--duration', '2', '--params'], 1), (['info'], 0)])
+@pytest.mark.parametrize('buffered, number, errors_too', [
+    ([], 1, False), (['-u'], 1, False), (['-u'], 1, True), (['-u'], 3, False), ([], 3, True)])
+def test_reader_that_leaves(flight, tmp_path, command, status, buffered, number, errors_too):
+    """As in ``ins_align replay ... | head -1``: neither files nor status change."""
+    if command[-1] == '--params':
+        command = [*command, str(flight / 'ins_align.yaml'), '--csv', str(tmp_path / 'a.csv')]
+    bags = [flight] * number
+    if errors_too:  # a warning, which goes the same way with 2>&1
+        cut = tmp_path / 'cut.mcap'
+        content = next(flight.glob('*.mcap')).read_bytes()
+        cut.write_bytes(content[:-1_000_000])
+        bags = [cut] * number
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(
+        [sys.executable, *buffered, *COMMAND[1:], *command, '--json', str(tmp_path / 'a.json'),
+         '--', *map(str, bags)],
+        stdout=writing, stderr=subprocess.STDOUT if errors_too else subprocess.PIPE, text=True,
+        cwd=Path(__file__).parents[1])
+    os.close(writing)
+    assert done.returncode == status
+    assert not done.stderr
+    content = json.loads((tmp_path / 'a.json').read_text())
+    assert len(content if number > 1 else [content]) == number
+    assert len(list(tmp_path.glob('*.csv'))) == (0 if command[0] == 'info' else number)
 
 
 def test_progress_bar_on_a_terminal(flight, tmp_path):

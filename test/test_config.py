@@ -87,6 +87,16 @@ def test_value_refused_in_one_line(name, value):
     assert len(str(info.value)) < 300
 
 
+@pytest.mark.parametrize('name, value, sentence', [
+    ('gyro_scale_std', 0.7, 'gyro_scale_std must lie between 0 and 0.5, got 0.7'),
+    ('gyro_scale_std', 'x', "gyro_scale_std must be a number, got 'x'"),
+    ('hold_time', -1, 'hold_time must lie between 0 and 3600 s, got -1')])
+def test_sentence_names_the_unit_where_there_is_one(name, value, sentence):
+    with pytest.raises(ConfigError) as info:
+        Config(**{name: value})
+    assert str(info.value) == sentence
+
+
 def test_values_take_their_own_type():
     config = Config(hold_time=3, use_velocity='true', use_position='False', free_start='false')
     assert isinstance(config.hold_time, float)

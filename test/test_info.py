@@ -23,7 +23,9 @@ from ins_align.bags import Bag
 from ins_align.cli import main
 from ins_align.decoding import deserialize
 from ins_align.info import describe, inspect
-from ins_align.motion_survey import find_manoeuvres, Series, track, velocity_frame
+from ins_align.motion_survey import (
+    find_manoeuvres, Series, track, velocity_frame, without_spikes)
+from ins_align.replay import replay
 from ins_align.simulation import simulate, write_bag
 import numpy as np
 import pytest
@@ -286,6 +288,18 @@ def test_gaps_and_no_fix(changed, drive):
     assert '25%' in info.notes[1]
 
 
+@pytest.mark.parametrize('silence, word', [(0.4, ''), (1.0, 'silent for 1.0 s')])
+def test_silence_after_which_an_alignment_starts_over(changed, drive, silence, word):
+    start = drive[1][0][1]
+    path = changed(lambda name, time, message: [] if name == '/imu/data_raw' and (
+        30.0 < (time - start) * 1e-9 < 30.0 + silence) else [(name, time, message)])
+    epochs = replay(path).epochs
+    lost = [now for before, now in zip(epochs, epochs[1:]) if before.initial and not now.initial]
+    notes = [note for note in inspect(path).notes if 'starts over' in note]
+    assert len(lost) == len(notes) == bool(word)
+    assert all(word in note for note in notes)
+
+
 def test_nothing_has_a_fix(changed):
     def change(name, time, message):
         if name == '/fix':
@@ -322,6 +336,18 @@ def test_values_that_are_no_numbers(changed):
     json.dumps(info.to_json(), allow_nan=False)
 
 
+@pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
+def test_half_of_a_recording(tmp_path, kind):
+    path = write_recording(tmp_path / 'a', kind, 20.0)
+    file = path if path.is_file() else next(path.glob('a.*'))
+    file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
+    info = inspect(file)
+    assert 'as far as it goes' in info.warnings[0]
+    last = max(topic.timing.last_s for topic in info.topics)
+    assert info.duration_s >= last > 7.0
+    assert f'{info.duration_s:.1f} s, recorded from 2023-11-14 22:13:20' in describe(info)
+
+
 def test_text_of_a_recording_cannot_move_the_cursor(tmp_path):
     info = inspect(write_recording(tmp_path / 'a', 'mcap', 6.0, {'/imu\x1b[2J': IMU, '/fix': FIX}))
     assert '\x1b' not in describe(info)
@@ -353,6 +379,53 @@ def test_track_and_manoeuvres_by_hand():
     assert frame.frame == 'enu' and frame.windows > 40
     swapped = Series(times, velocities.vectors[:, [1, 0, 2]])
     assert velocity_frame(swapped, positions).frame == 'ned'
+
+
+@pytest.mark.parametrize('rate', [0.0, 0.003, 0.005, 0.01, 0.05])
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_wild_fixes_do_not_change_the_frame(rate, seed):
+    """Positions 50 m off and velocities 5 m/s off, some of them one after the other."""
+    truth = simulate('car', seed=seed, duration=100.0, outlier_rate=rate)
+    times = (truth.gnss_stamps_ns - truth.gnss_stamps_ns[0]) * 1e-9
+    spoilt = track(times, *truth.lla_deg.T)
+    positions = without_spikes(spoilt)
+    # Of a spike in a random direction a part may point along the way or be short.
+    wild = np.isin(times, positions.times, invert=True)
+    assert np.count_nonzero(wild & truth.outlier) >= 0.8 * np.count_nonzero(truth.outlier)
+    assert np.count_nonzero(wild & ~truth.outlier) <= 1
+    C_bn = truth.attitude_at(truth.gnss_stamps_ns).transpose(0, 2, 1)
+    east, north, up = truth.velocity.T
+    for frame, velocity in (
+            ('enu', truth.velocity), ('ned', np.column_stack([north, east, -up])),
+            ('body', np.einsum('nij,nj->ni', C_bn, truth.velocity)),
+            ('turned', np.column_stack([0.8 * east - 0.6 * north, 0.6 * east + 0.8 * north, up])),
+            ('contradiction', 3.6 * truth.velocity)):
+        found = velocity_frame(Series(times, velocity), positions)
+        assert found.frame == frame
+        assert found.speed_ratio == pytest.approx(3.6 if frame == 'contradiction' else 1.0,
+                                                  rel=0.1)
+
+
+def test_wild_fixes_are_no_manoeuvres(tmp_path):
+    """From positions alone; steady course, of which the receiver is sometimes 50 m off."""
+    write_bag(simulate('straight', seed=1, outlier_rate=0.02), tmp_path / 'a')
+    with Bag(tmp_path / 'a') as bag:
+        topics = [topic for topic in bag.topics if topic.name in ('/imu/data_raw', '/fix')]
+        messages = [(topic.name, time, deserialize(data, topic))
+                    for topic, time, data in bag.messages(topics)]
+    path = write_messages(tmp_path / 'b', 'mcap', messages, {'/imu/data_raw': IMU, '/fix': FIX})
+    assert inspect(path).manoeuvres.starts == ()
+
+
+def test_sharp_turns_and_gaps_are_no_spikes():
+    """Two fixes a second of a vehicle that turns on the spot, with some of them missing."""
+    times = np.delete(np.arange(0.0, 40.0, 0.5), [10, 30, 31, 32, 50])
+    east = 20.0 * np.minimum(times, 20.0)
+    north = 20.0 * np.maximum(times - 20.0, 0.0)
+    positions = Series(times, np.column_stack([east, north, 0.0 * times]))
+    assert without_spikes(positions).times.tolist() == times.tolist()
+    few = Series(times[:4], positions.vectors[:4])
+    assert without_spikes(few) is few
 
 
 def test_velocities_and_positions_of_different_times_leave_the_frame_open():

@@ -26,7 +26,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 CORE = ('rotation', 'earth', 'preintegration', 'formula', 'unknowns', 'whitening', 'estimator',
-        'methods', 'buffers', 'plausibility', 'declaration', 'aligner', 'config', 'messages')
+        'methods', 'buffers', 'plausibility', 'intake', 'declaration', 'alignment', 'aligner',
+        'config', 'messages')
 OPTIONAL = ('rosbags', 'matplotlib', 'pyins', 'pandas', 'numba', 'scipy', 'tqdm')
 
 
@@ -66,6 +67,17 @@ def test_one_version():
     version = parse_package(ROOT / 'package.xml').version
     assert f"version='{version}'" in read('setup.py')
     assert re.search(rf'^{re.escape(version)} \(', read('CHANGELOG.rst'), re.MULTILINE)
+
+
+def test_what_the_launch_files_run_is_a_dependency():
+    needed = {dependency.name for dependency in parse_package(ROOT / 'package.xml').exec_depends}
+    verbs = set()
+    for path in (ROOT / 'launch').iterdir():
+        # cmd="ros2 bag play ..." in XML, cmd=['ros2', 'topic', ...] in Python.
+        verbs |= set(re.findall(r'cmd=\W*ros2\W+(\w+)', path.read_text()))
+    assert verbs == {'bag', 'topic'}
+    assert {f'ros2{verb}' for verb in verbs} <= needed
+    assert 'rosbag2_storage_mcap' in needed  # what ins_align simulate writes
 
 
 def test_commands_are_where_ros2_run_looks():

@@ -20,7 +20,8 @@ from types import SimpleNamespace
 
 from ins_align.config import Config
 from ins_align.replay import replay
-from ins_align.report import format_table, plot, save_figure, summary, write_whole
+from ins_align.report import (
+    DECLARED_GREEN, format_table, plot, save_figure, summary, write_whole)
 from ins_align.simulation import simulate, write_bag
 import numpy as np
 import pytest
@@ -125,6 +126,66 @@ def test_figure_marks_the_declaration(result):
     tilt = plot(result).axes[0]
     marks = [line for line in tilt.lines if line.get_label() == 'declared aligned']
     assert [line.get_xdata()[0] for line in marks] == [first]
+
+
+@pytest.fixture(scope='module')
+def restarted(tmp_path_factory):
+    """Replay a drive whose IMU says nothing from 20 s to 21.5 s."""
+    truth = simulate('car', seed=1, duration=40.0)
+    seconds = (truth.imu_stamps_ns - truth.imu_stamps_ns[0]) * 1e-9
+    heard = (seconds < 20.0) | (seconds > 21.5)
+    names = ('imu_stamps_ns', 'gyro', 'accel', 'truth_C_nb', 'truth_gyro', 'truth_accel')
+    path = tmp_path_factory.mktemp('report') / 'silent'
+    write_bag(dataclasses.replace(truth, **{name: getattr(truth, name)[heard] for name in names}),
+              path)
+    result = replay(path, Config(lever_arm=(1.0, 1.0, 1.0)))
+    first = result.epochs[0].stamp_ns
+    epochs = [dataclasses.replace(epoch, t_s=(epoch.stamp_ns - first) * 1e-9)
+              for epoch in result.epochs]
+    return dataclasses.replace(result, epochs=tuple(epochs))
+
+
+def test_nothing_is_drawn_across_a_restart(restarted):
+    shown = [epoch.t_s for epoch in restarted.epochs if epoch.initial and epoch.current]
+    figure = plot(restarted)
+    drawn(figure)
+    bands = 0
+    for axes in figure.axes[:-1]:  # the last one is the track
+        for line in axes.lines:
+            time, value = np.asarray(line.get_xdata(), float), np.asarray(line.get_ydata(), float)
+            if len(time) < 10 or line.get_linestyle() == 'None':
+                continue  # a mark at one time or one level; points
+            there = np.isfinite(time + value)
+            joined = there[1:] & there[:-1]
+            assert joined.any()
+            assert not np.any(joined & (time[:-1] < 20.7) & (time[1:] > 20.7)), line.get_label()
+            assert set(time[there]) <= set(shown)
+        for collection in axes.collections:
+            for path in collection.get_paths():
+                times = path.vertices[:, 0]
+                bands += times.max() < 20.7
+                assert times.max() < 20.7 or times.min() > 20.7
+    assert bands >= 3  # roll, pitch, yaw
+    tilt = figure.axes[0]
+    roll = lines_of(tilt)['roll']
+    assert np.nanmin(roll.get_xdata()) == shown[0] and np.nanmax(roll.get_xdata()) == shown[-1]
+    declared = [line for line in tilt.lines if line.get_color() == DECLARED_GREEN]
+    assert [line.get_xdata()[0] > 20.7 for line in declared] == [False, True]
+
+
+def test_error_is_shown_as_it_is_while_declared(restarted):
+    """The first seconds after a restart, with any heading, do not make the rest a flat line."""
+    axes = next(one for one in plot(restarted).axes
+                if one.get_ylabel().startswith('error'))
+    assert axes.get_ylim()[1] < 10.0
+
+
+def test_nothing_is_drawn_across_an_outage(result):
+    epochs = [epoch for epoch in result.epochs if not 12.0 < epoch.t_s < 20.0]
+    z = lines_of(plot(dataclasses.replace(result, epochs=tuple(epochs))).axes[5])['z']
+    time = z.get_xdata()
+    place, = np.flatnonzero(np.isnan(time))
+    assert time[place - 1] <= 12.0 and time[place + 1] >= 20.0
 
 
 def lines_of(axes):

@@ -437,6 +437,18 @@ def test_parameters_of_a_custom_imu(tmp_path):
     np.testing.assert_allclose(config.imu_noise, own)
 
 
+def test_parameters_hold_what_the_preset_does_not_cover(tmp_path):
+    write_bag(simulate('static', duration=1.0, imu_grade='tactical', gyro_scale_std=0.01,
+                       rate_random_walk=1e-4), tmp_path / 'worse')
+    noise = config_from_mapping(load_params(tmp_path / 'worse' / 'ins_align.yaml')).imu_noise
+    assert noise.gyro_scale_std == 0.01
+    assert noise.rate_random_walk == pytest.approx(1e-4)  # rad/s/sqrt(s) both ways
+    write_bag(simulate('static', duration=1.0, gyro_scale_std=0.001, rate_random_walk=1e-9),
+              tmp_path / 'covered')
+    config = config_from_mapping(load_params(tmp_path / 'covered' / 'ins_align.yaml'))
+    assert config.imu_noise == PRESETS['mems']
+
+
 def test_bag_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     s = simulate('static', duration=1.0)
     with pytest.raises(SimulationError, match='storage must be one of mcap, sqlite3'):
@@ -467,6 +479,8 @@ def test_bag_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     ({'gnss_rate': math.nan}, 'gnss_rate must be'),
     ({'duration': 0.0}, 'duration must be a number of seconds above 0'),
     ({'duration': 1e9}, 'too many samples'),
+    ({'stand_still': 1e7}, '1.00001e.07 s at 100 Hz are too many samples'),
+    ({'imu_rate': 1.0, 'duration': 1e4, 'gnss_rate': 1e4}, 'at 10000 Hz are too many samples'),
     ({'seed': -1}, 'seed must be an integer'),
     ({'seed': 0.5}, 'seed must be an integer'),
     ({'lever_arm': (1.0, 2.0)}, 'lever_arm must be three finite numbers'),
