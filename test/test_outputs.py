@@ -18,6 +18,7 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import tempfile
 
 import pytest
 from recordings import (FIX, IMU, make_fix, make_imu, make_twist, START_NS, TWIST, typestore,
@@ -100,20 +101,23 @@ def test_killed_simulation_leaves_no_recording(tmp_path):
 MARK = 'touch_me'
 NASTY = f'../../{MARK}; $(touch {MARK}) `touch {MARK}`; __import__("os").system("touch {MARK}")'
 # A process that notes every event of the interpreter that the mark reaches: files, processes,
-# code. It starts nothing, so that every process that is started is one too many.
+# code; also in the process that reads ahead, which inherits the watch. That one is a fork, runs
+# nothing else and takes no name with it; every other process that is started is one too many.
 WATCHED = f"""
-import json, sys
+import json, multiprocessing, os, sys
 from ins_align.cli import main
 import ins_align.batch, ins_align.info, ins_align.report
 import matplotlib.figure, matplotlib.backends.backend_agg
-seen = []
-STARTED = 'os.system', 'os.exec', 'os.fork', 'os.posix_spawn', 'os.spawn', 'subprocess.Popen'
+if 'fork' in multiprocessing.get_all_start_methods():
+    multiprocessing.set_start_method('fork')
+process, seen = os.getpid(), os.open(sys.argv[1], os.O_WRONLY | os.O_APPEND)
+STARTED = 'os.system', 'os.exec', 'os.posix_spawn', 'os.spawn', 'subprocess.Popen'
 def watch(event, arguments):
     if event in STARTED or {MARK!r} in repr(arguments):
-        seen.append([event, repr(arguments)[:200]])
+        line = json.dumps([event, repr(arguments)[:200], os.getpid() == process])
+        os.write(seen, (line + chr(10)).encode())
 sys.addaudithook(watch)
-status = main(sys.argv[1:])
-print(json.dumps([status, seen]), file=sys.stderr)
+sys.exit(main(sys.argv[2:]))
 """
 
 
@@ -138,10 +142,18 @@ def nasty_recording(path, kind):
 
 def watched(folder, *arguments):
     """Run the command line in a folder; return exit status and what the watch has seen."""
-    done = subprocess.run([sys.executable, '-c', WATCHED, *map(str, arguments)], cwd=folder,
-                          capture_output=True, text=True)
-    status, seen = json.loads(done.stderr.splitlines()[-1])
-    return status, seen, done.stdout
+    with tempfile.NamedTemporaryFile() as file:
+        done = subprocess.run([sys.executable, '-c', WATCHED, file.name, *map(str, arguments)],
+                              cwd=folder, capture_output=True, text=True)
+        seen = [json.loads(line) for line in file.read().splitlines()]
+    return done.returncode, seen, done.stdout
+
+
+def test_the_watch_sees_what_reads_ahead(standing, tmp_path):
+    pytest.importorskip('matplotlib')
+    (tmp_path / MARK).symlink_to(standing)
+    _, seen, _ = watched(tmp_path, 'replay', MARK, '--jobs', '2')
+    assert seen and not any(in_first_process for _, _, in_first_process in seen)
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
