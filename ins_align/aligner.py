@@ -14,9 +14,9 @@
 """
 The aligner: messages in, attitudes and states out.
 
-The same object works under the node and under replay. Messages are buffered; an epoch is
-processed when IMU samples `gnss_lateness` newer than it have come, so that late messages find
-their place and the results depend on the messages alone.
+An intake and an alignment behind one face; replay uses the two themselves. Messages are buffered;
+an epoch is processed when IMU samples `gnss_lateness` newer than it have come, so that late messages
+find their place and the results depend on the messages alone.
 """
 
 from collections import Counter

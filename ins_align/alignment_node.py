@@ -14,7 +14,8 @@
 """
 The ROS 2 node: subscribes, hands over to the aligner, publishes what it says.
 
-Everything that decides anything is in aligner.py; the same object runs under `ins_align replay`.
+Everything that decides anything is in the intake and the alignment that the aligner ties together;
+`ins_align replay` runs the same two.
 """
 
 from __future__ import annotations
@@ -60,6 +61,7 @@ IMU_DEPTH = 2000  # ten seconds at 200 Hz: the machine may be busy, no sample ma
 GNSS_DEPTH = 200
 IMU_BATCH = 100  # messages taken in a turn of the executor: more would hold up the others
 STATUS_PERIOD = 1.0  # s
+IMU_SILENT = 1.0  # s without a sample, by the clock of this machine; then the status says so
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.5)
 RCLPY_PARAMETERS = {'use_sim_time', 'start_type_description_service'}  # it declares them itself
 
@@ -140,6 +142,7 @@ class AlignmentNode(Node):
         self._imu_frame: str | None = None
         self._started = 0  # how often it has started over
         self._next_status = 0.0
+        self._imu_heard: float | None = None  # when the last sample came
         # From the worker to the executor, replaced as a whole:
         self._outlook = _Outlook(0, None, None)
 
@@ -226,6 +229,7 @@ class AlignmentNode(Node):
         if isinstance(item, ImuSample):
             if item.frame_id != self._imu_frame:
                 self._change_imu_frame(item.frame_id)
+            self._imu_heard = time.monotonic()
             aligner.add_imu(item.stamp_ns, item.gyro, item.accel)
         elif isinstance(item, Fix):
             aligner.add_fix(item)
@@ -300,12 +304,20 @@ class AlignmentNode(Node):
         self._attitude_publisher.publish(msg)
 
     def _publish_status(self) -> None:
-        self._next_status = time.monotonic() + STATUS_PERIOD
+        now = time.monotonic()
+        self._next_status = now + STATUS_PERIOD
         status = self._aligner.status()
+        level = LEVELS.get(status.state, DiagnosticStatus.WARN)
+        silent = 0.0 if self._imu_heard is None else now - self._imu_heard
+        if silent > IMU_SILENT:
+            # The aligner goes by stamps: it learns of a gap when the next sample comes.
+            level = max(level, DiagnosticStatus.WARN)
+            status = dataclasses.replace(
+                status, reason=f'{status.reason}; no IMU sample for {silent:.0f} s')
         msg = DiagnosticArray()
         msg.header.stamp = self.get_clock().now().to_msg()
         msg.status = [DiagnosticStatus(
-            level=LEVELS.get(status.state, DiagnosticStatus.WARN),
+            level=level,
             name=f'{self.get_name()}: alignment', message=f'{status.state.value}: {status.reason}',
             hardware_id=self._imu_frame or '',
             values=[KeyValue(key=key, value=value) for key, value in status_values(status)])]

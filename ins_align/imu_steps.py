@@ -212,7 +212,7 @@ class ImuCutter:
 
 def _together(*densities: 'Array | float') -> Array:
     """Density of noises that are independent of each other."""
-    return reduce(np.hypot, densities)
+    return reduce(np.hypot, map(np.asarray, densities))
 
 
 def _rms(slope: Array) -> Array:

@@ -95,8 +95,9 @@ def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'A
     first = np.clip(rungs[:, -1], 0, last - 1)
     most = np.max(last - first)
     if epochs.size > 1 and epochs.size * most > MAX_STEPS:
+        middle = (epochs.size + 1) // 2
         halves = [recent_motion(stamps, gyro, accel, half, unit)
-                  for half in np.array_split(epochs, 2)]
+                  for half in (epochs[:middle], epochs[middle:])]
         return Recent(*(np.concatenate(arrays) for arrays in zip(
             *(vars(half).values() for half in halves))))
     step = first[:, None] + np.arange(most)

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Replay: one recording through one aligner, with results as JSON, CSV and arrays."""
+"""Replay: one recording prepared and aligned, with results as JSON, CSV and arrays."""
 
 from __future__ import annotations
 

@@ -18,8 +18,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-CORE = ('rotation', 'earth', 'preintegration', 'formula', 'unknowns', 'whitening', 'estimator',
-        'methods', 'buffers', 'plausibility', 'declaration', 'aligner', 'config', 'messages')
+CORE = ('rotation', 'earth', 'preintegration', 'recent', 'g_sensitivity', 'imu_steps', 'formula',
+        'unknowns', 'whitening', 'solution', 'estimator', 'signs', 'told', 'handover', 'methods',
+        'messages', 'buffers', 'antenna', 'plausibility', 'prediction', 'declaration', 'intake',
+        'alignment', 'results', 'aligner', 'config')
 
 
 @pytest.mark.linter

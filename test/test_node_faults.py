@@ -14,14 +14,16 @@
 """What real drivers do to a node: each fault counted, none of them fatal, the attitude right."""
 
 from copy import deepcopy
+from itertools import groupby
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
 from ins_align.rotation import matrix_from_quaternion
 from ins_align.simulation import simulate
 from nav_msgs.msg import Odometry
 from node_harness import (
     attitude_error_deg, FIX, IMU, Listener, play, RELIABLE, running_node, script_of,
-    simulated_messages, stamp_ns, VELOCITY)
+    simulated_messages, stamp_ns, values_of, VELOCITY)
 import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
@@ -196,6 +198,24 @@ def test_frame_of_the_imu_changes(tmp_path):
     check_attitude(first, simulation)
     check_attitude(second, simulation)
     assert listener.statuses[-1].status[0].hardware_id == 'imu_of_the_other_make'
+
+
+def test_an_imu_that_falls_silent_is_told(tmp_path):
+    messages = simulated_messages(flight(duration=20.0))
+    split = 2 * len(messages) // 3
+    with Listener() as listener, running_node(PARAMETERS):
+        play(script_of(messages[:split]), tmp_path, RATE)
+        listener.wait_for(lambda: 'no IMU sample for 3 s' in listener.status.get('reason', ''))
+        assert listener.status['state'] == 'ALIGNED'
+        assert listener.statuses[-1].status[0].level == DiagnosticStatus.WARN
+        play(script_of(messages[split:]), tmp_path, RATE)
+        wait_until_taken(listener, messages)
+        listener.wait_for(lambda: 'no IMU sample for' in listener.status['reason'])
+    reasons = [values_of(status)['reason'] for status in listener.statuses]
+    silent = ['no IMU sample' in reason for reason in reasons]
+    # Heard, silent, heard, and silent once more.
+    assert [k for k, _ in groupby(silent)] == [False, True, False, True]
+    assert listener.count('imu_gap') == 0  # by the stamps there was none
 
 
 def test_a_bag_that_loops_in_simulated_time(tmp_path):
