@@ -19,7 +19,7 @@ What is on its way waits in a pipe, so that memory stays bounded however slow th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 import multiprocessing
 from multiprocessing.connection import Connection
 import pickle
@@ -31,15 +31,17 @@ T = TypeVar('T')
 # Of the pipe, where the system lets one choose: what the one process works on while the other is
 # at something that takes longer.
 PIPE_BYTES = 1 << 20
+# For what a generator that is told to end has to clean up, s.
+GRACE = 5.0
 
 
 class ProcessDied(RuntimeError):
     """The other process ended before the generator did."""
 
 
-def run_ahead(function: Callable[..., Iterator[T]], *arguments: Any) -> Iterator[T]:
+def run_ahead(function: Callable[..., Generator[T, None, None]], *arguments: Any) -> Iterator[T]:
     """
-    Yield what a generator yields in another process.
+    Yield what a generator yields in another process; in this one where there can be no other.
 
     Parameters
     ----------
@@ -56,52 +58,85 @@ def run_ahead(function: Callable[..., Iterator[T]], *arguments: Any) -> Iterator
         Whatever the generator raises; what cannot be pickled as a RuntimeError.
 
     """
+    if multiprocessing.current_process().daemon:  # of a pool, which may not start any
+        yield from function(*arguments)
+        return
     ours, theirs = multiprocessing.Pipe(duplex=False)
     _widen(theirs)
     process = multiprocessing.Process(target=_produce, args=(ours, theirs, function, arguments),
                                       daemon=True)
-    process.start()
+    try:
+        process.start()
+    except OSError:  # no process or no memory to be had
+        ours.close()
+        theirs.close()
+        yield from function(*arguments)
+        return
     theirs.close()
     try:
         while True:
             try:
-                item, error, is_last = pickle.loads(ours.recv_bytes())
-            except EOFError:
+                message = ours.recv_bytes()
+            except (EOFError, OSError):  # the latter in the middle of a message
                 process.join()
                 raise ProcessDied(f'exit status {process.exitcode}') from None
-            if error is not None:
-                raise error
-            if is_last:
+            what, content = pickle.loads(message)
+            if what == 'end':
                 return
-            yield item
+            if what == 'error':
+                error, where = content
+                raise error from RuntimeError(where)
+            yield content
     finally:
         ours.close()
         process.terminate()
-        process.join()
+        process.join(GRACE)
+        if process.is_alive():
+            process.kill()
+            process.join()
 
 
-def _produce(unused: Connection, pipe: Connection, function: Callable[..., Iterator[Any]],
+class _Left(SystemExit):
+    """Nobody reads any more."""
+
+
+def _produce(unused: Connection, pipe: Connection,
+             function: Callable[..., Generator[Any, None, None]],
              arguments: tuple[Any, ...]) -> None:
-    """Send (item, error, whether it was the last)."""
-    # An interruption is for the process that was asked; this one ends when nobody reads any more.
+    """Send ('item', item), ..., then ('end', None) or ('error', (error, where it came from))."""
+    # An interruption is for the process that was asked, and nobody's event loop is to hear of
+    # what is sent to this one. It ends when nobody reads any more.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.set_wakeup_fd(-1)
+    signal.signal(signal.SIGTERM, _leave)
     unused.close()
+    items = function(*arguments)
     try:
+        for item in items:
+            _send(pipe, pickle.dumps(('item', item), pickle.HIGHEST_PROTOCOL))
+        message = pickle.dumps(('end', None))
+    except Exception as error:
+        where = traceback.format_exc()
         try:
-            for item in function(*arguments):
-                pipe.send_bytes(pickle.dumps((item, None, False), pickle.HIGHEST_PROTOCOL))
-            message = pickle.dumps((None, None, True))
-        except BrokenPipeError:
-            raise
-        except Exception as error:
-            try:
-                message = pickle.dumps((None, error, True))
-                pickle.loads(message)               # not every exception can be made again
-            except Exception:
-                message = pickle.dumps((None, RuntimeError(traceback.format_exc()), True))
+            message = pickle.dumps(('error', (error, where)))
+            pickle.loads(message)  # not every exception can be made again
+        except Exception:
+            message = pickle.dumps(('error', (RuntimeError(where), where)))
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # what is to be cleaned up is
+        items.close()
+    _send(pipe, message)
+
+
+def _leave(*_: Any) -> None:
+    raise _Left
+
+
+def _send(pipe: Connection, message: bytes) -> None:
+    try:
         pipe.send_bytes(message)
     except BrokenPipeError:
-        pass
+        raise _Left from None
 
 
 def _widen(pipe: Connection) -> None:

@@ -15,8 +15,8 @@
 The aligner: messages in, attitudes and states out.
 
 An intake and an alignment behind one face; replay uses the two themselves. Messages are buffered;
-an epoch is processed when IMU samples `gnss_lateness` newer than it have come, so that late messages
-find their place and the results depend on the messages alone.
+an epoch is processed when IMU samples `gnss_lateness` newer than it have come, so that late
+messages find their place and the results depend on the messages alone.
 """
 
 from collections import Counter

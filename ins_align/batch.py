@@ -28,6 +28,7 @@ import multiprocessing
 import os
 from pathlib import Path
 import signal
+import threading
 from typing import Any
 
 from ins_align.ahead import ProcessDied
@@ -209,10 +210,25 @@ def _as_asked(outcome: Outcome, task: Task) -> Outcome:
                    summary=outcome.summary.replace(path, task.bag))
 
 
+def processors() -> int:
+    """Return how many processors this process may use."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def _advance(progress: Callable[[float], None], done: int, part: float) -> None:
     progress(done + part)
 
 
 def _leave_interrupts() -> None:
-    """Let Ctrl-C go to the parent alone, which ends its children."""
+    """Let Ctrl-C go to the parent alone, which ends its children; end when it is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)

@@ -118,6 +118,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status.
 
     """
+    for stream in ('stdout', 'stderr'):
+        if getattr(sys, stream) is None:  # closed by who started us
+            setattr(sys, stream, open(os.devnull, 'w'))
     arguments, unknown = parser().parse_known_args(argv)
     if unknown:
         arguments.parser.error(f'unrecognized arguments: {" ".join(unknown)}')
@@ -390,10 +393,10 @@ def run_replay(arguments: argparse.Namespace) -> int:
 def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace, progress: Progress,
               ) -> Iterator[Outcome]:
     """Process recordings where the arguments say."""
-    from ins_align.batch import ClusterError, process_all, process_on_cluster
+    from ins_align.batch import ClusterError, process_all, process_on_cluster, processors
 
     if not arguments.dask:
-        yield from process_all(tasks, arguments.jobs or os.cpu_count() or 1, progress.advance)
+        yield from process_all(tasks, arguments.jobs or processors(), progress.advance)
         return
     try:
         yield from process_on_cluster(tasks, arguments.dask, progress.advance)

@@ -16,7 +16,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 import io
 import math
@@ -229,7 +229,7 @@ class _Prepared(NamedTuple):
     warnings: tuple[str, ...]  # so far
 
 
-def _prepared(request: Request) -> Iterator[_Prepared]:
+def _prepared(request: Request) -> Generator[_Prepared, None, None]:
     """Read a recording and prepare it; the last part has all counts and warnings."""
     intake: Intake | None = None
     for part in read(request):

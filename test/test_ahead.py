@@ -79,13 +79,15 @@ def _process_and_thread():
     yield os.getpid(), threading.get_ident()
 
 
-@pytest.mark.parametrize('error', [BagError('it is broken'), KeyError('x'), OSError(5, 'why')])
+@pytest.mark.parametrize('error', [
+    BagError('it is broken'), KeyError('x'), OSError(5, 'why'), BrokenPipeError(32, 'another')])
 def test_errors_come_after_what_was_before_them(error):
     items = run_ahead(broken, 3, error)
     assert [next(items) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(type(error)) as caught:
         next(items)
     assert caught.value.args == error.args
+    assert 'in broken\n' in str(caught.value.__cause__)  # where it was raised
     assert not multiprocessing.active_children()
 
 
@@ -109,6 +111,71 @@ def test_a_killed_process_is_an_error_and_no_end():
     assert [next(items), next(items)] == [0, 1]
     with pytest.raises(ProcessDied):
         next(items)
+
+
+def test_a_process_killed_in_the_middle_of_a_message_is_an_error(tmp_path):
+    path = tmp_path / 'told'
+    items = run_ahead(told, path)
+    next(items)
+    pid = int(path.read_text().split()[0])
+    time.sleep(0.2)  # the pipe is full
+    os.kill(pid, signal.SIGKILL)
+    with pytest.raises(ProcessDied):
+        for _ in items:
+            pass
+
+
+def cleaned_up(path):
+    try:
+        yield from told(path)
+    finally:
+        path.unlink()
+
+
+def test_who_leaves_early_lets_it_clean_up(tmp_path):
+    path = tmp_path / 'told'
+    items = run_ahead(cleaned_up, path)
+    next(items)
+    assert path.exists()
+    items.close()
+    assert not path.exists()
+
+
+def test_handlers_of_the_parent_are_its_own(tmp_path):
+    # Two, because the second holds an end of the pipe of the first.
+    program = ('import asyncio, pathlib, signal, sys; sys.path.insert(0, sys.argv[1])\n'
+               'from test_ahead import told\n'
+               'from ins_align.ahead import run_ahead\n'
+               'async def main():\n'
+               '    loop = asyncio.get_running_loop()\n'
+               '    loop.add_signal_handler(signal.SIGTERM, print, "heard")\n'
+               '    both = [run_ahead(told, pathlib.Path(sys.argv[2], name)) for name in "ab"]\n'
+               '    for items in both: next(items)\n'
+               '    for items in both: items.close()\n'
+               '    await asyncio.sleep(0.2)\n'
+               'asyncio.run(main())\n')
+    done = subprocess.run([sys.executable, '-c', program, os.path.dirname(__file__), tmp_path],
+                          capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (0, ''), done.stderr
+
+
+def _all(count):
+    return list(run_ahead(range_of, count))
+
+
+def range_of(count):
+    yield from range(count)
+
+
+def test_where_there_can_be_no_other_process_it_runs_in_this_one(monkeypatch):
+    with multiprocessing.Pool(1) as pool:  # daemons may not have children
+        assert pool.apply(_all, (3,)) == [0, 1, 2]
+    monkeypatch.setattr(multiprocessing.Process, 'start', _no_process)
+    assert _all(3) == [0, 1, 2]
+
+
+def _no_process(process):
+    raise BlockingIOError(11, 'Resource temporarily unavailable')
 
 
 def test_who_leaves_early_leaves_nothing_behind(tmp_path):

@@ -20,6 +20,7 @@ import os
 from pathlib import Path
 import pty
 import re
+import select
 import signal
 import struct
 import subprocess
@@ -381,6 +382,31 @@ def test_interrupt(flight, jobs):
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 130
     assert errors == ''
+
+
+def test_workers_end_with_a_killed_parent(flight):
+    read, write = os.pipe()  # whoever lives holds an end of it
+    process = subprocess.Popen(
+        [*COMMAND, 'replay', *[str(flight)] * 200, '--jobs', '2'], pass_fds=[write],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=Path(__file__).parents[1])
+    os.close(write)
+    process.stdout.readline()
+    process.kill()
+    assert select.select([read], [], [], 30.0)[0] and os.read(read, 1) == b''
+    os.close(read)
+    process.communicate()
+
+
+@pytest.mark.parametrize('closed', [1, 2])
+def test_streams_that_are_closed_from_the_start(flight, tmp_path, closed):
+    """As in ``ins_align replay ... >&-``, or from a service without a terminal."""
+    path = tmp_path / 'a.json'
+    done = subprocess.run(
+        ['sh', '-c', f'exec "$@" {closed}>&-', 'sh', *COMMAND, 'replay', flight, '--params',
+         flight / 'ins_align.yaml', '--json', path], capture_output=True, text=True,
+        cwd=Path(__file__).parents[1])
+    assert done.returncode == 0 and 'Traceback' not in done.stdout + done.stderr
+    assert json.loads(path.read_text())['aligned']
 
 
 @pytest.mark.parametrize('command, status', [
