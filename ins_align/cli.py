@@ -24,6 +24,8 @@ from pathlib import Path
 import sys
 from typing import Any, NoReturn, TextIO, TYPE_CHECKING
 
+from ins_align.threads import keep_to_one
+
 if TYPE_CHECKING:
     from ins_align.batch import Outcome, Task
     from ins_align.config import Config
@@ -353,6 +355,7 @@ def run_info(arguments: argparse.Namespace) -> int:
 
 def run_replay(arguments: argparse.Namespace) -> int:
     """Run ``ins_align replay``."""
+    keep_to_one()
     for path in (arguments.json, arguments.csv, arguments.plot):
         _check_writable(path)
     config = _config(arguments)

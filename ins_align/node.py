@@ -23,6 +23,8 @@ import signal
 import sys
 from types import FrameType
 
+from ins_align.threads import keep_to_one
+
 _SOURCE_LINES = re.compile(r', at \S+:\d+')  # where in its sources rcl found an error
 
 
@@ -41,10 +43,7 @@ def main(args: Sequence[str] | None = None) -> int:
         Exit status: 0 after an interruption, 2 if an argument or a parameter is wrong.
 
     """
-    # Small matrices, now and then: the threads of a linear algebra library would not share that
-    # work, they would wait for more of it in a busy loop, which costs several times as much.
-    for library in ('OPENBLAS', 'MKL', 'OMP'):
-        os.environ.setdefault(f'{library}_NUM_THREADS', '1')
+    keep_to_one()  # several times as cheap
 
     # rclpy's own handlers end spin(). Python's would raise KeyboardInterrupt as well, at any line,
     # that of the clean-up included: ros2 launch passes on a Ctrl-C that has arrived already.

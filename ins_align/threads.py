@@ -1,0 +1,27 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""How many threads linear algebra may take."""
+
+import os
+
+
+def keep_to_one() -> None:
+    """
+    Let linear algebra libraries that are not loaded yet keep to one thread, unless told otherwise.
+
+    Small matrices, now and then: more threads would not share that work, they would wait for more
+    of it in a busy loop and take the processor from who has some.
+    """
+    for library in ('OPENBLAS', 'MKL', 'OMP'):
+        os.environ.setdefault(f'{library}_NUM_THREADS', '1')
