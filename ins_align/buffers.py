@@ -31,6 +31,8 @@ import numpy as np
 
 # Beyond these no sensor measures; such values would overflow the integrals (rad/s, m/s^2, m/s).
 MAX_RATE, MAX_ACCELERATION, MAX_SPEED = 200.0, 2000.0, 2000.0
+# The IMU may be silent for this long; then the attitude is lost and alignment starts over (ns).
+MAX_GAP_NS = 500_000_000
 # A GNSS stamp this far ahead of the IMU comes from another clock (ns).
 MAX_AHEAD_NS = 10_000_000_000
 MAX_PENDING = 10_000

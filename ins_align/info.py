@@ -25,7 +25,7 @@ from typing import Any
 
 from ins_align.bag_files import BagError
 from ins_align.bags import Bag
-from ins_align.buffers import MAX_AHEAD_NS
+from ins_align.buffers import MAX_AHEAD_NS, MAX_GAP_NS
 from ins_align.config import Config, config_from_mapping, parse_override
 from ins_align.decoding import ImuSamples
 from ins_align.earth import normal_gravity
@@ -33,7 +33,6 @@ from ins_align.imu_survey import ImuFacts, survey_imu
 from ins_align.motion_survey import (
     find_manoeuvres, MANOEUVRE_SPEED, MANOEUVRE_TIME, Manoeuvres, on_grid, Series, track,
     velocity_frame, velocity_from_positions, VelocityFrame, WEAK_SPEED, without_spikes)
-from ins_align.prediction import MAX_GAP_NS
 from ins_align.report import format_table
 from ins_align.topic_survey import KINDS, MAX_ASTRAY, read_candidates, Recorded, Timing
 import numpy as np

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Union
 
 from ins_align.antenna import Antenna, AntennaEpoch
-from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer, PAIR_NS
+from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer, MAX_GAP_NS, PAIR_NS
 from ins_align.config import Config
 from ins_align.declaration import State, Verdict
 from ins_align.imu_steps import ImuCutter, ImuSteps
@@ -32,8 +32,6 @@ from ins_align.plausibility import stuck
 from ins_align.rotation import Array
 import numpy as np
 
-# The IMU may be silent for this long; then the attitude is lost and alignment starts over (ns).
-MAX_GAP_NS = 500_000_000
 # Without GNSS an epoch without measurement is made this often, which bounds the buffer (ns).
 DRY_INTERVAL_NS = 2_000_000_000
 # Positions alone are taken when no velocity came for this long (ns).

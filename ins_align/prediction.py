@@ -23,12 +23,10 @@ from collections.abc import Sequence
 import copy
 import math
 
-from ins_align.buffers import MAX_RATE
+from ins_align.buffers import MAX_GAP_NS, MAX_RATE
 from ins_align.rotation import apply, Array, matrix_from_quaternion, quaternion_from_matrix
 import numpy as np
 
-# An attitude is lost when samples are missing for longer (ns).
-MAX_GAP_NS = 500_000_000
 # So many samples are kept until it is known from which of them on to carry.
 HISTORY = 2000
 _SMALL_ANGLE = 1e-6  # rad: sin(x / 2) / x is 1 / 2 to rounding
