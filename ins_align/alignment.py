@@ -138,10 +138,8 @@ class Alignment:
         assert self._first_t0_ns is not None
         self._stamp_ns = stamp_ns = epoch.stamp_ns
         time_s = (stamp_ns - self._start_ns) * 1e-9
+        method.settle()
         fit = method.fit()
-        if not fit.converged:
-            method.settle()
-            fit = method.fit()
         initial, current = method.initial(), method.current()
         measured = epoch.v_n is not None or epoch.position_measured
         if measured:

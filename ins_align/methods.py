@@ -281,6 +281,7 @@ class MapMethod:
     def _move_start(self) -> None:
         """Move t0 to the last epoch; what was learnt becomes the prior."""
         self._estimator.settle(last=True)
+        self._told.ask(self._estimator)
         track = self._track
         fit = self.fit()
         if self._lost:
@@ -319,7 +320,6 @@ class MapMethod:
         solution = self._estimator.solution
         if solution is None:
             return _no_fit(self._offered, self._config.gnss_delay)
-        self._told.ask(self._estimator)
         velocities, positions, epochs = (before + since for before, since in zip(
             self._rejected, (*solution.rejected, solution.rejected_epochs)))
         past_chi2, past_dof = self._past
@@ -329,8 +329,9 @@ class MapMethod:
                    self._told.objection)
 
     def settle(self) -> None:
-        """Relinearise now if that is worth it at all."""
+        """Relinearise now if that is worth it at all, and doubt what was told."""
         self._estimator.settle()
+        self._told.ask(self._estimator)
 
     def unconfirmed(self) -> str:
         """Return what speaks against a heading: of signs, or of what is told for certain."""
