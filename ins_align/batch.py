@@ -210,13 +210,6 @@ def _as_asked(outcome: Outcome, task: Task) -> Outcome:
                    summary=outcome.summary.replace(path, task.bag))
 
 
-def processors() -> int:
-    """Return how many processors this process may use."""
-    if hasattr(os, 'sched_getaffinity'):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def _advance(progress: Callable[[float], None], done: int, part: float) -> None:
     progress(done + part)
 

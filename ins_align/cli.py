@@ -24,7 +24,7 @@ from pathlib import Path
 import sys
 from typing import Any, NoReturn, TextIO, TYPE_CHECKING
 
-from ins_align.threads import keep_to_one
+from ins_align.threads import keep_to_one, processors
 
 if TYPE_CHECKING:
     from ins_align.batch import Outcome, Task
@@ -396,7 +396,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
 def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace, progress: Progress,
               ) -> Iterator[Outcome]:
     """Process recordings where the arguments say."""
-    from ins_align.batch import ClusterError, process_all, process_on_cluster, processors
+    from ins_align.batch import ClusterError, process_all, process_on_cluster
 
     if not arguments.dask:
         yield from process_all(tasks, arguments.jobs or processors(), progress.advance)

@@ -11,9 +11,18 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""How many threads linear algebra may take."""
+"""How many threads linear algebra may take, and how many processors there are."""
 
 import os
+
+VARIABLES = ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'OMP_NUM_THREADS')
+
+
+def processors() -> int:
+    """Return how many processors this process may use."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def keep_to_one() -> None:
@@ -23,5 +32,5 @@ def keep_to_one() -> None:
     Small matrices, now and then: more threads would not share that work, they would wait for more
     of it in a busy loop and take the processor from who has some.
     """
-    for library in ('OPENBLAS', 'MKL', 'OMP'):
-        os.environ.setdefault(f'{library}_NUM_THREADS', '1')
+    for variable in VARIABLES:
+        os.environ.setdefault(variable, '1')

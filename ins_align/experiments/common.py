@@ -31,12 +31,12 @@ from ins_align.declaration import State
 from ins_align.report import format_table, write_whole
 from ins_align.rotation import Array, log_so3
 from ins_align.simulation import Simulation
+from ins_align.threads import processors, VARIABLES
 import numpy as np
 
 # Of simulated data nothing comes late, but an unknown delay wants IMU samples beyond the stamp.
 LATENESS = 0.5
 GRADES = ('navigation', 'tactical', 'mems')
-_THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 _PROGRESS_STEP = 0.02
 COLOURS = 64        # of a figure
 
@@ -60,11 +60,11 @@ def parallel(function: Callable[[Any], Any], tasks: Sequence[Any],
         A process of its own even for one job.
 
     """
-    jobs = min(jobs or os.cpu_count() or 1, max(len(tasks), 1))
+    jobs = min(jobs or processors(), max(len(tasks), 1))
     if jobs == 1 and not apart:
         return list(_counted(map(function, tasks), len(tasks), name))
-    before = {variable: os.environ.get(variable) for variable in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, '1'))
+    before = {variable: os.environ.get(variable) for variable in VARIABLES}
+    os.environ.update(dict.fromkeys(VARIABLES, '1'))
     try:
         # A fresh interpreter reads the number of threads when it imports numpy.
         with multiprocessing.get_context('spawn').Pool(jobs) as pool:
