@@ -111,7 +111,7 @@ import matplotlib.figure, matplotlib.backends.backend_agg
 if 'fork' in multiprocessing.get_all_start_methods():
     multiprocessing.set_start_method('fork')
 process, seen = os.getpid(), os.open(sys.argv[1], os.O_WRONLY | os.O_APPEND)
-STARTED = 'os.system', 'os.exec', 'os.posix_spawn', 'os.spawn', 'subprocess.Popen'
+STARTED = 'os.system', 'os.exec', 'os.fork', 'os.posix_spawn', 'os.spawn', 'subprocess.Popen'
 def watch(event, arguments):
     if event in STARTED or {MARK!r} in repr(arguments):
         line = json.dumps([event, repr(arguments)[:200], os.getpid() == process])
@@ -119,6 +119,7 @@ def watch(event, arguments):
 sys.addaudithook(watch)
 sys.exit(main(sys.argv[2:]))
 """
+READS_AHEAD = ['os.fork', '()', True]
 
 
 def nasty_recording(path, kind):
@@ -146,6 +147,8 @@ def watched(folder, *arguments):
         done = subprocess.run([sys.executable, '-c', WATCHED, file.name, *map(str, arguments)],
                               cwd=folder, capture_output=True, text=True)
         seen = [json.loads(line) for line in file.read().splitlines()]
+    if READS_AHEAD in seen:
+        seen.remove(READS_AHEAD)  # once
     return done.returncode, seen, done.stdout
 
 
