@@ -51,6 +51,8 @@ MIN_DOF = 12
 # A delay is to be expected within so many of its sigmas; and further off (s) it is more than a
 # correction to the model, whatever the sigma.
 DELAY_SIGMAS, MAX_DELAY = 3.0, 0.3
+# Factor on variances that is worth a word.
+MENTIONED = 1.5
 # Epochs over which the latest innovations are averaged.
 RECENT = 25
 
@@ -185,7 +187,7 @@ class Declaration:
         config = self.config
         if self.aligned:
             return Verdict(State.ALIGNED, f'heading sigma {heading:.2g} deg, '
-                                          f'tilt sigma {tilt:.2g} deg{_understated(fit)}')
+                                          f'tilt sigma {tilt:.2g} deg{_noise(fit)}')
         if fit.dof < MIN_DOF:
             return Verdict(State.ALIGNING, f'{fit.offered} GNSS epochs so far: more are needed')
         if tilt > config.tilt_std_threshold and not self.levelled:
@@ -194,7 +196,8 @@ class Declaration:
         state = State.LEVELLED if self.levelled else State.ALIGNING
         if heading > config.heading_std_threshold:
             return Verdict(state, f'heading sigma {heading:.2g} deg, needs '
-                                  f'{config.heading_std_threshold:g}: turn or change speed')
+                                  f'{config.heading_std_threshold:g}: turn or change speed'
+                                  f'{_noise(fit)}')
         if not fit.converged:
             return Verdict(state, f'heading sigma {heading:.2g} deg is good enough: the estimate '
                                   'is still settling')
@@ -225,11 +228,15 @@ class Declaration:
         return ''
 
 
-def _understated(fit: Fit) -> str:
-    """Return what a receiver states too little of, as the end of a sentence."""
-    return ''.join(f'; the GNSS {name} are {math.sqrt(factor):.1f} times as noisy as stated'
+def _noise(fit: Fit) -> str:
+    """Return how a receiver's noise is another one than it states, as the end of a sentence."""
+    more = ''.join(f'; the GNSS {name} are {math.sqrt(factor):.1f} times as noisy as stated'
                    for name, factor in zip(('velocities', 'positions'), fit.gnss_noise)
                    if factor > 1.0)
+    if fit.lasting > MENTIONED:
+        more += (f'; errors of the GNSS last from epoch to epoch: sigmas are up to '
+                 f'{math.sqrt(fit.lasting):.1f} times larger')
+    return more
 
 
 def _sigmas_deg(P: Array, factor: float) -> tuple[float, float]:

@@ -530,6 +530,37 @@ class MapEstimator:
         self._run(other, None, self._refused[:self.count])
         return other
 
+    def gnss_share(self, of_prior: float) -> float:
+        """
+        Return how much of the attitude's variance comes from the GNSS.
+
+        Of the angle, then or now, of which most does.
+
+        Parameters
+        ----------
+        of_prior : float
+            How much of the prior's variances does.
+
+        Raises
+        ------
+        RuntimeError
+            Before the first solution.
+
+        """
+        s = self.solution
+        if s is None:
+            raise RuntimeError('no solution yet')
+        velocities, positions = self.noise.gnss
+        # With twice the noise there is so much more of the variance.
+        noisier = Solution(
+            s.point, replace(self.prior, information=self.prior.information / (1.0 + of_prior)),
+            self.columns, self.size,
+            self.noise._replace(gnss=(2.0 * velocities, 2.0 * positions)), self._rate_random_walk)
+        self._run(noisier, None, self._refused[:self.count])
+        more = np.concatenate([noisier.P.diagonal()[:3] / s.P.diagonal()[:3],
+                               noisier.covariance.diagonal() / s.covariance.diagonal()])
+        return float(np.clip(np.max(more) - 1.0, 0.0, 1.0))
+
     def raw_intervals(self) -> Intervals:
         """Return the stored intervals as they would be with sensor errors of zero."""
         return self._corrected(slice(0, self.count), SensorErrors.none())

@@ -25,6 +25,7 @@ from typing import Protocol
 
 from ins_align.antenna import AntennaEpoch
 from ins_align.config import Config, STANDARD_GRAVITY
+from ins_align.correlation import Correlation
 from ins_align.estimator import FIRST_NOISE, Innovation, MapEstimator, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
 from ins_align.handover import prior_from_now, prior_without_attitude
@@ -67,11 +68,14 @@ class Fit:
     # Variances of velocities and positions over the stated ones.
     gnss_noise: tuple[float, float] = (1.0, 1.0)
     objection: str = ''         # what the data say against what is told, in words
+    lasting: float = 1.0        # factor on variances: errors of the GNSS last
 
     @property
     def factor(self) -> float:
         """A-posteriori factor on sigmas, at least 1."""
-        return math.sqrt(max(1.0, self.chi2 / self.dof)) if self.dof > 0 else math.inf
+        if self.dof <= 0:
+            return math.inf
+        return math.sqrt(max(1.0, self.lasting * self.chi2 / self.dof))
 
     @property
     def significant_scale(self) -> float:
@@ -179,6 +183,7 @@ class MapMethod:
             _force_at_rest(imu))
         self._signs = SignCheck()
         self._told = ToldCheck(config)
+        self._correlation = Correlation()
         self._ahead = 1
         self._offered = 0
         self._rejected = [0, 0, 0]          # velocities, positions, epochs before t0
@@ -263,6 +268,7 @@ class MapMethod:
         for k, self._innovation in enumerate(self._estimator.add(intervals, gnss)):
             self._track, self._last_epoch = track.at(k), epochs[k]
             self._last_imu = imu.take(slice(k, k + 1))
+            self._correlation.add(self._innovation.normalised)
             self._offered += bool(present[k].any())
             self._look_for_velocity(epochs[k])
             yield epochs[k]
@@ -282,10 +288,12 @@ class MapMethod:
         """Move t0 to the last epoch; what was learnt becomes the prior."""
         self._estimator.settle(last=True)
         self._told.ask(self._estimator)
+        self._correlation.ask(self._estimator)
         track = self._track
         fit = self.fit()
         if self._lost:
             prior, self._past = self._first_prior, (0.0, 0)
+            self._correlation = Correlation()
         else:
             prior = prior_from_now(self._estimator, track.C_n0n, -track.still_v, -track.s_p,
                                    fit.significant_scale, self._wander * track.time)
@@ -293,6 +301,7 @@ class MapMethod:
         self._rejected = [fit.rejected_velocity, fit.rejected_position, fit.rejected]
         self._signs.restart()
         self._told.restart()
+        self._correlation.restart()
         self.moved += 1
         start = replace(self._last_epoch, v_n=None, position_measured=False)
         self._start(start, prior, self._estimator.noise)
@@ -326,12 +335,13 @@ class MapMethod:
         return Fit(past_chi2 + solution.chi2, past_dof + solution.dof, self._innovation,
                    self._estimator.converged, velocities, positions, epochs, self._offered,
                    self._delay(solution.estimate), self._estimator.noise.gnss,
-                   self._told.objection)
+                   self._told.objection, self._correlation.attitude)
 
     def settle(self) -> None:
         """Relinearise now if that is worth it at all, and doubt what was told."""
         self._estimator.settle()
         self._told.ask(self._estimator)
+        self._correlation.ask(self._estimator)
 
     def unconfirmed(self) -> str:
         """Return what speaks against a heading: of signs, or of what is told for certain."""

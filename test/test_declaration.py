@@ -193,6 +193,12 @@ def test_a_receiver_that_understates_its_noise_is_named():
     assert 'noisy' not in judge(Declaration(Config()), 0.0, 3.0, GOOD).reason
 
 
+def test_sigmas_that_grew_because_errors_last_are_explained():
+    lasting = judge(Declaration(Config()), 0.0, 3.0, GOOD, fit(lasting=9.0))
+    assert 'sigmas are up to 3.0 times larger' in lasting.reason
+    assert 'larger' not in judge(Declaration(Config()), 0.0, 3.0, GOOD).reason
+
+
 def test_doubt_about_the_signs_holds_the_heading_back_and_not_the_level():
     declaration = Declaration(Config(hold_time=2.0))
     verdict = judge(declaration, 0.0, 10.0, GOOD, doubt='signs of the axes: turn')

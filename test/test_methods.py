@@ -13,6 +13,8 @@
 # limitations under the License.
 """The alignment methods on noise-free flights, and what they say of themselves."""
 
+from dataclasses import replace
+
 from alignment import aligned, error_deg, error_of, normalised_error, simulated
 from ins_align.estimator import NOTHING_NEW
 from ins_align.methods import Fit
@@ -116,3 +118,4 @@ def test_a_posteriori_factor_only_widens():
     empty = Fit(chi2=0.0, dof=0, innovation=NOTHING_NEW, converged=True, rejected_velocity=0,
                 rejected_position=0, rejected=0, offered=2, delay=0.0)
     assert good.factor == 1.0 and bad.factor == 2.0 and empty.factor == np.inf
+    assert replace(bad, lasting=4.0).factor == 4.0 and replace(good, lasting=1.5).factor == 1.0
