@@ -27,7 +27,7 @@ import math
 
 from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals, SensorErrors
-from ins_align.rotation import apply, Array, cross
+from ins_align.rotation import apply, Array, cross, Index
 from ins_align.solution import Course, NoiseLevels, Solution
 from ins_align.unknowns import (ACCEL_MATRIX, DELAY, GYRO_BIAS, GYRO_MATRIX, LEVER_ARM, Prior,
                                 SIZE, START_POSITION, START_VELOCITY, Unknowns)
@@ -321,10 +321,11 @@ class MapEstimator:
 
     # Solution
 
-    def _start(self, point: Unknowns) -> Solution:
-        """Return an empty solution at a linearisation point."""
-        return Solution(point, self.prior, self.columns, self.size, self.noise,
-                        self._rate_random_walk)
+    def _start(self, point: Unknowns, prior: Prior | None = None, columns: Index | None = None,
+               noise: NoiseLevels | None = None) -> Solution:
+        """Return an empty solution; with another prior, unknowns or noise where given."""
+        return Solution(point, prior or self.prior, self.columns if columns is None else columns,
+                        self.size, noise or self.noise, self._rate_random_walk)
 
     def _converge(self, point: Unknowns, P: 'Array | None', refused: np.ndarray) -> Solution:
         """
@@ -400,9 +401,10 @@ class MapEstimator:
         if self.noise != before:
             self._fit()
 
-    def _rerun(self, point: Unknowns) -> tuple[Solution, Whitened]:
-        """Take the stored epochs once more, with the noise as it is taken to be now."""
-        solution = self._start(point)
+    def _rerun(self, point: Unknowns, prior: Prior | None = None, columns: Index | None = None,
+               noise: NoiseLevels | None = None) -> tuple[Solution, Whitened]:
+        """Take the stored epochs once more, as `_start` has it."""
+        solution = self._start(point, prior, columns, noise)
         return solution, self._run(solution, None, self._refused[:self.count])
 
     def _tune_excess(self, s: Solution) -> None:
@@ -520,15 +522,10 @@ class MapEstimator:
             Before the first solution.
 
         """
-        if self.solution is None:
-            raise RuntimeError('no solution yet')
         prior, columns = self.prior, self.columns
         for block, std in free:
             prior, columns = prior.loosened(block, std), np.union1d(columns, np.r_[block])
-        other = Solution(self.solution.point, prior, columns, self.size, self.noise,
-                         self._rate_random_walk)
-        self._run(other, None, self._refused[:self.count])
-        return other
+        return self._rerun(self._solved.point, prior, columns)[0]
 
     def gnss_share(self, of_prior: float) -> float:
         """
@@ -547,16 +544,12 @@ class MapEstimator:
             Before the first solution.
 
         """
-        s = self.solution
-        if s is None:
-            raise RuntimeError('no solution yet')
+        s = self._solved
         velocities, positions = self.noise.gnss
         # With twice the noise there is so much more of the variance.
-        noisier = Solution(
+        noisier, _ = self._rerun(
             s.point, replace(self.prior, information=self.prior.information / (1.0 + of_prior)),
-            self.columns, self.size,
-            self.noise._replace(gnss=(2.0 * velocities, 2.0 * positions)), self._rate_random_walk)
-        self._run(noisier, None, self._refused[:self.count])
+            noise=self.noise._replace(gnss=(2.0 * velocities, 2.0 * positions)))
         more = np.concatenate([noisier.P.diagonal()[:3] / s.P.diagonal()[:3],
                                noisier.covariance.diagonal() / s.covariance.diagonal()])
         return float(np.clip(np.max(more) - 1.0, 0.0, 1.0))
@@ -566,6 +559,12 @@ class MapEstimator:
         return self._corrected(slice(0, self.count), SensorErrors.none())
 
     # Results
+
+    @property
+    def _solved(self) -> Solution:
+        if self.solution is None:
+            raise RuntimeError('no solution yet')
+        return self.solution
 
     @property
     def converged(self) -> bool:
@@ -630,7 +629,5 @@ class MapEstimator:
             Before the first solution.
 
         """
-        s = self.solution
-        if s is None:
-            raise RuntimeError('no solution yet')
+        s = self._solved
         return s.C, s.covariance
