@@ -286,9 +286,7 @@ class MapMethod:
 
     def _move_start(self) -> None:
         """Move t0 to the last epoch; what was learnt becomes the prior."""
-        self._estimator.settle(last=True)
-        self._told.ask(self._estimator)
-        self._correlation.ask(self._estimator)
+        self.settle(last=True)
         track = self._track
         fit = self.fit()
         if self._lost:
@@ -337,9 +335,9 @@ class MapMethod:
                    self._delay(solution.estimate), self._estimator.noise.gnss,
                    self._told.objection, self._correlation.attitude)
 
-    def settle(self) -> None:
-        """Relinearise now if that is worth it at all, and doubt what was told."""
-        self._estimator.settle()
+    def settle(self, last: bool = False) -> None:
+        """Relinearise now if that is worth it; doubt what was told, and that errors are white."""
+        self._estimator.settle(last)
         self._told.ask(self._estimator)
         self._correlation.ask(self._estimator)
 
