@@ -24,13 +24,12 @@ from copy import copy
 
 from ins_align.alignment import Alignment
 from ins_align.config import Config, ConfigError, parameters
-from ins_align.declaration import State
 from ins_align.earth import EARTH_RATE
 from ins_align.intake import Intake
 from ins_align.messages import Fix, Velocity
 from ins_align.plausibility import IMU_BEFORE, without_spikes
 from ins_align.prediction import Prediction
-from ins_align.results import Attitude, Epoch, Status
+from ins_align.results import Attitude, Epoch, State, Status
 from ins_align.rotation import Array
 import numpy as np
 

@@ -23,12 +23,12 @@ import math
 
 from ins_align.antenna import AntennaEpoch
 from ins_align.config import Config
-from ins_align.declaration import Declaration, State, Verdict
+from ins_align.declaration import Declaration
 from ins_align.intake import Afresh, Loss, Run, Start, Step, Wait
 from ins_align.methods import MapMethod, Method, NoteMethod, Nuisance
 from ins_align.plausibility import ForceCheck
 from ins_align.preintegration import SensorErrors
-from ins_align.results import Attitude, Epoch, Status
+from ins_align.results import Attitude, Epoch, State, Status, Verdict
 from ins_align.unknowns import Prior
 import numpy as np
 

@@ -19,25 +19,13 @@ under its threshold; the residuals must pass; both must have held for a while.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from enum import Enum
 import math
 
 from ins_align.config import Config
 from ins_align.methods import Fit
+from ins_align.results import State, Verdict
 from ins_align.rotation import Array
 from ins_align.told import seem_late
-
-
-class State(str, Enum):
-    """State of an alignment."""
-
-    WAITING_FOR_IMU = 'WAITING_FOR_IMU'
-    WAITING_FOR_GNSS = 'WAITING_FOR_GNSS'
-    ALIGNING = 'ALIGNING'
-    LEVELLED = 'LEVELLED'
-    ALIGNED = 'ALIGNED'
-    FAULT = 'FAULT'
 
 
 # Mean square of normalised residuals above which the model is contradicted.
@@ -55,14 +43,6 @@ DELAY_SIGMAS, MAX_DELAY = 3.0, 0.3
 MENTIONED = 1.5
 # Epochs over which the latest innovations are averaged.
 RECENT = 25
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """State and the reason for it."""
-
-    state: State
-    reason: str
 
 
 class Declaration:

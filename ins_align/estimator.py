@@ -419,10 +419,10 @@ class MapEstimator:
         for trial in (before / self.TUNE_STEP, before * self.TUNE_STEP):
             if not 0.99 * FIRST_NOISE.excess <= trial <= self.MAX_EXCESS:
                 continue
-            self.noise = self.noise._replace(excess=trial)
-            solution, _ = self._rerun(s.estimate)
+            noise = self.noise._replace(excess=trial)
+            solution, _ = self._rerun(s.estimate, noise=noise)
             if solution.log_likelihood > likelihood:
-                best, likelihood = self.noise, solution.log_likelihood
+                best, likelihood = noise, solution.log_likelihood
         self.noise = best
 
     def _tune_gnss(self, point: Unknowns) -> None:

@@ -25,10 +25,10 @@ from typing import NamedTuple, Union
 from ins_align.antenna import Antenna, AntennaEpoch
 from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer, MAX_GAP_NS, PAIR_NS
 from ins_align.config import Config
-from ins_align.declaration import State, Verdict
 from ins_align.imu_steps import ImuCutter, ImuSteps
 from ins_align.messages import Fix, Velocity
 from ins_align.plausibility import stuck
+from ins_align.results import State, Verdict
 from ins_align.rotation import Array
 import numpy as np
 

@@ -27,12 +27,11 @@ from ins_align.ahead import run_ahead
 from ins_align.alignment import Alignment
 from ins_align.bags import Topics
 from ins_align.config import Config
-from ins_align.declaration import State
 from ins_align.decoding import Orientations
 from ins_align.intake import Intake, Step
 from ins_align.messages import Fix
 from ins_align.reading import Part, read, Request
-from ins_align.results import Attitude, Epoch, Status
+from ins_align.results import Attitude, Epoch, State, Status
 from ins_align.rotation import (
     Array, exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw)
 import numpy as np
@@ -238,12 +237,13 @@ def _prepared(request: Request) -> Generator[_Prepared, None, None]:
         fixes = [(message.stamp_ns, message.latitude_deg, message.longitude_deg)
                  for _, message in part.gnss if isinstance(message, Fix)]
         intake.prepare()
-        yield _Prepared(part.topics, part.config, intake.take_steps(), fixes, part.orientations,
-                        Counter(intake.counts), part.done, part.warnings)
+        prepared = _Prepared(part.topics, part.config, intake.take_steps(), fixes,
+                             part.orientations, Counter(intake.counts), part.done, part.warnings)
+        yield prepared
     assert intake is not None
     intake.prepare(last=True)
-    yield _Prepared(part.topics, part.config, intake.take_steps(), [], part.orientations,
-                    Counter(intake.counts), part.done, part.warnings)
+    # Of the last part, which has no messages.
+    yield prepared._replace(steps=intake.take_steps(), counts=Counter(intake.counts))
 
 
 def _feed(intake: Intake, part: Part) -> None:

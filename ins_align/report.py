@@ -21,12 +21,11 @@ import os
 from pathlib import Path
 from typing import Any, IO, TYPE_CHECKING
 
-from ins_align.declaration import State
+from ins_align.results import Epoch, State
 import numpy as np
 
 if TYPE_CHECKING:
     from ins_align.replay import ReplayResult
-    from ins_align.results import Epoch
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 

@@ -11,14 +11,33 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What an alignment yields: attitudes, epochs, the status."""
+"""What an alignment yields: its state, attitudes, epochs, the status."""
 
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
 
-from ins_align.declaration import State
 from ins_align.rotation import Array, quaternion_from_matrix, roll_pitch_yaw
 import numpy as np
+
+
+class State(str, Enum):
+    """State of an alignment."""
+
+    WAITING_FOR_IMU = 'WAITING_FOR_IMU'
+    WAITING_FOR_GNSS = 'WAITING_FOR_GNSS'
+    ALIGNING = 'ALIGNING'
+    LEVELLED = 'LEVELLED'
+    ALIGNED = 'ALIGNED'
+    FAULT = 'FAULT'
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """State and the reason for it."""
+
+    state: State
+    reason: str
 
 
 @dataclass(frozen=True)

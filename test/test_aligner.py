@@ -17,9 +17,8 @@ from dataclasses import replace
 
 from alignment import (aligned, config_for, error_deg, error_of, LEVER, normalised_error,
                        simulated)
-from ins_align.aligner import Aligner
+from ins_align.aligner import Aligner, State
 from ins_align.config import Config, ConfigError, ImuNoise
-from ins_align.declaration import State
 from ins_align.experiments.declare import largest, run_trial, trial
 from ins_align.rotation import exp_so3, matrix_from_quaternion, roll_pitch_yaw
 from ins_align.scenarios import Motion, Scenario, SCENARIOS

@@ -14,9 +14,10 @@
 """When something is declared, held back and withdrawn, and the words for it."""
 
 from ins_align.config import Config
-from ins_align.declaration import Declaration, State
+from ins_align.declaration import Declaration
 from ins_align.estimator import Innovation
 from ins_align.methods import Fit
+from ins_align.results import State
 import numpy as np
 import pytest
 

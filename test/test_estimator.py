@@ -21,11 +21,11 @@ from alignment import (aligned, config_for, error_of, estimator_of, LEVER, norma
                        simulated)
 from ins_align import scenarios
 from ins_align.config import PRESETS
-from ins_align.declaration import State
 from ins_align.estimator import MapEstimator
 from ins_align.experiments.dense import bound, dense_solution
 from ins_align.methods import MapMethod
 from ins_align.preintegration import Noise, preintegrate, SensorErrors, Steps
+from ins_align.results import State
 from ins_align.rotation import log_so3
 from ins_align.scenarios import Motion
 from ins_align.simulation import simulate

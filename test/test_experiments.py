@@ -17,9 +17,8 @@ import json
 import math
 
 from ins_align import experiments
-from ins_align.aligner import Attitude
+from ins_align.aligner import Attitude, State
 from ins_align.config import PRESETS
-from ins_align.declaration import State
 from ins_align.experiments import bound, common, compare, cost, declare, note, recorded
 from ins_align.rotation import exp_so3, matrix_from_rpy
 from ins_align.simulation import simulate, write_bag

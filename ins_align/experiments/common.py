@@ -25,9 +25,8 @@ from pathlib import Path
 import sys
 from typing import Any, NamedTuple
 
-from ins_align.aligner import Attitude, Epoch
+from ins_align.aligner import Attitude, Epoch, State
 from ins_align.config import Config
-from ins_align.declaration import State
 from ins_align.report import format_table, write_whole
 from ins_align.rotation import Array, log_so3
 from ins_align.simulation import Simulation

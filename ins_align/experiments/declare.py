@@ -25,9 +25,8 @@ import itertools
 from pathlib import Path
 from typing import Any
 
-from ins_align.aligner import Aligner, Epoch
+from ins_align.aligner import Aligner, Epoch, State
 from ins_align.config import Config
-from ins_align.declaration import State
 from ins_align.experiments.bound import crossing_time
 from ins_align.experiments.common import (
     config_for, error_of, exact_config_for, first_in, GRADES, parallel, Report)

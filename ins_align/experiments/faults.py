@@ -30,9 +30,8 @@ from types import SimpleNamespace
 from typing import Any
 import warnings
 
-from ins_align.aligner import Aligner, Attitude, Epoch
+from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
-from ins_align.declaration import State
 from ins_align.experiments.common import config_for, error_of, GRADES, parallel, Report
 from ins_align.experiments.spoilt import FAULTS, SECOND, Stream, stream_of
 from ins_align.messages import fix_from_msg, imu_from_msg, MessageError, velocity_from_msg
