@@ -23,6 +23,7 @@ from collections import Counter
 from copy import copy
 
 from ins_align.alignment import Alignment
+from ins_align.buffers import MAX_GAP_NS
 from ins_align.config import Config, ConfigError, parameters
 from ins_align.earth import EARTH_RATE
 from ins_align.intake import Intake
@@ -154,7 +155,11 @@ class Aligner:
         return events
 
     def attitude_now(self) -> Attitude | None:
-        """Return the current attitude carried on with the gyros to the newest IMU sample."""
+        """
+        Return the current attitude carried on with the gyros to the newest IMU sample.
+
+        None before there is one, and after a gap of the IMU.
+        """
         prediction = self.prediction()
         return None if prediction is None else Attitude(prediction.stamp_ns,
                                                         *prediction.matrices())
@@ -168,6 +173,8 @@ class Aligner:
         start_ns = current.stamp_ns if self._now is None else self._now.stamp_ns
         stamps = imu.stamps
         first = int(np.searchsorted(stamps, start_ns, side='right'))
+        if np.any(np.diff(stamps[first:], prepend=start_ns) > MAX_GAP_NS):
+            return None                             # nobody knows how it has turned since
         looked_at = max(first - IMU_BEFORE, 0)
         samples, _ = without_spikes(stamps[looked_at:], imu.samples[looked_at:])
         rates = samples[:, :3]

@@ -20,10 +20,12 @@ other, and tells what has become of it.
 
 from collections import Counter
 import math
+from typing import NamedTuple
 
 from ins_align.antenna import AntennaEpoch
 from ins_align.config import Config
 from ins_align.declaration import Declaration
+from ins_align.handover import aged
 from ins_align.intake import Afresh, Loss, Run, Start, Step, Wait
 from ins_align.methods import MapMethod, Method, NoteMethod, Nuisance
 from ins_align.plausibility import ForceCheck
@@ -33,6 +35,13 @@ from ins_align.unknowns import Prior
 import numpy as np
 
 _NOTHING_YET = Verdict(State.WAITING_FOR_IMU, 'no IMU sample yet')
+
+
+class _Learnt(NamedTuple):
+    """What an alignment that is over has learnt of sensors, lever arm and delay, and when."""
+
+    prior: Prior
+    stamp_ns: int
 
 
 class Alignment:
@@ -64,11 +73,11 @@ class Alignment:
         self._first_t0_ns: int | None = None
         self._forget(None)
 
-    def _forget(self, prior: Prior | None) -> None:
-        """Forget everything but the counts and a prior."""
+    def _forget(self, learnt: '_Learnt | None') -> None:
+        """Forget everything but the counts and what was learnt of sensors, lever arm and delay."""
         if self._method is not None:
             self._epochs.update(_epoch_counts(self._method))
-        self._prior = prior
+        self._learnt = learnt
         self._method = None
         self._declaration = Declaration(self.config)
         self._force_check = ForceCheck()
@@ -107,10 +116,18 @@ class Alignment:
         if self._first_t0_ns is None:
             self._first_t0_ns = epoch.stamp_ns
         if self.config.method == 'map':
-            self._method = MapMethod(self.config, epoch, step.imu, step.use_position, self._prior)
+            self._method = MapMethod(self.config, epoch, step.imu, step.use_position,
+                                     self._prior(epoch.stamp_ns))
         else:
             self._method = NoteMethod(self.config, epoch, step.imu, epoch.v_n is None)
         return self._judge(self._method, epoch, step.first.fault)
+
+    def _prior(self, stamp_ns: int) -> Prior | None:
+        """Return what is known at a stamp of what was learnt before."""
+        if self._learnt is None:
+            return None
+        prior, learnt_ns = self._learnt
+        return aged(prior, self.config.imu_noise, (stamp_ns - learnt_ns) * 1e-9)
 
     def _advance(self, run: Run) -> list[Epoch]:
         method = self._method
@@ -126,12 +143,13 @@ class Alignment:
 
     def _lose(self, why: str) -> None:
         """Start over; what was learnt of the sensors is kept."""
-        prior = self._prior
-        if self._method is not None:
+        learnt = self._learnt
+        if self._method is not None and self._stamp_ns is not None:
             self.counts['restarts'] += 1
             self._events.append(f'alignment starts over: {why}')
             prior = self._method.prior_without_attitude()
-        self._forget(prior)
+            learnt = None if prior is None else _Learnt(prior, self._stamp_ns)
+        self._forget(learnt)
 
     def _judge(self, method: Method, epoch: AntennaEpoch, fault: str) -> Epoch:
         """Results and state after an epoch; `fault` is what is known to be wrong with the GNSS."""
@@ -162,7 +180,7 @@ class Alignment:
             self.current = Attitude(stamp_ns, current[0], current[1] * scale)
         fault = self._force_check.fault or fault
         if fault:
-            self._declaration.levelled = self._declaration.aligned = False
+            self._declaration.withdraw()
             verdict = Verdict(State.FAULT, fault)
         method.judged(self._declaration.contradicted or bool(fault),
                       verdict.state in (State.LEVELLED, State.ALIGNED))

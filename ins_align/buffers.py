@@ -57,13 +57,14 @@ class ImuBuffer:
         How far out of order a sample may arrive.
     counts : Counter
         Where samples are counted: ``imu``, ``imu_nan``, ``imu_duplicate``, ``imu_out_of_order``,
-        ``imu_late``.
+        ``imu_late``, ``imu_ahead``.
 
     """
 
     def __init__(self, lateness_ns: int, counts: Counter[str]) -> None:
         """Start empty."""
         self._lateness_ns = lateness_ns
+        self._reach_ns = max(lateness_ns, MAX_GAP_NS)
         self._counts = counts
         self.stamps = np.zeros(0, np.int64)
         self.samples = np.zeros((0, 6))
@@ -73,12 +74,26 @@ class ImuBuffer:
         self.newest_ns: int | None = None
         self.used_ns = -(1 << 62)
         self._suspect_ns: int | None = None
+        # A sample far ahead of the others, until the next one shows whether time goes on there.
+        self._ahead: tuple[int, Array, Array] | None = None
         # The samples in a row behind the newest one: that one, the first, the last, how many.
         self._behind: tuple[int | None, int, int, int] = None, 0, 0, 0
         self.jumped_to_ns: int | None = None
 
     def add(self, stamp_ns: int, gyro: Array, accel: Array) -> None:
         """Append one sample."""
+        if self._ahead is not None:
+            ahead, self._ahead = self._ahead, None
+            if stamp_ns >= ahead[0] - self._lateness_ns:
+                self._append(*ahead)
+            else:
+                self._counts['imu_ahead'] += 1
+        if self.newest_ns is not None and stamp_ns > self.newest_ns + self._reach_ns:
+            self._ahead = stamp_ns, gyro, accel
+        else:
+            self._append(stamp_ns, gyro, accel)
+
+    def _append(self, stamp_ns: int, gyro: Array, accel: Array) -> None:
         newest = self.newest_ns
         if newest is not None and stamp_ns < newest - self._lateness_ns:
             self._old_sample(stamp_ns)
@@ -106,8 +121,10 @@ class ImuBuffer:
         """
         if stamps_ns.size == 0:
             return 0
-        ordered = (np.all(stamps_ns[1:] > stamps_ns[:-1])
-                   and (self.newest_ns is None or stamps_ns[0] > self.newest_ns))
+        before_ns = self.newest_ns if stamps_ns.size == 1 else stamps_ns[-2]
+        ordered = (self._ahead is None and np.all(stamps_ns[1:] > stamps_ns[:-1])
+                   and (self.newest_ns is None or stamps_ns[0] > self.newest_ns)
+                   and (before_ns is None or stamps_ns[-1] <= before_ns + self._reach_ns))
         if not ordered:
             for k, (stamp_ns, g, a) in enumerate(zip(stamps_ns.tolist(), gyro, accel)):
                 self.add(stamp_ns, g, a)
@@ -150,8 +167,15 @@ class ImuBuffer:
                                      np.array(self._new_samples, float)))
             self._new_stamps, self._new_samples = [], []
 
-    def consolidate(self) -> None:
-        """Sort what is new into the arrays, without what is broken, late or there twice."""
+    def consolidate(self, last: bool = False) -> None:
+        """
+        Sort what is new into the arrays, without what is broken, late or there twice.
+
+        `last`: nothing comes any more.
+        """
+        if last and self._ahead is not None:
+            self._counts['imu_ahead'] += 1
+            self._ahead = None
         self._flatten()
         if not self._new_arrays:
             return

@@ -41,6 +41,8 @@ MIN_DOF = 12
 DELAY_SIGMAS, MAX_DELAY = 3.0, 0.3
 # Factor on variances that is worth a word.
 MENTIONED = 1.5
+# Conditions that have to hold are seen to hold at epochs that are no further apart than this (s).
+MAX_SILENCE = 30.0
 # Epochs over which the latest innovations are averaged.
 RECENT = 25
 
@@ -116,7 +118,7 @@ class Declaration:
                                        and tilt_now <= max_tilt and heading_now <= max_heading)
         self.later_start = False
         if contradiction:
-            self.levelled = self.aligned = False
+            self.withdraw()
             return Verdict(State.ALIGNING, contradiction)
         self.levelled = self.levelled or self._held(self._level_since_s, time_s)
         doubt = ''
@@ -124,7 +126,7 @@ class Declaration:
             doubt = unconfirmed()
             self.aligned = not doubt and tilt <= max_tilt and heading <= max_heading
             self.later_start = not doubt and not self.aligned
-        self._withdraw(tilt, heading)
+        self._withdraw_lost(tilt, heading)
         if doubt:
             return Verdict(State.LEVELLED if self.levelled else State.ALIGNING, doubt)
         return self._verdict(tilt, heading, fit)
@@ -147,16 +149,23 @@ class Declaration:
 
         """
         silence = f'no GNSS for {silent_s:.0f} s'
+        if silent_s > MAX_SILENCE:
+            self._level_since_s = self._heading_since_s = None
         if self.levelled or self.aligned:
             tilt, heading = (max(worse) for worse in zip(*(
                 _sigmas_deg(P, fit.factor) for P in (initial, current))))
-            self._withdraw(tilt, heading)
+            self._withdraw_lost(tilt, heading)
         if self.levelled or self.aligned:
             verdict = self._verdict(tilt, heading, fit)
             return Verdict(verdict.state, f'{verdict.reason}; {silence}')
         return Verdict(State.ALIGNING, silence)
 
-    def _withdraw(self, tilt: float, heading: float) -> None:
+    def withdraw(self) -> None:
+        """Withdraw all that is declared; what was good until now counts no more."""
+        self.levelled = self.aligned = False
+        self._level_since_s = self._heading_since_s = None
+
+    def _withdraw_lost(self, tilt: float, heading: float) -> None:
         """Keep what was declared until its sigma has clearly grown."""
         max_tilt = WITHDRAWN_AT * self.config.tilt_std_threshold
         self.levelled = self.levelled and tilt <= max_tilt

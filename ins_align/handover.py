@@ -14,14 +14,40 @@
 """Moving t0: what an estimator knows at its last epoch becomes the prior of the next one."""
 
 from dataclasses import replace
+import math
 
+from ins_align.config import ImuNoise
 from ins_align.earth import EARTH_RATE
 from ins_align.estimator import MapEstimator
 from ins_align.rotation import Array, exp_so3, skew
-from ins_align.unknowns import (ACCEL, ATTITUDE, BODY_FIXED, GYRO, GYRO_BIAS, Prior, prior_of,
-                                SIZE, START_POSITION, START_VELOCITY, Unknowns)
+from ins_align.unknowns import (ACCEL, ACCEL_BIAS, ATTITUDE, BODY_FIXED, GYRO, GYRO_BIAS, Prior,
+                                prior_of, SIZE, START_POSITION, START_VELOCITY, Unknowns)
 from ins_align.whitening import HEADING_RESOLVED_STD, START
 import numpy as np
+# Biases wander by this share of their prior sigma in this time (s).
+WANDER, WANDER_TIME = 0.3, 100.0
+
+
+def wander(noise: ImuNoise) -> Array:
+    """
+    Return the variance by which the unknowns change in a second, shape (37,).
+
+    Beside a rate random walk of the gyroscopes, which the estimator counts all the time.
+    """
+    variance = np.zeros(SIZE)
+    if noise.rate_random_walk == 0.0:
+        variance[GYRO_BIAS] = (WANDER * noise.gyro_bias_std) ** 2 / WANDER_TIME
+    variance[ACCEL_BIAS] = (WANDER * noise.accel_bias_std) ** 2 / WANDER_TIME
+    return variance
+
+
+def aged(prior: Prior, noise: ImuNoise, seconds: float) -> Prior:
+    """Return what is left of what was known, after a time in which nothing was measured."""
+    variance = wander(noise)
+    variance[GYRO_BIAS] += noise.rate_random_walk ** 2
+    for block in (GYRO_BIAS, ACCEL_BIAS):
+        prior = prior.loosened(block, math.sqrt(variance[block.start] * seconds))
+    return prior
 
 
 def prior_from_now(estimator: MapEstimator, C_n0n: Array, shift_v: Array, shift_p: Array,

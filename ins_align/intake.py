@@ -38,6 +38,7 @@ DRY_INTERVAL_NS = 2_000_000_000
 NO_VELOCITY_NS = 2_000_000_000
 # The IMU samples of a run of epochs that are handled at one go, and what an epoch costs beside.
 MAX_RUN_SAMPLES, EPOCH_SAMPLES = 4096, 16
+_NO_SAMPLE = f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s'
 
 
 class Located(NamedTuple):
@@ -145,7 +146,6 @@ class Intake:
         """Wait for the first messages."""
         self._config = config
         self.counts: Counter[str] = Counter()
-        self._refusal = ''                          # why messages cannot be used
         self._delay_ns = round(config.gnss_delay * 1e9)
         self._lateness_ns = round(config.gnss_lateness * 1e9) + max(self._delay_ns, 0)
         self.steps: list[Step] = []
@@ -156,6 +156,7 @@ class Intake:
         """Forget everything but the counts."""
         self.imu = ImuBuffer(self._lateness_ns, self.counts)
         self._cutter = ImuCutter(self._config.imu_noise, self.imu, self.counts)
+        self._refusal = ''                          # why messages cannot be used
         self._gnss = GnssBuffer(self._lateness_ns, self.counts,
                                 0 if self._config.use_velocity is False else PAIR_NS)
         self._forget_epochs()
@@ -198,6 +199,7 @@ class Intake:
 
     def add_velocity(self, velocity: Velocity) -> None:
         """Take a GNSS velocity."""
+        self._refusal = ''
         self._gnss.add_velocity(velocity._replace(stamp_ns=velocity.stamp_ns - self._delay_ns),
                                 self.imu.newest_ns)
 
@@ -230,7 +232,7 @@ class Intake:
 
         `last`: at the end of a recording nothing comes any more at all.
         """
-        self.imu.consolidate()
+        self.imu.consolidate(last)
         if self.imu.newest_ns is None or self.imu.stamps.size < 4:
             return
         stamps = self.imu.stamps
@@ -244,9 +246,17 @@ class Intake:
         waiting_ns = self._gnss.oldest_ns
         self._dry_epochs(upto_ns if waiting_ns is None else min(upto_ns, waiting_ns))
         self._cut_run()
+        # Samples come, but none that could be used.
+        silent = self.imu.newest_ns - self._lateness_ns - int(stamps[-1]) > MAX_GAP_NS
+        if self._last_ns is not None and silent:
+            self.counts['imu_gap'] += 1
+            self._lose(_NO_SAMPLE)
         if self._last_ns is None:
             self._cutter.forget_before(upto_ns)
-            if not self._waits:
+            if silent:
+                self._wait(State.WAITING_FOR_IMU, _NO_SAMPLE)
+                self._waits = False
+            elif not self._waits:
                 self._wait(State.WAITING_FOR_GNSS, 'no GNSS position yet')
 
     def _wait(self, state: State, reason: str) -> None:
@@ -290,8 +300,7 @@ class Intake:
         """When the IMU says nothing, in what is buffered; `blind`: too much was missed (ns)."""
         stamps = self.imu.stamps
         last = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
-        why = f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s'
-        silences = [_Silence(start, end, 'imu_gap', why) for start, end in
+        silences = [_Silence(start, end, 'imu_gap', _NO_SAMPLE) for start, end in
                     zip(stamps[last].tolist(), stamps[last + 1].tolist())]
         # An epoch is taken when the IMU is ahead by the lateness: what is known by then, not what
         # is known when somebody looks.

@@ -28,7 +28,7 @@ from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.correlation import Correlation
 from ins_align.estimator import FIRST_NOISE, Innovation, MapEstimator, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
-from ins_align.handover import prior_from_now, prior_without_attitude
+from ins_align.handover import prior_from_now, prior_without_attitude, wander
 from ins_align.imu_steps import ImuSteps
 from ins_align.preintegration import Noise, preintegrate, SensorErrors
 from ins_align.rotation import Array, orthonormalized
@@ -40,8 +40,6 @@ from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_B
 from ins_align.whitening import Measurements
 import numpy as np
 
-# Biases wander by this share of their prior sigma in this time (s).
-WANDER, WANDER_TIME = 0.3, 100.0
 # After t0 has moved, the fit so far counts like this many rows.
 PAST_DOF = 300
 # Beside velocities positions gain little and hurt when their errors wander: where a method may
@@ -157,7 +155,7 @@ class MapMethod:
         Of no length, at t0.
     use_position : bool
     prior : Prior, optional
-        From an earlier alignment.
+        From an earlier alignment, as of t0.
     capacity : int
         Epochs that the estimator stores.
 
@@ -173,10 +171,7 @@ class MapMethod:
         self.moved = 0
         noise = config.imu_noise
         self._estimates_matrices = noise.gyro_scale_std > 0
-        self._wander = np.zeros(SIZE)
-        if noise.rate_random_walk == 0.0:       # otherwise it counts all the time
-            self._wander[GYRO_BIAS] = (WANDER * noise.gyro_bias_std) ** 2 / WANDER_TIME
-        self._wander[ACCEL_BIAS] = (WANDER * noise.accel_bias_std) ** 2 / WANDER_TIME
+        self._wander = wander(noise)
         self._first_prior = first_prior(
             noise.gyro_bias_std, noise.accel_bias_std, np.array(config.lever_arm),
             config.lever_arm_std, 0.0, config.gnss_delay_std, noise.gyro_scale_std,
@@ -367,7 +362,7 @@ class MapMethod:
         return sensors if solution is None else sensors._replace(gyro_bias=solution.gyro_bias)
 
     def prior_without_attitude(self) -> Prior | None:
-        """Return what a fresh start may keep."""
+        """Return what a fresh start may keep, as of the last epoch."""
         return None if self._lost else prior_without_attitude(self._estimator)
 
 

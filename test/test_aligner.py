@@ -14,11 +14,12 @@
 """The aligner as a whole: states, faults of messages, outputs, wrong set-ups."""
 
 from dataclasses import replace
+import math
 
 from alignment import (aligned, config_for, error_deg, error_of, LEVER, normalised_error,
                        simulated)
 from ins_align.aligner import Aligner, State
-from ins_align.config import Config, ConfigError, ImuNoise
+from ins_align.config import Config, ConfigError, ImuNoise, PRESETS
 from ins_align.experiments.declare import largest, run_trial, trial
 from ins_align.rotation import exp_so3, matrix_from_quaternion, roll_pitch_yaw
 from ins_align.scenarios import Motion, Scenario, SCENARIOS
@@ -183,6 +184,20 @@ def test_rejected_messages_of_an_adapter_are_counted():
 
 
 # Faults of messages
+
+def test_why_messages_were_refused_is_forgotten_when_others_come(flight):
+    aligner = Aligner(config_for(flight))
+    aligner.reject('velocity_body_frame', 'in the wrong axes')
+    aligner.add_fix(flight.fix(0))
+    aligner.add_imu(flight.imu_stamps_ns[:300], flight.gyro[:300], flight.accel[:300])
+    aligner.flush()
+    assert 'in the wrong axes' in aligner.status().reason
+    aligner.reset()
+    aligner.add_fix(flight.fix(20))
+    aligner.add_imu(flight.imu_stamps_ns[300:800], flight.gyro[300:800], flight.accel[300:800])
+    aligner.flush()
+    assert aligner.status().reason == 'no GNSS velocity yet'
+
 
 def test_clock_set_back_starts_over(flight):
     aligner = Aligner(config_for(flight))
@@ -368,6 +383,59 @@ def test_silent_imu_starts_over_and_keeps_the_biases(flight):
     assert status.t0_ns > before.t0_ns + 18 * SECOND
     assert normalised_error(status.current, flight) < chi2.ppf(0.9999, 3)
     assert np.all(status.gyro_bias_std <= 1.2 * before.gyro_bias_std)
+
+
+@pytest.mark.parametrize('seed', (1, 2))
+def test_biases_that_were_learnt_before_a_long_silence_are_doubted(seed):
+    first = simulated('flight', imu_grade='mems', duration=60.0, seed=seed)
+    silence_ns = 3 * 3600 * SECOND
+    walked = PRESETS['mems'].rate_random_walk * math.sqrt(silence_ns * 1e-9)
+    later = replace(first, imu_stamps_ns=first.imu_stamps_ns + silence_ns,
+                    gnss_stamps_ns=first.gnss_stamps_ns + silence_ns,
+                    gnss_arrival_ns=first.gnss_arrival_ns + silence_ns,
+                    gyro=first.gyro + walked * np.random.default_rng(seed).standard_normal(3))
+    aligner = Aligner(config_for(first, rate_random_walk=0.0, imu_grade='mems'))
+    feed(aligner, first)
+    epochs = feed_part(aligner, later)
+    assert aligner.status().counts['restarts'] == 1
+    assert epochs[-1].state is State.ALIGNED
+    for epoch in epochs:
+        if epoch.state is State.ALIGNED:
+            attitude = replace(epoch.current, stamp_ns=epoch.stamp_ns - silence_ns)
+            assert normalised_error(attitude, first) < chi2.ppf(0.9999, 3)
+
+
+def test_samples_without_numbers_are_no_samples(flight):
+    gyro = flight.gyro.copy()
+    gyro[1800:2600, 1] = np.nan
+    spoilt = replace(flight, gyro=gyro)
+    aligner = Aligner(config_for(flight))
+    feed_part(aligner, spoilt, 0.0, 20.5)           # 2.5 s of them
+    assert aligner.declared is None and aligner.attitude_now() is None
+    assert aligner.status().state is State.WAITING_FOR_IMU
+    feed_part(aligner, spoilt, 20.5)
+    counts = aligner.status().counts
+    assert counts['restarts'] == counts['imu_gap'] == 1 and counts['imu_nan'] == 800
+    assert normalised_error(aligner.status().current, flight) < chi2.ppf(0.9999, 3)
+
+
+def test_no_attitude_is_carried_over_a_gap_of_the_imu(flight):
+    aligner = Aligner(config_for(flight))
+    feed_part(aligner, flight, 0.0, 20.0)
+    assert aligner.attitude_now() is not None
+    feed_part(aligner, flight, 20.6, 20.7)
+    assert aligner.attitude_now() is None
+
+
+def test_a_single_imu_stamp_far_ahead_loses_nothing(flight, result):
+    stamps = flight.imu_stamps_ns.copy()
+    stamps[1500] += 5 * SECOND
+    aligner = Aligner(config_for(flight))
+    give_all(aligner, replace(flight, imu_stamps_ns=stamps))
+    status = aligner.status()
+    assert status.counts['imu_ahead'] == 1 and status.counts.get('clock_jumps', 0) == 0
+    assert status.t0_ns == result[0].status().t0_ns
+    assert np.allclose(status.current.C_nb, result[0].status().current.C_nb, atol=1e-4)
 
 
 def test_short_gaps_of_the_imu_are_survived_and_doubted(flight):

@@ -87,9 +87,34 @@ def test_broken_values_are_dropped_and_counted(value, column):
 
 def test_sample_later_than_allowed_is_counted_and_dropped():
     buffer, counts = imu_buffer()
-    fill(buffer, [0, 2000 * MS, 10 * MS, 2010 * MS])
-    assert held(buffer) == [0, 2000 * MS, 2010 * MS]
+    fill(buffer, [0, 1000 * MS, 2000 * MS, 10 * MS, 2010 * MS])
+    assert held(buffer) == [0, 1000 * MS, 2000 * MS, 2010 * MS]
     assert counts['imu_late'] == 1 and buffer.jumped_to_ns is None
+
+
+@pytest.mark.parametrize('at_once', (True, False))
+@pytest.mark.parametrize('wild', (1500 * MS, 10 ** 18))
+def test_single_sample_far_ahead_is_of_another_clock(wild, at_once):
+    buffer, counts = imu_buffer()
+    stamps = [0, 10 * MS, wild, 20 * MS, 30 * MS, wild]
+    if at_once:
+        gyro, accel = (np.array(values) for values in zip(*map(sample_of, stamps)))
+        assert buffer.add_many(np.array(stamps), gyro, accel) == 6
+    else:
+        fill(buffer, stamps)
+    assert buffer.newest_ns == 30 * MS and buffer.jumped_to_ns is None
+    buffer.consolidate(last=True)
+    assert held(buffer) == [0, 10 * MS, 20 * MS, 30 * MS]
+    assert counts['imu_ahead'] == 2 and counts['imu'] == 4
+
+
+def test_time_goes_on_where_a_second_sample_says_so():
+    buffer, counts = imu_buffer()
+    fill(buffer, [0, 3000 * MS])
+    assert buffer.newest_ns == 0
+    fill(buffer, [2990 * MS])                   # out of order, within the lateness
+    assert held(buffer) == [0, 2990 * MS, 3000 * MS]
+    assert buffer.newest_ns == 3000 * MS and counts['imu_ahead'] == 0
 
 
 def test_sample_before_what_is_used_up_is_late():

@@ -76,6 +76,23 @@ def test_a_lapse_starts_the_hold_again():
     assert judge(declaration, 4.0, 0.0, GOOD).state is State.ALIGNED
 
 
+def test_what_was_withdrawn_has_to_hold_again():
+    declaration = Declaration(Config(hold_time=2.0))
+    assert judge(declaration, 0.0, 3.0, GOOD).state is State.ALIGNED
+    declaration.withdraw()
+    assert judge(declaration, 3.2, 1.8, GOOD).state is State.ALIGNING
+    assert judge(declaration, 5.2, 0.0, GOOD).state is State.ALIGNED
+
+
+def test_a_minute_without_gnss_holds_nothing():
+    declaration = Declaration(Config(hold_time=2.0))
+    judge(declaration, 0.0, 0.0, GOOD)
+    for silent in range(2, 62, 2):
+        declaration.update_without_gnss(float(silent), GOOD, GOOD, fit())
+    assert judge(declaration, 62.0, 1.8, GOOD).state is State.ALIGNING
+    assert judge(declaration, 64.0, 0.0, GOOD).state is State.ALIGNED
+
+
 def test_sigma_is_widened_by_the_misfit():
     misfit = fit(chi2=300.0 * 9 / 4)
     wide = covariance(0.1, 0.8)                       # times 1.5: 1.2 degrees

@@ -156,7 +156,7 @@ def test_handover_gives_the_attitude_of_one_that_never_handed_over(changes, walk
     # is left of second order.
     monkeypatch.setattr('ins_align.methods.Fit.factor', 1.0)
     monkeypatch.setattr('ins_align.methods.Fit.significant_scale', 1.0)
-    monkeypatch.setattr('ins_align.methods.WANDER', 0.0)
+    monkeypatch.setattr('ins_align.handover.WANDER', 0.0)
     monkeypatch.setattr(MapEstimator, 'NONLINEARITY', 0.01)
     s = simulated('flight', imu_grade='tactical', duration=30.0, seed=2, position_std=0.5,
                   rate_random_walk=walk * PRESETS['tactical'].gyro_bias_std)

@@ -288,9 +288,10 @@ def miscounted(counts: dict[str, int], stream: Stream) -> list[str]:
             wrong.append(f'{refused} of {number} {name} refused')
     # A sample that is late when it comes is not looked at any more, one that is found late later
     # is in both counters.
-    imu, late, sent = counts.get('imu', 0), counts.get('imu_late', 0), len(stream.imu)
-    if not imu <= sent <= imu + late:
-        wrong.append(f'imu is {imu} and imu_late {late} of {sent}')
+    imu, sent = counts.get('imu', 0), len(stream.imu)
+    left_out = counts.get('imu_late', 0) + counts.get('imu_ahead', 0)
+    if not imu <= sent <= imu + left_out:
+        wrong.append(f'imu is {imu}, late or ahead are {left_out} of {sent}')
     return wrong
 
 

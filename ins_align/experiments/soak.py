@@ -151,7 +151,7 @@ class _Player:
 
     def _imu_counted(self) -> int:
         # The first sample after a jump of the clock is taken for one that is late.
-        return self._counted('imu') + self._counted('imu_late')
+        return sum(map(self._counted, ('imu', 'imu_late', 'imu_ahead')))
 
     def _on_status(self, msg: DiagnosticArray) -> None:
         self._status = {value.key: value.value for value in msg.status[0].values}
