@@ -36,6 +36,8 @@ import numpy as np
 
 __all__ = ['Aligner', 'Attitude', 'Epoch', 'State', 'Status']
 
+MAX_TOLD = 100  # sentences on messages that were rejected
+
 
 class Aligner:
     """
@@ -53,6 +55,7 @@ class Aligner:
         self._intake = Intake(self.config)
         self._alignment = Alignment(self.config)
         self._events: list[str] = []
+        self._told: set[str] = set()                # of messages that were rejected
         self._done: list[Epoch] = []
         self._now: Prediction | None = None
 
@@ -65,6 +68,12 @@ class Aligner:
     def counts(self) -> Counter[str]:
         """Return what became of messages and epochs, by name."""
         return Counter(self.status().counts)
+
+    @property
+    def newest_imu_ns(self) -> int | None:
+        """Return the stamp of the newest IMU sample of use, None where there is none."""
+        stamps = self._intake.imu.stamps
+        return int(stamps[-1]) if stamps.size else None
 
     # Input
 
@@ -97,8 +106,10 @@ class Aligner:
         self._intake.add_velocity(velocity)
 
     def reject(self, reason: str, why: str = '') -> None:
-        """Count a message that an adapter could not convert; `why`, in words, is told once."""
-        if self._intake.reject(reason, why):
+        """Count a message that an adapter could not use; `why`, in words, is told once."""
+        self._intake.reject(reason, why)
+        if why and why not in self._told and len(self._told) < MAX_TOLD:
+            self._told.add(why)
             self._events.append(why)
 
     def reset(self, reason: str = 'on request') -> None:

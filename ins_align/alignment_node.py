@@ -61,7 +61,10 @@ IMU_DEPTH = 2000  # ten seconds at 200 Hz: the machine may be busy, no sample ma
 GNSS_DEPTH = 200
 IMU_BATCH = 100  # messages taken in a turn of the executor: more would hold up the others
 STATUS_PERIOD = 1.0  # s
-IMU_SILENT = 1.0  # s without a sample, by the clock of this machine; then the status says so
+# Without a sample for so long, by the clock of this machine, the IMU is silent: the status says so,
+# and another one may take its place (s).
+IMU_SILENT = 1.0
+MAX_OTHER_FRAMES = 8
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.5)
 RCLPY_PARAMETERS = {'use_sim_time', 'start_type_description_service'}  # it declares them itself
 
@@ -71,7 +74,7 @@ LEVELS = {
 }
 
 
-class Gate(CallbackGroup):
+class OnDemand(CallbackGroup):
     """
     Keeps a subscription from its executor until it is opened.
 
@@ -142,7 +145,10 @@ class AlignmentNode(Node):
         self._imu_frame: str | None = None
         self._started = 0  # how often it has started over
         self._next_status = 0.0
-        self._imu_heard: float | None = None  # when the last sample came
+        self._imu_received_ns = 0  # the last sample of that frame
+        self._other_frames: set[str] = set()  # of IMUs that were there before
+        self._newest_imu_ns: int | None = None
+        self._imu_heard: float | None = None  # when there was a new sample of use
         # From the worker to the executor, replaced as a whole:
         self._outlook = _Outlook(0, None, None)
 
@@ -151,14 +157,14 @@ class AlignmentNode(Node):
         self._status_publishers = [
             self._publish_on(DiagnosticArray, topic, QoSProfile(depth=10))
             for topic in ('~/status', '/diagnostics')]
-        self._imu_gate = Gate()
+        self._imu_on_demand = OnDemand()
         self._imu_subscription = self._subscribe_to(
-            Imu, 'imu/data_raw', self._on_imu, IMU_DEPTH, self._imu_gate)
+            Imu, 'imu/data_raw', self._on_imu, IMU_DEPTH, self._imu_on_demand)
         self._fix_subscription = self._subscribe_to(
-            NavSatFix, 'fix', _nothing, GNSS_DEPTH, Gate())
+            NavSatFix, 'fix', _nothing, GNSS_DEPTH, OnDemand())
         self._velocity_subscription = self._subscribe_to(
             VELOCITY_TYPES[self._config.velocity_type], 'fix_velocity', _nothing, GNSS_DEPTH,
-            Gate())
+            OnDemand())
         self.create_service(Trigger, '~/reset', self._on_reset)
         # A signal between two waits of the executor wakes it from neither: it has to look.
         self.create_timer(1.0, _nothing, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -186,10 +192,12 @@ class AlignmentNode(Node):
             self._adopted = outlook
             self._follower.adopt(
                 outlook.prediction if outlook.starts == self._starts else None)
-        now = self._follower.follow(sample.stamp_ns, sample.gyro)
+        now = None
         # What was learnt is about the axes of another IMU when the frame is another one.
+        if outlook.frame_id in (None, sample.frame_id):
+            now = self._follower.follow(sample.stamp_ns, sample.gyro)
         self._imu_publisher.publish(
-            with_orientation(data) if now is None or sample.frame_id != outlook.frame_id else
+            with_orientation(data) if now is None else
             with_orientation(data, now.quaternion_xyzw, now.covariance))
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -206,16 +214,20 @@ class AlignmentNode(Node):
     def _work(self, items: list[tuple[int, Any]]) -> None:
         """Take in what has come, align and publish what has changed."""
         for subscription, convert in (
-                *([] if self._imu_gate.is_open else [(self._imu_subscription, read_imu)]),
+                *([] if self._imu_on_demand.is_open else [(self._imu_subscription, read_imu)]),
                 (self._fix_subscription, fix_from_msg),
                 (self._velocity_subscription, self._velocity)):
             items += [(received_ns, convert(message)) for message, received_ns
                       in queued(subscription, subscription.qos_profile.depth)]
         # Each topic is a queue by itself: nothing shall be late, or early, for having waited.
         items.sort(key=itemgetter(0))
-        for _, item in items:
-            self._feed(item)
+        for received_ns, item in items:
+            self._feed(received_ns, item)
         self._align()
+        newest_ns = self._aligner.newest_imu_ns
+        if newest_ns is not None and newest_ns != self._newest_imu_ns:
+            self._imu_heard = time.monotonic()
+        self._newest_imu_ns = newest_ns
         self._look_out()
         events = self._aligner.take_events()
         for event in events:
@@ -224,13 +236,11 @@ class AlignmentNode(Node):
         if events or time.monotonic() >= self._next_status:
             self._publish_status()
 
-    def _feed(self, item: Any) -> None:
+    def _feed(self, received_ns: int, item: Any) -> None:
         aligner = self._aligner
         if isinstance(item, ImuSample):
-            if item.frame_id != self._imu_frame:
-                self._change_imu_frame(item.frame_id)
-            self._imu_heard = time.monotonic()
-            aligner.add_imu(item.stamp_ns, item.gyro, item.accel)
+            if self._heeds(item.frame_id, received_ns):
+                aligner.add_imu(item.stamp_ns, item.gyro, item.accel)
         elif isinstance(item, Fix):
             aligner.add_fix(item)
         elif isinstance(item, Velocity):
@@ -259,12 +269,28 @@ class AlignmentNode(Node):
             self._aligner.reject('velocity_body_frame', str(error))
             return None
 
+    def _heeds(self, frame_id: str, received_ns: int) -> bool:
+        """Whether a sample is of the IMU that is aligned, which one that is new becomes."""
+        if frame_id != self._imu_frame:
+            silent = received_ns - self._imu_received_ns > IMU_SILENT * 1e9
+            if frame_id in self._other_frames and not silent:
+                self._aligner.reject('imu_other_frame')
+                self.get_logger().warning(
+                    f'two IMUs send on one topic, with frame_id {frame_id!r} and '
+                    f'{self._imu_frame!r}: the latter is used', once=True)
+                return False
+            self._change_imu_frame(frame_id)
+        self._imu_received_ns = received_ns
+        return True
+
     def _change_imu_frame(self, frame_id: str) -> None:
         """Start over: what was learnt is about axes that are no longer the IMU's."""
         if self._imu_frame is not None:
             self._aligner.reject('imu_frame_changed')
             self._start_over(
                 f'frame_id of the IMU changed from {self._imu_frame!r} to {frame_id!r}')
+            if len(self._other_frames) < MAX_OTHER_FRAMES:
+                self._other_frames.add(self._imu_frame)
         self._imu_frame = frame_id
 
     def _look_out(self) -> None:
@@ -273,8 +299,8 @@ class AlignmentNode(Node):
         prediction = self._aligner.prediction() if listened and self._declared else None
         if prediction is not None or self._outlook.prediction is not None:
             self._outlook = _Outlook(self._started, self._imu_frame, prediction)
-        if listened != self._imu_gate.is_open:
-            self._imu_gate.is_open = listened
+        if listened != self._imu_on_demand.is_open:
+            self._imu_on_demand.is_open = listened
             if self.executor is not None:
                 self.executor.wake()
 
@@ -339,12 +365,12 @@ class AlignmentNode(Node):
             depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
 
     def _subscribe_to(self, msg_type: type, topic: str, callback: Callable[..., None],
-                      depth: int, gate: Gate) -> Subscription:
+                      depth: int, group: OnDemand) -> Subscription:
         # Best effort matches every publisher, so that no event can tell of one that does not.
         return self.create_subscription(
             msg_type, topic, callback,
             QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT),
-            callback_group=gate,
+            callback_group=group,
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             raw=msg_type is Imu)

@@ -156,7 +156,7 @@ class Intake:
         """Forget everything but the counts."""
         self.imu = ImuBuffer(self._lateness_ns, self.counts)
         self._cutter = ImuCutter(self._config.imu_noise, self.imu, self.counts)
-        self._refusal = ''                          # why messages cannot be used
+        self._refusal = ''                          # why velocities cannot be used
         self._gnss = GnssBuffer(self._lateness_ns, self.counts,
                                 0 if self._config.use_velocity is False else PAIR_NS)
         self._forget_epochs()
@@ -203,12 +203,10 @@ class Intake:
         self._gnss.add_velocity(velocity._replace(stamp_ns=velocity.stamp_ns - self._delay_ns),
                                 self.imu.newest_ns)
 
-    def reject(self, reason: str, why: str = '') -> bool:
-        """Count a message that could not be converted; return whether `why`, in words, is new."""
+    def reject(self, reason: str, why: str = '') -> None:
+        """Count a message that could not be used, and keep why, in words."""
         self.counts[reason] += 1
-        is_new = why not in ('', self._refusal)
         self._refusal = why or self._refusal
-        return is_new
 
     def reset(self, reason: str) -> None:
         """Start over, for a reason in words."""

@@ -53,7 +53,7 @@ def main(path, rate, reliability):
 
     def on_status(msg):
         values = {value.key: value.value for value in msg.status[0].values}
-        seen[0] = int(values.get('imu', 0))
+        seen[0] = sum(int(values.get(name, 0)) for name in ('imu', 'imu_other_frame'))
 
     node.create_subscription(DiagnosticArray, '/ins_align/status', on_status, 10)
     deadline = time.monotonic() + TIMEOUT

@@ -200,6 +200,49 @@ def test_frame_of_the_imu_changes(tmp_path):
     assert listener.statuses[-1].status[0].hardware_id == 'imu_of_the_other_make'
 
 
+def test_two_imus_on_one_topic(tmp_path):
+    simulation = flight(duration=24.0)
+    messages = simulated_messages(simulation)
+    messages += [(time_ns, topic, replaced_imu(msg)) for time_ns, topic, msg in messages
+                 if topic == IMU]
+    messages.sort(key=lambda message: message[0])
+    with Listener(imu=True) as listener, running_node(PARAMETERS) as node:
+        listener.wait_for(lambda: listener.statuses)
+        play(script_of(messages), tmp_path, 3.0)
+        wait_until_taken(listener, messages)
+    # They change places once, then one of them is left out.
+    assert listener.count('imu_frame_changed') == listener.count('resets') == 1
+    assert listener.count('imu_other_frame') > 2000
+    assert node.output.count('two IMUs send on one topic') == 1
+    assert listener.attitudes
+    used = listener.statuses[-1].status[0].hardware_id
+    known = {msg.header.frame_id for msg in listener.imus if msg.orientation_covariance[0] >= 0.0}
+    assert known == {used}
+
+
+def replaced_imu(msg):
+    """Return the sample of another IMU that is mounted upside down."""
+    other = deepcopy(msg)
+    other.header.frame_id = 'second_imu'
+    for vector in (other.angular_velocity, other.linear_acceleration):
+        vector.y, vector.z = -vector.y, -vector.z
+    return other
+
+
+def test_an_imu_that_sends_no_numbers_is_silent(tmp_path):
+    messages = simulated_messages(flight(duration=20.0))
+    for k, (_, topic, msg) in enumerate(messages):
+        if topic == IMU and k > 2 * len(messages) // 3:
+            msg.angular_velocity.y = float('nan')
+    with Listener() as listener, running_node(PARAMETERS):
+        play(script_of(messages), tmp_path, 3.0)
+        wait_until_taken(listener, messages)
+        listener.wait_for(lambda: 'no IMU sample' in listener.status['reason'])
+    assert listener.attitudes
+    assert listener.statuses[-1].status[0].level == DiagnosticStatus.WARN
+    assert listener.count('imu_nan') > 500
+
+
 def test_an_imu_that_falls_silent_is_told(tmp_path):
     messages = simulated_messages(flight(duration=20.0))
     split = 2 * len(messages) // 3
