@@ -57,6 +57,13 @@ class Orientations(NamedTuple):
     covariances: np.ndarray  # (N, 9), rad^2
 
 
+class Refused(NamedTuple):
+    """A GNSS message that cannot be used: as what it is counted, and why where that helps."""
+
+    counter: str
+    why: str = ''
+
+
 Columns = TypeVar('Columns', ImuSamples, Orientations)
 
 
@@ -191,8 +198,8 @@ def _column(raw: np.ndarray, start: int, kind: str, width: int = 1) -> np.ndarra
     return np.ascontiguousarray(raw[:, start:start + size]).view(kind)
 
 
-def decode_fixes(messages: Sequence[bytes], topic: Topic) -> list[Fix | str]:
-    """Decode serialised sensor_msgs/NavSatFix, or say why not as the counts name it."""
+def decode_fixes(messages: Sequence[bytes], topic: Topic) -> list[Fix | Refused]:
+    """Decode serialised sensor_msgs/NavSatFix, or say why not."""
     same = _same_layout(messages, topic.encoding, 1)
     if same is not None:
         raw, _, status = same
@@ -207,7 +214,7 @@ def decode_fixes(messages: Sequence[bytes], topic: Topic) -> list[Fix | str]:
 
 
 def decode_velocities(messages: Sequence[bytes], topic: Topic,
-                      config: Config) -> list[Velocity | str]:
+                      config: Config) -> list[Velocity | Refused]:
     """Decode the messages that ``config.velocity_type`` names like `decode_fixes`."""
     strings, place, covariance, count = _VELOCITIES[config.velocity_type]
     same = _same_layout(messages, topic.encoding, strings)
@@ -220,8 +227,8 @@ def decode_velocities(messages: Sequence[bytes], topic: Topic,
             try:
                 return [*velocities(stamps, names[-1], linear,
                                     twist[0].reshape(-1, 6, 6) if twist else None, config)]
-            except MessageError:
-                return ['velocity_body_frame'] * len(messages)
+            except MessageError as error:
+                return [Refused('velocity_body_frame', str(error))] * len(messages)
     return [_by_library(message, topic, lambda msg: velocity_from_msg(msg, config), 'velocity')
             for message in messages]
 
@@ -230,11 +237,11 @@ def _by_library(message: bytes, topic: Topic, convert: Callable[[Any], Any], nam
     try:
         msg = deserialize(message, topic)
     except MessageError:
-        return f'{name}_undecodable'
+        return Refused(f'{name}_undecodable')
     try:
         return convert(msg)
-    except MessageError:
-        return 'velocity_body_frame'
+    except MessageError as error:
+        return Refused('velocity_body_frame', str(error))
 
 
 def _same_layout(messages: Sequence[bytes], encoding: str, strings: int,

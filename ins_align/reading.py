@@ -26,7 +26,8 @@ from ins_align.bag_files import BagError, Topic
 from ins_align.bags import Bag, Block, Topics
 from ins_align.config import Config
 from ins_align.decoding import (
-    decode_fixes, decode_imu, decode_orientations, decode_velocities, ImuSamples, Orientations)
+    decode_fixes, decode_imu, decode_orientations, decode_velocities, ImuSamples, Orientations,
+    Refused)
 from ins_align.messages import Fix, Velocity
 import numpy as np
 
@@ -65,9 +66,8 @@ class Part(NamedTuple):
     topics: Topics
     config: Config  # as requested, for the type of velocity that was found
     imu: ImuSamples
-    # Each GNSS message, or why it is none as the counts name it, and how many of the IMU samples
-    # come before it.
-    gnss: tuple[tuple[int, Fix | Velocity | str], ...]
+    # Each GNSS message, and how many of the IMU samples come before it.
+    gnss: tuple[tuple[int, Fix | Velocity | Refused], ...]
     orientations: Orientations
     done: float  # how much of the recording this ends at, 0 to 1
     warnings: tuple[str, ...]  # so far
@@ -144,7 +144,7 @@ def _decoded(block: Block, wanted: Sequence[Topic], topics: Topics, config: Conf
     before = np.zeros(indices.size, np.int64)
     before[imu_places] = samples.decoded
     before = np.cumsum(before)
-    gnss: list[tuple[int, Fix | Velocity | str]] = []
+    gnss: list[tuple[int, Fix | Velocity | Refused]] = []
     places, messages = places_and_messages(topics.fix)
     gnss += zip(places, decode_fixes(messages, topics.fix))
     if topics.velocity is not None:

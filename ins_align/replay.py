@@ -27,7 +27,7 @@ from ins_align.ahead import run_ahead
 from ins_align.alignment import Alignment
 from ins_align.bags import Topics
 from ins_align.config import Config
-from ins_align.decoding import Orientations
+from ins_align.decoding import Orientations, Refused
 from ins_align.intake import Intake, Step
 from ins_align.messages import Fix
 from ins_align.reading import Part, read, Request
@@ -257,8 +257,8 @@ def _feed(intake: Intake, part: Part) -> None:
             between = slice(position, before)
             intake.add_imu_array(imu.stamps_ns[between], imu.gyro[between], imu.accel[between])
             position = before
-        if isinstance(message, str):
-            intake.reject(message)
+        if isinstance(message, Refused):
+            intake.reject(*message)
         elif isinstance(message, Fix):
             intake.add_fix(message)
         elif message is not None:

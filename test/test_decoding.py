@@ -19,7 +19,8 @@ from ins_align.bag_files import Topic
 from ins_align.bags import VELOCITY_TYPES
 from ins_align.config import Config
 from ins_align.decoding import (
-    body_start, decode_fixes, decode_imu, decode_orientations, decode_velocities, deserialize)
+    body_start, decode_fixes, decode_imu, decode_orientations, decode_velocities, deserialize,
+    Refused)
 from ins_align.messages import MessageError
 import numpy as np
 import pytest
@@ -198,7 +199,7 @@ def assert_same_gnss(messages, expected):
     assert len(messages) == len(expected)
     for mine, theirs in zip(messages, expected):
         assert type(mine) is type(theirs)
-        if isinstance(mine, str):
+        if isinstance(mine, Refused):
             assert mine == theirs
             continue
         for one, other in zip(mine, theirs):
@@ -212,7 +213,7 @@ def assert_same_gnss(messages, expected):
 def test_gnss_as_the_library(encoding, kind, frame_id, monkeypatch):
     raws = serialized_gnss(encoding, kind, frame_id=frame_id)
     expected = gnss_by_library(raws, encoding, kind)
-    assert not any(isinstance(message, str) for message in expected)
+    assert not any(isinstance(message, Refused) for message in expected)
     monkeypatch.setattr(decoding, 'deserialize', None)  # the bulk path needs no library
     assert_same_gnss(decode_gnss(raws, encoding, kind), expected)
 
@@ -227,10 +228,12 @@ def test_gnss_of_several_layouts_keeps_its_order(encoding, kind):
     messages = decode_gnss(raws, encoding, kind)
     assert_same_gnss(messages, gnss_by_library(raws, encoding, kind))
     name = 'fix' if kind == FIX else 'velocity'
-    assert messages[0] == messages[-1] == f'{name}_undecodable'
+    assert messages[0] == messages[-1] == Refused(f'{name}_undecodable')
     if kind != FIX:
-        assert messages[2::3] == ['velocity_body_frame'] * 5
-        assert decode_gnss(raws[2::3], encoding, kind) == ['velocity_body_frame'] * 5
+        refused = messages[2::3]
+        assert {message.counter for message in refused} == {'velocity_body_frame'}
+        assert all("body frame 'imu'" in message.why for message in refused)
+        assert decode_gnss(raws[2::3], encoding, kind) == refused
 
 
 @pytest.mark.parametrize('kind', GNSS)
@@ -241,7 +244,7 @@ def test_gnss_with_its_last_four_bytes_filled_up(kind):
         messages = decode_gnss([raw + bytes(fill) for raw in raws], 'cdr', kind)
         assert_same_gnss(messages, expected if good else gnss_by_library(
             [raw + bytes(fill) for raw in raws], 'cdr', kind))
-        assert isinstance(messages[0], str) is not good
+        assert isinstance(messages[0], Refused) is not good
 
 
 @pytest.mark.parametrize('kind', GNSS)

@@ -204,6 +204,9 @@ def test_body_frame_velocity_is_counted(flight, tmp_path):
     found, named = replay(path), replay(path, velocity_topic='/fix_velocity')
     assert found.topics.velocity is None
     assert named.status.counts['velocity_body_frame'] == len(rows) == 15
+    insisting = replay(path, Config(use_velocity=True), velocity_topic='/fix_velocity')
+    assert insisting.status.reason.startswith(
+        "no GNSS velocity yet: the velocity is given in the body frame 'imu'")
     for result in (found, named):
         warning, = result.warnings
         assert "/fix_velocity cannot be used: the velocity is given in the body frame 'imu'" \

@@ -24,7 +24,7 @@ from ins_align.aligner import Aligner
 from ins_align.bag_files import BagError
 from ins_align.bags import Bag
 from ins_align.config import Config
-from ins_align.decoding import ImuSamples, joined, Orientations
+from ins_align.decoding import ImuSamples, joined, Orientations, Refused
 from ins_align.earth import ecef_from_lla, matrix_en
 from ins_align.experiments.common import Error, error_of
 from ins_align.reading import read, Request
@@ -89,7 +89,7 @@ def load(path: Path) -> Recording:
     earlier = 0
     for part in parts:
         gnss += [(earlier + before, message) for before, message in part.gnss
-                 if not isinstance(message, str)]
+                 if not isinstance(message, Refused)]
         earlier += part.imu.stamps_ns.size
     name = path.name.split('.')[0]
     return Recording(
