@@ -61,8 +61,8 @@ IMU_DEPTH = 2000  # ten seconds at 200 Hz: the machine may be busy, no sample ma
 GNSS_DEPTH = 200
 IMU_BATCH = 100  # messages taken in a turn of the executor: more would hold up the others
 STATUS_PERIOD = 1.0  # s
-# Without a sample for so long, by the clock of this machine, the IMU is silent: the status says so,
-# and another one may take its place (s).
+# Without a sample for so long, by the clock of this machine, the IMU is silent: the status says
+# so, and another one may take its place (s).
 IMU_SILENT = 1.0
 MAX_OTHER_FRAMES = 8
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.5)

@@ -29,8 +29,8 @@ from ins_align.plausibility import IMU_BEFORE
 from ins_align.rotation import Array
 import numpy as np
 
-# Beyond these no sensor measures; such values would overflow the integrals (rad/s, m/s^2, m/s).
-MAX_RATE, MAX_ACCELERATION, MAX_SPEED = 200.0, 2000.0, 2000.0
+# Beyond these no sensor measures; such values would overflow the integrals (rad/s, m/s^2, m/s, m).
+MAX_RATE, MAX_ACCELERATION, MAX_SPEED, MAX_ALTITUDE = 200.0, 2000.0, 2000.0, 1e6
 # The IMU may be silent for this long; then the attitude is lost and alignment starts over (ns).
 MAX_GAP_NS = 500_000_000
 # A GNSS stamp this far ahead of the IMU comes from another clock (ns).
@@ -206,6 +206,24 @@ class ImuBuffer:
         self.stamps, self.samples = self.stamps[first:], self.samples[first:]
 
 
+def fault_of_fix(fix: Fix) -> str:
+    """Return what a fix that cannot be used is counted as: ``no_fix``, ``nan``, or ''."""
+    position = fix.latitude_deg, fix.longitude_deg, fix.altitude_m
+    if fix.status == NO_FIX or position[:2] == (0.0, 0.0):
+        return 'no_fix'
+    return '' if (all(map(math.isfinite, position)) and abs(fix.latitude_deg) <= 90.0
+                  and abs(fix.longitude_deg) <= 360.0
+                  and abs(fix.altitude_m) < MAX_ALTITUDE) else 'nan'
+
+
+def usable_velocity(velocity: Velocity) -> Velocity | None:
+    """Return what can be used of a velocity, without its vertical where that is nan."""
+    east, north, up = velocity.velocity
+    if math.isnan(up):
+        velocity = velocity._replace(velocity=np.array([east, north, 0.0]), vertical=False)
+    return velocity if np.all(np.abs(velocity.velocity) < MAX_SPEED) else None
+
+
 @dataclass
 class GnssEpoch:
     """What the receiver said at one stamp."""
@@ -257,12 +275,8 @@ class GnssBuffer:
     def add_fix(self, fix: Fix, imu_newest_ns: int | None) -> None:
         """Take a position, or count why not."""
         self._counts['fix'] += 1
-        position = fix.latitude_deg, fix.longitude_deg, fix.altitude_m
-        if fix.status == NO_FIX or position[:2] == (0.0, 0.0):
-            self._counts['fix_no_fix'] += 1
-        elif not (all(map(math.isfinite, position)) and abs(fix.latitude_deg) <= 90.0
-                  and abs(fix.longitude_deg) <= 360.0 and abs(fix.altitude_m) < 1e6):
-            self._counts['fix_nan'] += 1
+        if fault := fault_of_fix(fix):
+            self._counts[f'fix_{fault}'] += 1
         else:
             if fix.status == STATUS_UNKNOWN:
                 self._counts['fix_status_unknown'] += 1
@@ -275,12 +289,11 @@ class GnssBuffer:
     def add_velocity(self, velocity: Velocity, imu_newest_ns: int | None) -> None:
         """Take a velocity, or count why not."""
         self._counts['velocity'] += 1
-        east, north, up = velocity.velocity
-        if math.isnan(up):
-            velocity = velocity._replace(velocity=np.array([east, north, 0.0]), vertical=False)
-        if not np.all(np.abs(velocity.velocity) < MAX_SPEED):
+        usable = usable_velocity(velocity)
+        if usable is None:
             self._counts['velocity_nan'] += 1
             return
+        velocity = usable
         epoch = self._epoch(velocity.stamp_ns, imu_newest_ns, 'velocity')
         if epoch is not None and epoch.velocity is None:
             epoch.velocity = velocity

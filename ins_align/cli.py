@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+import errno
 import json
 import os
 from pathlib import Path
@@ -79,7 +80,7 @@ With several recordings --json writes an array with an object for each, and --cs
 the recording's name before the suffix: out.csv becomes out_first.csv, out_second.csv.
 
 examples:
-  ins_align replay flight_1 --set lever_arm=[1.2,0,0.4] --json flight_1.json
+  ins_align replay flight_1 --set lever_arm=[1.2,0.0,0.4] --json flight_1.json
   ins_align replay drive.bag --params config/ins_align.yaml --start 30 --plot drive.png
 """
 
@@ -141,6 +142,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except BrokenPipeError:  # an experiment, which says what it does while it writes
         _to_nobody(sys.stdout)
+        return UNUSABLE
+    except OSError as error:  # nobody else's: the output has no room
+        if error.errno != errno.ENOSPC:
+            raise
+        _to_nobody(sys.stdout)
+        print(f'ins_align {arguments.command}: cannot write: {error.strerror}', file=sys.stderr)
         return UNUSABLE
 
 
@@ -356,8 +363,11 @@ def run_info(arguments: argparse.Namespace) -> int:
 def run_replay(arguments: argparse.Namespace) -> int:
     """Run ``ins_align replay``."""
     keep_to_one()
-    for path in (arguments.json, arguments.csv, arguments.plot):
+    outputs = [path for path in (arguments.json, arguments.csv, arguments.plot) if path]
+    for path in outputs:
         _check_writable(path)
+        if outputs.count(path) > 1:
+            raise UsageError(f'{path} is given for two outputs')
     config = _config(arguments)
     if arguments.plot:
         _check_plot(arguments.plot)
@@ -418,10 +428,18 @@ def _write_json(path: str, content: Any) -> None:
 
 
 def _config(arguments: argparse.Namespace) -> Config:
-    from ins_align.config import config_from_mapping, ConfigError, load_params, parse_override
+    from ins_align.config import (
+        config_from_mapping, ConfigError, load_params, parameters, parse_override)
 
+    known = {parameter.name for parameter in parameters()}
     try:
         values = load_params(arguments.params) if arguments.params else {}
+        for name in values.keys() - known:
+            # As the node has it: a file for many nodes is not wrong, a slip must not pass unseen.
+            with _readers_may_leave(sys.stderr):
+                print(f'ins_align {arguments.command}: warning: parameter {name!r} of '
+                      f'{arguments.params} is not known and has no effect', file=sys.stderr)
+            del values[name]
         values.update(parse_override(text) for text in arguments.overrides)
         return config_from_mapping(values)
     except ConfigError as error:
@@ -451,7 +469,13 @@ def _check_writable(path: str | None) -> None:
     """Find out before the work whether its result can be written."""
     if path is None:
         return
-    folder = Path(path).parent
+    from ins_align.report import is_stream
+
+    if is_stream(path):
+        if not os.access(path, os.W_OK):
+            raise UsageError(f'cannot write {path}: no permission')
+        return
+    folder = Path(os.path.realpath(path)).parent
     if not folder.is_dir():
         raise UsageError(f'cannot write {path}: there is no directory {folder}')
     if Path(path).is_dir():

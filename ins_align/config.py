@@ -90,7 +90,8 @@ class Config:
 
     lever_arm: tuple[float, float, float] = _parameter(
         (0.0, 0.0, 0.0), 'lever arm from the IMU to the GNSS antenna, in the IMU frame '
-        '(x forward, y left, z up)', 'm', minimum=-1000.0, maximum=1000.0)
+        '(x forward, y left, z up); each number with a point: 0.0', 'm',
+        minimum=-1000.0, maximum=1000.0)
     lever_arm_std: float = _parameter(
         1.0, 'how well the lever arm is known, 1 sigma per axis; above 0 it is estimated too',
         'm', minimum=0.0, maximum=100.0)
@@ -377,7 +378,7 @@ def _checked_vector(field: dataclasses.Field[Any], value: Any) -> tuple[float, f
     except TypeError:
         elements = None
     if elements is None or len(elements) != 3:
-        got = reprlib.repr(value) if elements is None else f'{len(elements)}'
+        got = reprlib.repr(value) if elements is None else f'{len(elements)} of them'
         raise ConfigError(f'{field.name} must be three numbers '
                           f'({field.metadata["unit"]}), got {got}')
     x, y, z = (_checked_number(f'{field.name}[{index}]', element, field)

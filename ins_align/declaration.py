@@ -180,13 +180,12 @@ class Declaration:
         if fit.dof < MIN_DOF:
             return Verdict(State.ALIGNING, f'{fit.offered} GNSS epochs so far: more are needed')
         if tilt > config.tilt_std_threshold and not self.levelled:
-            return Verdict(State.ALIGNING, f'tilt sigma {tilt:.2g} deg, needs '
-                                           f'{config.tilt_std_threshold:g}: wait')
+            return Verdict(State.ALIGNING,
+                           f'tilt sigma {_above(tilt, config.tilt_std_threshold)}: wait')
         state = State.LEVELLED if self.levelled else State.ALIGNING
         if heading > config.heading_std_threshold:
-            return Verdict(state, f'heading sigma {heading:.2g} deg, needs '
-                                  f'{config.heading_std_threshold:g}: turn or change speed'
-                                  f'{_noise(fit)}')
+            return Verdict(state, f'heading sigma {_above(heading, config.heading_std_threshold)}'
+                                  f': turn or change speed{_noise(fit)}')
         if not fit.converged:
             return Verdict(state, f'heading sigma {heading:.2g} deg is good enough: the estimate '
                                   'is still settling')
@@ -226,6 +225,14 @@ def _noise(fit: Fit) -> str:
         more += (f'; errors of the GNSS last from epoch to epoch: sigmas are up to '
                  f'{math.sqrt(fit.lasting):.1f} times larger')
     return more
+
+
+def _above(sigma_deg: float, threshold_deg: float) -> str:
+    """Return a sigma and the threshold that it is above, so that this shows."""
+    text = f'{sigma_deg:.2g}'
+    if float(text) <= threshold_deg:
+        text = f'{sigma_deg:.4g}'
+    return f'{text} deg, needs {threshold_deg:g}'
 
 
 def _sigmas_deg(P: Array, factor: float) -> tuple[float, float]:

@@ -56,7 +56,8 @@ class ImuFacts:
     turn_ratio: float | None  # rate about the vertical over that of the course
     faults: tuple[str, ...]
     too_small: tuple[str, ...]  # sensors at the end of their range, in words
-    grade: str  # preset whose figures cover these
+    grade: str  # preset whose figures cover these, or come closest
+    grade_covers: bool
     grade_is_sure: bool  # noise and biases have been seen at rest
 
 
@@ -114,12 +115,13 @@ def survey_imu(samples: ImuSamples, times: Array, velocities: Series | None,
         part, quiet = slice(*np.searchsorted(times, grid[[rest[0], rest[-1]]]).tolist()), 0.5
     walk = math.degrees(_random_walk(samples.gyro[part], interval, quiet)) * 60.0
     force_walk = _random_walk(samples.accel[part], interval, quiet) * 60.0
-    grade = _grade(walk, force_walk, rest_rate, rest_force)
+    grade, covered = _grade(walk, force_walk, rest_rate, rest_force)
     return ImuFacts(
         mean_force, tuple(up.tolist()), math.degrees(max_rate), walk, force_walk,
         len(rest) * GRID if rest else 0.0,
         None if rest_rate is None else tuple(np.degrees(rest_rate).tolist()), rest_force, ratio,
-        tuple(faults), _at_end_of_range(samples), grade, rest_rate is not None)
+        tuple(faults), _at_end_of_range(samples), grade, covered,
+        rest_rate is not None)
 
 
 def _at_end_of_range(samples: ImuSamples) -> tuple[str, ...]:
@@ -206,8 +208,8 @@ def _longest_rest(grid: Array, gyro: Array, accel: Array, velocities: Series | N
 
 
 def _grade(walk: float, force_walk: float, rest_rate: Array | None,
-           rest_force: float | None) -> str:
-    """Return the best preset that covers what was measured."""
+           rest_force: float | None) -> tuple[str, bool]:
+    """Return the best preset that covers what was measured, or the last, and whether it does."""
     for name, preset in PRESETS.items():
         if (walk > NOISE_MARGIN * math.degrees(preset.angle_random_walk) * 60.0
                 or force_walk > NOISE_MARGIN * preset.velocity_random_walk * 60.0):
@@ -218,5 +220,5 @@ def _grade(walk: float, force_walk: float, rest_rate: Array | None,
             if (bias > BIAS_SIGMAS * math.sqrt(3.0) * preset.gyro_bias_std
                     or abs(rest_force) > BIAS_SIGMAS * preset.accel_bias_std):
                 continue
-        return name
-    return next(reversed(PRESETS))
+        return name, True
+    return name, False

@@ -394,7 +394,10 @@ def _about_imu(imu: ImuFacts) -> list[str]:
             f'at rest for {imu.rest_s:.0f} s: rate '
             f'({", ".join(f"{rate:+.4f}" for rate in imu.rest_rate_deg_s)}) deg/s, '
             f'specific force {imu.rest_force_error:+.3f} m/s^2 off gravity')
-    lines.append(f'suits imu_grade {imu.grade}' if imu.grade_is_sure else
+    lines.append(f'no imu_grade covers this, {imu.grade} comes closest: more noise is measured '
+                 'while aligning, more bias is not'
+                 if imu.grade_is_sure and not imu.grade_covers else
+                 f'suits imu_grade {imu.grade}' if imu.grade_is_sure else
                  f'imu_grade: no worse than {imu.grade}' if imu.grade != Config.imu_grade else
                  f'imu_grade: never at rest to measure it; {imu.grade} is the default')
     return lines

@@ -38,6 +38,9 @@ DRY_INTERVAL_NS = 2_000_000_000
 NO_VELOCITY_NS = 2_000_000_000
 # The IMU samples of a run of epochs that are handled at one go, and what an epoch costs beside.
 MAX_RUN_SAMPLES, EPOCH_SAMPLES = 4096, 16
+# Positions that are left out, as they are counted, and why.
+_LEFT_OUT = {'fix_no_fix': 'without a fix', 'fix_nan': 'without numbers',
+             'fix_late': 'later than gnss_lateness allows', 'fix_ahead': 'far ahead of the IMU'}
 _NO_SAMPLE = f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s'
 
 
@@ -165,7 +168,8 @@ class Intake:
         """Wait for another t0 among what is buffered."""
         self._antenna = Antenna(self._config, self.counts)
         self._last_ns: int | None = None            # the last epoch since t0; None before it
-        self._waits = False                         # whether it was said why there is none yet
+        self._waiting: Verdict | None = None        # why there is none yet, as it was said
+        self._counts_before = Counter(self.counts)
         self._first_fix_ns: int | None = None
         self._run: list[Located] = []
 
@@ -253,13 +257,21 @@ class Intake:
             self._cutter.forget_before(upto_ns)
             if silent:
                 self._wait(State.WAITING_FOR_IMU, _NO_SAMPLE)
-                self._waits = False
-            elif not self._waits:
-                self._wait(State.WAITING_FOR_GNSS, 'no GNSS position yet')
+            elif self._first_fix_ns is None:
+                self._wait(State.WAITING_FOR_GNSS, self._no_position())
 
     def _wait(self, state: State, reason: str) -> None:
-        self._waits = True
-        self.steps.append(Wait(Verdict(state, reason)))
+        verdict = Verdict(state, reason)
+        if verdict != self._waiting:
+            self.steps.append(Wait(verdict))
+        self._waiting = verdict
+
+    def _no_position(self) -> str:
+        """Say that there is no position, and what has become of those that came."""
+        left_out = ', '.join(
+            f'{count} {why}' for name, why in _LEFT_OUT.items()
+            if (count := self.counts[name] - self._counts_before[name]))
+        return 'no GNSS position yet' + (left_out and f': {left_out}')
 
     def _dry_epochs(self, upto_ns: int) -> None:
         """Go on without GNSS up to a stamp in steps of bounded length."""

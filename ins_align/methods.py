@@ -36,7 +36,7 @@ from ins_align.signs import SignCheck
 from ins_align.solution import NoiseLevels
 from ins_align.told import ToldCheck
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
-                                Prior, SIZE, UNIFORM_ANGLE_STD, Unknowns)
+                                Prior, UNIFORM_ANGLE_STD, Unknowns)
 from ins_align.whitening import Measurements
 import numpy as np
 

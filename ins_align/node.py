@@ -70,7 +70,8 @@ def main(args: Sequence[str] | None = None) -> int:
         _refuse_other_arguments(remove_ros_args(args)[1:])
         rclpy.init(args=args)
     except RuntimeError as error:  # all of rcl's
-        return _refused(f'the ROS arguments are wrong: {error}')
+        hint = ' (write 0.0, not 0, in a list)' if 'same type' in str(error) else ''
+        return _refused(f'the ROS arguments are wrong: {error}{hint}')
     ros_handles_signals = True
     # The estimator's thread must not keep a callback waiting for the interpreter (s).
     sys.setswitchinterval(0.001)

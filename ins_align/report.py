@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import io
 import math
 import os
 from pathlib import Path
@@ -45,6 +46,14 @@ LOST_SIGMA_DEG = 60.0  # above this a heading is not worth drawing
 PLOT_SUFFIXES = ('.png', '.pdf', '.svg', '.jpg', '.jpeg', '.webp', '.eps', '.tif', '.tiff')
 
 
+def is_stream(path: str | os.PathLike[str]) -> bool:
+    """Whether there is no file at a path, nor can be one, but a pipe or a device."""
+    path = Path(path).absolute()
+    # /dev/stdout may be a file: where the output of the command goes, which is not to be replaced.
+    return path.parts[1:2] in (('dev',), ('proc',)) and path.exists() or (
+        path.exists() and not path.is_file() and not path.is_dir())
+
+
 def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any]) -> None:
     """
     Write a file whole or not at all.
@@ -56,8 +65,16 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any])
     write : callable
         Gets the open file. If it raises, `path` is as it was before.
 
+    A link stays one, to a file that is replaced. A pipe or a device is written to as it is.
+
     """
-    path = Path(path)
+    if is_stream(path):
+        content = io.BytesIO()
+        write(content)
+        with open(os.open(path, os.O_WRONLY | os.O_APPEND), 'wb') as stream:
+            stream.write(content.getvalue())
+        return
+    path = Path(os.path.realpath(path))
     unfinished = path.with_name(f'.{path.name}.{os.getpid()}.part')
     try:
         with open(unfinished, 'xb') as file:
@@ -111,11 +128,28 @@ def _cell(value: Any) -> str:
     return str(value)
 
 
+def declared_spans(epochs: Sequence[Epoch]) -> list[tuple[float, float]]:
+    """Return the first and the last epoch of each time that was ALIGNED, s since the first t0."""
+    spans: list[tuple[float, float]] = []
+    aligned = False
+    for epoch in epochs:
+        start = spans[-1][0] if aligned else epoch.t_s
+        if epoch.state is State.ALIGNED:
+            spans[len(spans) - aligned:] = [(start, epoch.t_s)]
+        aligned = epoch.state is State.ALIGNED
+    return spans
+
+
 def summary(result: ReplayResult) -> str:
     """Return the table that ``ins_align replay`` prints of a recording."""
     status = result.status
     after = '' if status.time_to_align_s is None else f' after {status.time_to_align_s:.1f} s'
     lines = [result.bag, f'  {status.state.value}{after}: {status.reason}']
+    spans = declared_spans(result.epochs)
+    # Where it is not one from then to the end.
+    if spans and (status.state is not State.ALIGNED or len(spans) > 1):
+        lines.append('  it was ALIGNED from ' + ', '.join(
+            f'{start:.1f} to {end:.1f} s' for start, end in spans))
     attitudes = [('initial', status.initial), ('final', status.current)]
     rows = []
     for name, attitude in attitudes:

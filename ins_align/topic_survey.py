@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 from ins_align.bag_files import BagError, Topic
 from ins_align.bags import Bag, FIX_TYPE, IMU_TYPE, REFERENCE_NAMESPACE, VELOCITY_TYPES
-from ins_align.buffers import MAX_ACCELERATION, MAX_RATE, MAX_SPEED, NO_FIX
+from ins_align.buffers import fault_of_fix, MAX_ACCELERATION, MAX_RATE, usable_velocity
 from ins_align.config import Config
 from ins_align.decoding import decode_imu, deserialize
 from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
@@ -33,7 +33,6 @@ import numpy as np
 KINDS = ('imu', 'fix', 'velocity')
 WIDTHS = {'imu': 6, 'fix': 3, 'velocity': 3}
 MAX_ASTRAY = 60.0  # s: a stamp further off the recorded time than the others is not used
-MAX_ALTITUDE = 100_000.0  # m
 GAP_INTERVALS = 3.5  # times the usual interval without a message is a gap
 
 
@@ -193,18 +192,18 @@ class Recorded:
     def _add_gnss(self, time_ns: int, message: Fix | Velocity) -> None:
         if isinstance(message, Fix):
             values = (message.latitude_deg, message.longitude_deg, message.altitude_m)
-            has_fix = message.status != NO_FIX
-            usable = (has_fix and abs(values[0]) <= 90.0 and abs(values[1]) <= 360.0
-                      and abs(values[2]) < MAX_ALTITUDE)
-            self.no_fix += not has_fix
+            fault = fault_of_fix(message)
+            usable = not fault
+            self.no_fix += fault == 'no_fix'
         else:
-            values = tuple(message.velocity.tolist())
-            usable = max(map(abs, values)) < MAX_SPEED
+            velocity = usable_velocity(message)
+            usable = velocity is not None
+            values = tuple((velocity or message).velocity.tolist())
         covariance = message.covariance
         sigmas = (math.nan, math.nan) if covariance is None else (
             math.sqrt((covariance[0, 0] + covariance[1, 1]) / 2.0), math.sqrt(covariance[2, 2]))
         self._rows.append((time_ns, message.stamp_ns, values, sigmas,
-                           usable and all(map(math.isfinite, values))))
+                           usable))
 
 
 def read_candidates(bag: Bag) -> list[Recorded]:

@@ -185,6 +185,20 @@ def test_rejected_messages_of_an_adapter_are_counted():
 
 # Faults of messages
 
+def test_positions_that_are_left_out_are_told_in_the_reason(flight):
+    aligner = Aligner(config_for(flight))
+    for start in (0, 200, 400):
+        used = slice(start, start + 200)
+        aligner.add_imu(flight.imu_stamps_ns[used], flight.gyro[used], flight.accel[used])
+        aligner.update()
+    for k in range(10):
+        aligner.add_fix(flight.fix(k))
+        aligner.add_fix(flight.fix(28)._replace(status=-1))
+    aligner.update()
+    assert aligner.status().reason == ('no GNSS position yet: 10 without a fix, '
+                                       '10 later than gnss_lateness allows')
+
+
 def test_why_messages_were_refused_is_forgotten_when_others_come(flight):
     aligner = Aligner(config_for(flight))
     aligner.reject('velocity_body_frame', 'in the wrong axes')

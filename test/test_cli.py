@@ -209,6 +209,7 @@ def test_no_recording_writes_over_the_files_of_another(bags):
     (['--imu-topic', '/fix'], 'IMU needs sensor_msgs/Imu'),
     (['--velocity-topic', '/fix'], 'velocity needs'),
     (['--json', 'no/such/directory/a.json'], 'there is no directory'),
+    (['--json', 'a', '--csv', 'a'], 'a is given for two outputs'),
     (['--json', '.'], 'is a directory'),
     (['--plot', 'a.xyz'], 'must end with'),
     (['--plot', 'a'], 'must end with')])
@@ -395,6 +396,24 @@ def test_workers_end_with_a_killed_parent(flight):
     assert select.select([read], [], [], 30.0)[0] and os.read(read, 1) == b''
     os.close(read)
     process.communicate()
+
+
+@pytest.mark.skipif(not Path('/dev/full').is_char_device(), reason='no /dev/full')
+@pytest.mark.parametrize('command', [['replay'], ['info']])
+def test_output_without_room(flight, command):
+    with open('/dev/full', 'w') as full:
+        done = subprocess.run([*COMMAND, *command, flight], stdout=full, stderr=subprocess.PIPE,
+                              text=True, cwd=Path(__file__).parents[1])
+    assert done.returncode == 2 and 'No space left' in done.stderr
+    assert done.stderr.count('\n') == 1
+
+
+def test_parameters_of_others_in_a_file_are_told(flight, tmp_path, capsys):
+    path = tmp_path / 'many.yaml'
+    text = (flight / 'ins_align.yaml').read_text()
+    path.write_text(text + '/**:\n  ros__parameters:\n    map_frame: map\n')
+    assert main(['replay', str(flight), '--params', str(path)]) == 0
+    assert "parameter 'map_frame'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('closed', [1, 2])

@@ -68,6 +68,11 @@ def test_level_comes_before_heading_and_the_reason_has_numbers():
     assert verdict.state is State.ALIGNING and 'tilt sigma 5' in verdict.reason
 
 
+def test_what_is_missing_shows_in_the_numbers():
+    verdict = judge(Declaration(Config()), 0.0, 3.0, covariance(0.1, 1.004))
+    assert verdict.reason.startswith('heading sigma 1.004 deg, needs 1:')
+
+
 def test_a_lapse_starts_the_hold_again():
     declaration = Declaration(Config(hold_time=2.0))
     judge(declaration, 0.0, 1.6, GOOD)

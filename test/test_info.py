@@ -134,10 +134,11 @@ def test_noise_in_motion_is_an_upper_bound_only(tmp_path):
     (lambda e, n, u: (n, e, -u), ['velocity_frame=ned']),
     (lambda e, n, u: (e, n, 0.0), ['velocity_vertical=absent']),
     (lambda e, n, u: (n, e, 0.0), ['velocity_frame=ned', 'velocity_vertical=absent']),
+    (lambda e, n, u: (e, n, math.nan), ['velocity_vertical=absent']),
     (lambda e, n, u: (math.hypot(e, n), 0.01, u), ['use_velocity=false']),
     (lambda e, n, u: (0.8 * e - 0.6 * n, 0.6 * e + 0.8 * n, u), ['use_velocity=false']),
     (lambda e, n, u: (3.6 * e, 3.6 * n, 3.6 * u), ['use_velocity=false'])],
-    ids=['ned', 'flat', 'flat ned', 'body', 'turned', 'km/h'])
+    ids=['ned', 'flat', 'flat ned', 'no vertical', 'body', 'turned', 'km/h'])
 def test_frame_of_the_velocity(changed, function, settings):
     info = inspect(changed(velocity_changed(function)))
     useless = settings == ['use_velocity=false']
@@ -269,7 +270,8 @@ def test_half_of_the_stamps_of_another_clock(changed):
     json.dumps(info.to_json(), allow_nan=False)
 
 
-def test_gaps_and_no_fix(changed, drive):
+@pytest.mark.parametrize('says_so', (True, False))
+def test_gaps_and_no_fix(changed, drive, says_so):
     start = drive[1][0][1]
 
     def change(name, time, message):
@@ -277,7 +279,10 @@ def test_gaps_and_no_fix(changed, drive):
         if name == '/imu/data_raw' and 30.0 < seconds < 33.0:
             return []
         if name == '/fix' and seconds > 45.0:
-            message.status.status = -1
+            if says_so:
+                message.status.status = -1
+            else:
+                message.latitude = message.longitude = 0.0
         return [(name, time, message)]
 
     info = inspect(changed(change, 'sqlite3 file'))

@@ -13,15 +13,18 @@
 # limitations under the License.
 """Tables, figures, and files that are written whole or not at all."""
 
+from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 import math
+import os
 import re
 from types import SimpleNamespace
 
 from ins_align.config import Config
 from ins_align.replay import replay
 from ins_align.report import (
-    DECLARED_GREEN, format_table, plot, save_figure, summary, write_whole)
+    DECLARED_GREEN, declared_spans, format_table, plot, save_figure, summary, write_whole)
+from ins_align.results import State
 from ins_align.simulation import simulate, write_bag
 import numpy as np
 import pytest
@@ -65,6 +68,37 @@ def test_file_is_written_whole_or_not_at_all(tmp_path):
     write_whole(path, lambda file: file.write(b'third'))
     assert path.read_bytes() == b'third'
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_stays_a_link(tmp_path):
+    (tmp_path / 'store').mkdir()
+    link, target = tmp_path / 'link.txt', tmp_path / 'store' / 'real.txt'
+    link.symlink_to(target)
+    for content in (b'first', b'second'):
+        write_whole(link, lambda file: file.write(content))
+        assert link.is_symlink() and target.read_bytes() == content
+    assert list(target.parent.iterdir()) == [target]
+
+
+def test_a_pipe_is_written_to_and_stays_one(tmp_path):
+    pipe = tmp_path / 'pipe'
+    os.mkfifo(pipe)
+    with ThreadPoolExecutor(1) as pool:
+        read = pool.submit(pipe.read_bytes)
+        write_whole(pipe, lambda file: file.write(b'content'))
+        assert read.result(10.0) == b'content'
+    assert pipe.is_fifo() and list(tmp_path.iterdir()) == [pipe]
+
+
+def test_times_that_were_declared(result):
+    epochs = [dataclasses.replace(result.epochs[0], t_s=float(k), state=state)
+              for k, state in enumerate(map(State, (
+                  'ALIGNING', 'ALIGNED', 'ALIGNED', 'LEVELLED', 'ALIGNED', 'FAULT')))]
+    assert declared_spans(epochs) == [(1.0, 2.0), (4.0, 4.0)]
+    assert declared_spans(epochs[:1]) == [] and declared_spans(epochs[:3]) == [(1.0, 2.0)]
+    assert 'it was ALIGNED' not in summary(result)
+    before = dataclasses.replace(result, epochs=tuple(epochs))
+    assert 'it was ALIGNED from 1.0 to 2.0 s, 4.0 to 4.0 s' in summary(before)
 
 
 def test_summary_says_what_matters(result):
