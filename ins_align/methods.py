@@ -333,7 +333,7 @@ class MapMethod:
     def settle(self, last: bool = False) -> None:
         """Relinearise now if that is worth it; doubt what was told, and that errors are white."""
         self._estimator.settle(last)
-        self._told.ask(self._estimator)
+        self._told.ask(self._estimator, self._correlation.gnss)
         self._correlation.ask(self._estimator)
 
     def unconfirmed(self) -> str:

@@ -85,11 +85,20 @@ class ToldCheck:
         """
         self._occasions = Occasions(self._judged_at if self._gain > 1.0 else 0)
 
-    def ask(self, estimator: MapEstimator) -> None:
-        """Ask the data for something else than was told, if it is time."""
+    def ask(self, estimator: MapEstimator, lasting: float = 1.0) -> None:
+        """
+        Ask the data for something else than was told, if it is time.
+
+        Parameters
+        ----------
+        estimator : MapEstimator
+        lasting : float
+            By how much variances are larger than if the errors of the GNSS were white.
+
+        """
         if self._looked_at and estimator.converged and self._occasions.come(estimator):
             told, self._gain, free = max(
-                ((told, *_gain(told, estimator)) for told in self._looked_at),
+                ((told, *_gain(told, estimator, lasting)) for told in self._looked_at),
                 key=lambda tried: tried[1])
             self._words, self._judged_at = self._in_words(told, free), estimator.count
 
@@ -128,7 +137,7 @@ def seem_late(delay: float, config: Config) -> str:
             f'and gnss_delay_std {config.gnss_delay_std:g}: check the clocks')
 
 
-def _gain(told: _Told, estimator: MapEstimator) -> tuple[float, Unknowns]:
+def _gain(told: _Told, estimator: MapEstimator, lasting: float) -> tuple[float, Unknowns]:
     """Return what the data gain if it is not so, over what is no chance; and the estimate then."""
     free, solution = estimator.loosened(told.free), estimator.solution
     assert solution is not None
@@ -141,5 +150,7 @@ def _gain(told: _Told, estimator: MapEstimator) -> tuple[float, Unknowns]:
                                       solution.P[ATTITUDE, ATTITUDE]),
                                      (free.C, solution.C, solution.covariance)))
     usual = max(1.0, free.chi2 / max(free.dof, 1))
+    if told is not BIASES_TOLD:         # residuals of an IMU worse than told last too
+        usual *= lasting
     # What hardly moves the attitude does little harm.
     return (solution.chi2 - free.chi2) / (usual * told.gain) * min(moved, 1.0) ** 2, free.estimate
