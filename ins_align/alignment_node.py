@@ -462,6 +462,8 @@ def status_values(status: Status) -> Iterator[tuple[str, str]]:
             sigma = attitude.sigma_deg
         yield f'{name}_roll_pitch_yaw_deg', _text(angles)
         yield f'{name}_sigma_east_north_up_deg', _text(sigma)
+    yield 'current_heading_deg', _text(
+        None if status.current is None else status.current.heading_deg)
     for name, estimate, sigma, unit in (
             ('gyro_bias', status.gyro_bias, status.gyro_bias_std, 'rad_s'),
             ('accel_bias', status.accel_bias, status.accel_bias_std, 'm_s2'),

@@ -217,10 +217,12 @@ class Declaration:
 
 
 def _noise(fit: Fit) -> str:
-    """Return how a receiver's noise is another one than it states, as the end of a sentence."""
+    """Return how the noise is another one than is stated, as the end of a sentence."""
     more = ''.join(f'; the GNSS {name} are {math.sqrt(factor):.1f} times as noisy as stated'
                    for name, factor in zip(('velocities', 'positions'), fit.gnss_noise)
                    if factor > 1.0)
+    if fit.walk > 1.0:
+        more += f'; the biases of the gyros drift {fit.walk:.0f} times as fast as stated'
     if fit.lasting > MENTIONED:
         more += (f'; errors of the GNSS last from epoch to epoch: sigmas are up to '
                  f'{math.sqrt(fit.lasting):.1f} times larger')

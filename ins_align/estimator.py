@@ -21,7 +21,7 @@ their sensitivity to x at once, and the normal equations accumulate (docs, "Theo
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -97,10 +97,13 @@ class MapEstimator:
     GROWTH = 0.125
     FAR, GROWTH_FAR = 1.0, 0.015
     MAX_ITERATIONS = 8
-    # Noise is judged when the store has grown by this share. That in excess of the IMU's is tried
-    # at steps of this factor, and moved when the log likelihood gains this much.
-    TUNE_FROM, TUNE_GROWTH, TUNE_STEP, TUNE_GAIN = 12, 0.5, 9.0, 3.0
-    MAX_EXCESS = 3.0
+    # Noise is judged when the store has grown by this share.
+    TUNE_FROM, TUNE_GROWTH = 12, 0.5
+    # That of the IMU is tried at steps of these factors, up to a largest one, and moved when the
+    # log likelihood gains so much. A walk that is a factor of e larger has to gain more, a smaller
+    # one may lose it.
+    EXCESS_STEPS, MAX_EXCESS, EXCESS_GAIN = (1 / 9, 9.0), 3.0, 3.0
+    WALK_STEPS, MAX_WALK, WALK_GAIN, WALK_COST = (1 / 9, 1 / 3, 3.0, 9.0), 27.0, 1.0, 5.0
     # The receiver's is taken for understated when the residuals' variance is so many times what it
     # should be and at least so much of it is white, as what does not fit the model is not; from
     # then on it follows when they differ by this factor.
@@ -324,8 +327,9 @@ class MapEstimator:
     def _start(self, point: Unknowns, prior: Prior | None = None, columns: Index | None = None,
                noise: NoiseLevels | None = None) -> Solution:
         """Return an empty solution; with another prior, unknowns or noise where given."""
+        noise = noise or self.noise
         return Solution(point, prior or self.prior, self.columns if columns is None else columns,
-                        self.size, noise or self.noise, self._rate_random_walk)
+                        self.size, noise, self._rate_random_walk * noise.walk)
 
     def _converge(self, point: Unknowns, P: 'Array | None', refused: np.ndarray) -> Solution:
         """
@@ -395,7 +399,13 @@ class MapEstimator:
         self._last_tuned = self.count
         before = self.noise
         if np.any(self._intervals.Q_excess[:self.count]):
-            self._tune_excess(s)
+            # Vibration looks like white noise between samples and is less than that over seconds;
+            # and other errors grow with it.
+            self._tune_imu(s, 'excess', self.EXCESS_STEPS, self.MAX_EXCESS, self.EXCESS_GAIN)
+        if self._rate_random_walk > 0.0:
+            # Gyros that warm up drift faster than they do later.
+            self._tune_imu(s, 'walk', self.WALK_STEPS, self.MAX_WALK, self.WALK_GAIN,
+                           self.WALK_COST)
         if s.chi2 > self.LOUD * s.dof or max(self.noise.gnss) > 1.0:
             self._tune_gnss(s.estimate)
         if self.noise != before:
@@ -407,22 +417,23 @@ class MapEstimator:
         solution = self._start(point, prior, columns, noise)
         return solution, self._run(solution, None, self._refused[:self.count])
 
-    def _tune_excess(self, s: Solution) -> None:
+    def _tune_imu(self, s: Solution, name: str, steps: Sequence[float], most: float,
+                  gain: float, cost: float = 0.0) -> None:
         """
-        Judge by the likelihood how much of the IMU's noise in excess counts.
+        Judge by the likelihood a level of the IMU's noise.
 
-        Vibration looks like white noise between samples and is less than that over seconds; and
-        other errors grow with it. The overall scale is left to the a-posteriori factor.
+        The overall scale is left to the a-posteriori factor.
         """
-        best = self.noise
-        before, likelihood = best.excess, s.log_likelihood + self.TUNE_GAIN
-        for trial in (before / self.TUNE_STEP, before * self.TUNE_STEP):
-            if not 0.99 * FIRST_NOISE.excess <= trial <= self.MAX_EXCESS:
+        best, likelihood = self.noise, s.log_likelihood + gain
+        for step in steps:
+            trial = step * getattr(self.noise, name)
+            if not 0.99 * getattr(FIRST_NOISE, name) <= trial <= 1.01 * most:
                 continue
-            noise = self.noise._replace(excess=trial)
+            noise = self.noise._replace(**{name: trial})
             solution, _ = self._rerun(s.estimate, noise=noise)
-            if solution.log_likelihood > likelihood:
-                best, likelihood = noise, solution.log_likelihood
+            gained = solution.log_likelihood - cost * math.log(step)
+            if gained > likelihood:
+                best, likelihood = noise, gained
         self.noise = best
 
     def _tune_gnss(self, point: Unknowns) -> None:
@@ -579,14 +590,6 @@ class MapEstimator:
     def estimate(self) -> Unknowns:
         """Return the estimate."""
         return self.prior.mean if self.solution is None else self.solution.estimate
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance of the 37 unknowns; zero where one is not estimated, shape (37, 37)."""
-        full = np.zeros((SIZE, SIZE))
-        if self.solution is not None:
-            full[np.ix_(self.columns, self.columns)] = self.solution.P
-        return full
 
     @property
     def variances(self) -> Array:

@@ -65,6 +65,7 @@ class Fit:
     delay: float                # of the GNSS, seconds; the told one where none is estimated
     # Variances of velocities and positions over the stated ones.
     gnss_noise: tuple[float, float] = (1.0, 1.0)
+    walk: float = 1.0           # rate random walk of the gyros over the stated one
     objection: str = ''         # what the data say against what is told, in words
     lasting: float = 1.0        # factor on variances: errors of the GNSS last
 
@@ -298,9 +299,7 @@ class MapMethod:
         self.moved += 1
         start = replace(self._last_epoch, v_n=None, position_measured=False)
         self._start(start, prior, self._estimator.noise)
-        innovation = self._innovation
         self._take_start(start, self._last_imu.end())
-        self._innovation = innovation
 
     def initial(self) -> tuple[Array, Array] | None:
         """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
@@ -328,7 +327,8 @@ class MapMethod:
         return Fit(past_chi2 + solution.chi2, past_dof + solution.dof, self._innovation,
                    self._estimator.converged, velocities, positions, epochs, self._offered,
                    self._delay(solution.estimate), self._estimator.noise.gnss,
-                   self._told.objection, self._correlation.attitude)
+                   self._estimator.noise.walk, self._told.objection,
+                   self._correlation.attitude)
 
     def settle(self, last: bool = False) -> None:
         """Relinearise now if that is worth it; doubt what was told, and that errors are white."""

@@ -174,7 +174,8 @@ def exact(integrals: Array, age: float) -> tuple[Array, Array, Array]:
     rest = age - rung * RUNG
     trapezoids = 0.5 * rest * there
     trapezoids[1:rung] += RUNG
-    trapezoids[rung] += 0.5 * ((RUNG if rung else 0.0) + rest)
+    trapezoids[rung] += 0.5 * (RUNG + rest)
+    # Up to the first rung, which is at age 0, the integrals are 0: it is left out.
     value, integral, double_integral = (weights[1:] @ integrals
                                         for weights in (value, there, trapezoids))
     return value, integral, double_integral

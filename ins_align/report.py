@@ -157,14 +157,15 @@ def summary(result: ReplayResult) -> str:
             continue
         row = [name, f'{attitude.stamp_ns * 1e-9:.3f}']
         row += [f'{angle:.3f}' for angle in (
-            attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)]
+            attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg, attitude.heading_deg)]
         row += [f'{sigma:.3f}' for sigma in attitude.sigma_deg]
         if result.reference is not None:
             errors = result.reference.errors_deg(attitude)
             row += ['-'] * 3 if errors is None else [f'{error:+.3f}' for error in errors[1]]
         rows.append(row)
     if rows:
-        header = ['attitude, deg', 'stamp, s', 'roll', 'pitch', 'yaw', 'sigma e', 'n', 'u']
+        header = ['attitude, deg', 'stamp, s', 'roll', 'pitch', 'yaw', 'heading', 'sigma e',
+                  'n', 'u']
         if result.reference is not None:
             header += ['error roll', 'pitch', 'yaw']
         lines += ['', format_table(rows, header, '  '), '', _nuisance_table(result)]

@@ -84,6 +84,11 @@ class Attitude:
         return self._rpy_deg[2]
 
     @property
+    def heading_deg(self) -> float:
+        """Heading as a compass has it: degrees clockwise from true north, 0 to 360."""
+        return (90.0 - self.yaw_deg) % 360.0
+
+    @property
     def sigma_deg(self) -> Array:
         """One sigma about east, north, up, degrees, shape (3,)."""
         return np.degrees(np.sqrt(np.diag(self.covariance)))

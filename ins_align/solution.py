@@ -49,11 +49,14 @@ class NoiseLevels(NamedTuple):
         Share that is believed of the IMU noise measured in excess of the stated one.
     gnss : tuple of float
         Factors on the covariances of velocities and positions.
+    walk : float
+        Factor on the rate random walk of the gyros' biases.
 
     """
 
     excess: float
     gnss: tuple[float, float] = (1.0, 1.0)
+    walk: float = 1.0
 
 
 @dataclass

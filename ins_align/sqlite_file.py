@@ -98,6 +98,7 @@ class SqliteFile:
 
     def blocks(self, ids: Collection[int], start_ns: int, stop_ns: int) -> Iterator[Records]:
         """Yield records many at a time, in the order of recorded time."""
+        taken: Records = []  # of the last stamp
         if self.end_ns is not None:
             query = (self._SELECT + f'FROM messages WHERE topic_id IN ({",".join("?" * len(ids))})'
                      ' AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, rowid')
@@ -106,14 +107,17 @@ class SqliteFile:
                 while rows := cursor.fetchmany(BLOCK):
                     if records := self._sound(rows):
                         yield records
-                        start_ns = records[-1][0] + 1
+                        start_ns = records[-1][0]
+                        taken = [record for record in (*taken, *records) if record[0] == start_ns]
                 return
             except _ERRORS as error:
                 self._warn_of_damage(error)
         records = []
         for row in self._rows_as_stored():
-            if row[1] in ids and type(row[0]) is int and start_ns <= row[0] < stop_ns:
-                records.append(row[:3])
+            record = row[:3]
+            if (row[1] in ids and type(row[0]) is int and start_ns <= row[0] < stop_ns
+                    and record not in taken):
+                records.append(record)
             if len(records) == BLOCK:
                 yield self._sound(records)
                 records = []

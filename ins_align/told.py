@@ -92,6 +92,7 @@ class ToldCheck:
         Parameters
         ----------
         estimator : MapEstimator
+            With the data.
         lasting : float
             By how much variances are larger than if the errors of the GNSS were white.
 

@@ -90,6 +90,17 @@ def test_states_in_their_order(flight):
     assert aligner.take_events() == []
 
 
+def test_before_the_first_epoch_is_known_what_is_told():
+    config = Config(lever_arm=(1.0, 2.0, 3.0), lever_arm_std=0.7, gnss_delay=0.2,
+                    gnss_delay_std=0.03, imu_grade='tactical')
+    status = Aligner(config).status()
+    assert status.lever_arm.tolist() == [1.0, 2.0, 3.0] and status.gnss_delay == 0.2
+    assert status.lever_arm_std.tolist() == [0.7] * 3 and status.gnss_delay_std == 0.03
+    assert not status.gyro_bias.any() and not status.accel_bias.any()
+    assert np.allclose(status.gyro_bias_std, config.imu_noise.gyro_bias_std)
+    assert np.allclose(status.accel_bias_std, config.imu_noise.accel_bias_std)
+
+
 def test_only_positions_wait_for_velocities_and_then_go_on(flight):
     aligner, epochs = aligned(flight, velocity=False)
     assert epochs[0].stamp_ns - flight.gnss_stamps_ns[0] >= 2 * SECOND
@@ -102,9 +113,12 @@ def test_only_velocities_wait_for_a_position(flight):
     assert 'position' in aligner.status().reason
 
 
-def test_wanted_velocities_are_waited_for(flight):
-    aligner, epochs = aligned(flight, velocity=False, use_velocity=True)
-    assert epochs == [] and 'velocity' in aligner.status().reason
+@pytest.mark.parametrize('changes', ({'use_velocity': True}, {'method': 'vif'}))
+def test_wanted_velocities_are_waited_for(flight, changes):
+    aligner, epochs = aligned(flight, velocity=False, **changes)
+    status = aligner.status()
+    assert epochs == [] and status.state is State.WAITING_FOR_GNSS and status.t0_ns is None
+    assert 'no GNSS velocity' in status.reason
 
 
 def test_epochs_tell_time_and_both_attitudes(flight, result):
@@ -155,15 +169,17 @@ def test_attitude_now_is_carried_to_the_newest_sample(flight):
 
 def test_reset_starts_over(flight):
     aligner = Aligner(config_for(flight))
-    feed_part(aligner, flight, 0.0, 15.0)
+    assert feed_part(aligner, flight, 0.0, 15.0)[-1].t_s > 10.0
     assert aligner.status().initial is not None
     aligner.reset('test')
     status = aligner.status()
     assert status.state is State.WAITING_FOR_IMU and status.initial is None
     assert aligner.declared is None and status.counts['resets'] == 1
     assert any('test' in word for word in aligner.take_events())
-    feed_part(aligner, flight, 15.0)
+    epochs = feed_part(aligner, flight, 15.0)
     assert aligner.status().t0_ns > flight.imu_stamps_ns[0] + 14 * SECOND
+    assert epochs[0].t_s == 0.0
+    assert epochs[-1].t_s == pytest.approx((epochs[-1].stamp_ns - epochs[0].stamp_ns) * 1e-9)
 
 
 def test_thresholds_may_change_while_running_and_nothing_else(flight):
@@ -197,6 +213,21 @@ def test_positions_that_are_left_out_are_told_in_the_reason(flight):
     aligner.update()
     assert aligner.status().reason == ('no GNSS position yet: 10 without a fix, '
                                        '10 later than gnss_lateness allows')
+
+
+def test_why_velocities_were_refused_is_said_while_they_are_waited_for(flight):
+    aligner = Aligner(config_for(flight, use_velocity=True))
+    for why in ('in the wrong axes', 'in the wrong axes', ''):
+        aligner.reject('velocity_body_frame', why)
+    for k in range(20):
+        aligner.add_fix(flight.fix(k))
+    aligner.add_imu(flight.imu_stamps_ns, flight.gyro, flight.accel)
+    aligner.flush()
+    status = aligner.status()
+    assert status.state is State.WAITING_FOR_GNSS
+    assert status.reason == 'no GNSS velocity yet: in the wrong axes'
+    assert status.counts['velocity_body_frame'] == 3
+    assert aligner.take_events().count('in the wrong axes') == 1
 
 
 def test_why_messages_were_refused_is_forgotten_when_others_come(flight):
@@ -347,6 +378,35 @@ def test_counts_hold_every_epoch_over_a_restart(flight):
     assert epochs[-1].t_s == pytest.approx((epochs[-1].stamp_ns - epochs[0].stamp_ns) * 1e-9)
 
 
+def test_an_epoch_before_the_first_sample_of_the_imu_is_no_start(flight):
+    aligner = Aligner(config_for(flight))
+    epochs = give_all(aligner, flight, slice(500, None))
+    first = flight.imu_stamps_ns[500]
+    expected = flight.gnss_stamps_ns[flight.gnss_stamps_ns >= first]
+    assert [epoch.stamp_ns for epoch in epochs] == expected.tolist()
+    counts = aligner.status().counts
+    assert counts['epochs_before_start'] == len(flight.gnss_stamps_ns) - len(expected) > 0
+
+
+def test_epochs_without_gnss_are_not_counted_as_gnss(flight):
+    """The IMU is silent while there is no GNSS: an epoch in between starts over."""
+    stamps = flight.imu_stamps_ns
+    used = np.flatnonzero((stamps < stamps[0] + 14 * SECOND) | (stamps > stamps[0] + 15 * SECOND))
+    given = [k for k, stamp in enumerate(flight.gnss_stamps_ns)
+             if not 10 * SECOND < stamp - stamps[0] < 20 * SECOND]
+    aligner = Aligner(config_for(flight))
+    for k in given:
+        aligner.add_fix(flight.fix(k))
+        aligner.add_velocity(flight.velocity_measurement(k))
+    aligner.add_imu(stamps[used], flight.gyro[used], flight.accel[used])
+    epochs = aligner.flush()
+    counts = aligner.status().counts
+    assert counts['restarts'] == 1
+    used, refused = counts['epochs_used'], counts['epochs_rejected_velocity']
+    assert used + refused == len(epochs)
+    assert used + refused + counts['epochs_before_start'] == len(given)
+
+
 @pytest.mark.parametrize('bunch, apart_ns', ((2, 1_000_000), (5, 60_000), (3, 1)))
 def test_samples_that_are_stamped_in_bunches(bunch, apart_ns):
     """A driver reads several at a time and stamps them as they come out of its buffer."""
@@ -396,6 +456,31 @@ def test_silent_imu_starts_over_and_keeps_the_biases(flight):
     assert status.counts['restarts'] == 1 and status.counts['imu_gap'] >= 1
     assert status.t0_ns > before.t0_ns + 18 * SECOND
     assert normalised_error(status.current, flight) < chi2.ppf(0.9999, 3)
+    assert np.all(status.gyro_bias_std <= 1.2 * before.gyro_bias_std)
+
+
+def test_biases_outlive_a_second_loss_before_the_next_start(flight):
+    """The IMU is silent, then the position jumps while velocities are waited for."""
+    aligner = Aligner(config_for(flight, use_velocity=True))
+    feed_part(aligner, flight, 0.0, 15.0)
+    before = aligner.status()
+    origin = int(flight.imu_stamps_ns[0])
+    for kind, payload in flight.messages():
+        stamp = int(payload[0][-1]) if kind == 'imu' else payload.stamp_ns
+        seconds = (stamp - origin) * 1e-9
+        if seconds < 18.5:
+            continue
+        if kind == 'imu':
+            aligner.add_imu(*payload)
+            aligner.update()
+        elif kind == 'fix':
+            away = 1.0 if seconds > 20.0 else 0.0
+            aligner.add_fix(payload._replace(latitude_deg=payload.latitude_deg + away))
+        elif seconds > 23.0:
+            aligner.add_velocity(payload)
+    status = aligner.status()
+    assert status.counts['fix_jump'] >= 5 and status.counts['restarts'] == 1
+    assert status.t0_ns > origin + 23 * SECOND
     assert np.all(status.gyro_bias_std <= 1.2 * before.gyro_bias_std)
 
 
@@ -477,6 +562,24 @@ def test_stamps_that_jitter_are_doubted_as_much_as_the_motion_makes_of_it():
         give_all(aligner, jittered)
         squares += normalised_error(aligner.status().initial, s)
     assert squares < chi2.ppf(0.9999, 3 * 6)
+
+
+@pytest.mark.parametrize('seed', (1, 2, 3))
+def test_gyros_that_warm_up_are_doubted(seed):
+    cold = simulated('car', imu_grade='mems', seed=seed, duration=100.0)
+    seconds = (cold.imu_stamps_ns - cold.imu_stamps_ns[0]) * 1e-9
+    drift = np.radians(0.5) * (1.0 - np.exp(-seconds / 60.0))
+    signs = np.random.default_rng(seed).choice([-1.0, 1.0], 3)
+    warming = replace(cold, gyro=cold.gyro + drift[:, None] * signs)
+    for s in (cold, warming):
+        aligner, epochs = aligned(s, imu_grade='mems', rate_random_walk=0.15, lever_arm_std=1.0,
+                                  gnss_delay_std=0.1)
+        late = [epoch.current for epoch in epochs if epoch.t_s > 70.0]
+        assert epochs[-1].state is State.ALIGNED
+        assert np.mean([normalised_error(attitude, s) for attitude in late]) < chi2.ppf(
+            0.9999, 3)
+        if s is cold:
+            assert 'as fast as stated' not in aligner.status().reason
 
 
 def test_single_samples_that_no_motion_makes_are_counted_and_do_little(flight, result):
@@ -835,14 +938,15 @@ def test_outliers_that_were_taken_back_say_nothing_about_the_grade(seed, grade):
     assert normalised_error(epochs[-1].current, s) < chi2.ppf(0.999, 3)
 
 
-@pytest.mark.parametrize('late', (0.1, 0.2))
+@pytest.mark.parametrize('late, told', ((0.1, 0.0), (0.2, 0.0), (0.3, 0.1)))
 @pytest.mark.parametrize('scenario, grade', (('flight', 'mems'), ('car', 'tactical'),
                                              ('hover', 'mems')))
-def test_a_delay_that_is_told_wrongly_is_named_and_what_is_declared_right(scenario, grade, late):
+def test_a_delay_that_is_told_wrongly_is_named_and_what_is_declared_right(scenario, grade, late,
+                                                                          told):
     """Nor is what was declared before the data showed it kept; told rightly it is declared."""
     s = simulated(scenario, imu_grade=grade, seed=2, duration=60.0, gnss_delay=late)
     assert aligned(s)[1][-1].state is State.ALIGNED
-    aligner, epochs = aligned(s, gnss_delay=0.0)
+    aligner, epochs = aligned(s, gnss_delay=told)
     for epoch in epochs:
         if epoch.state is State.ALIGNED:
             assert np.all(np.abs(np.degrees(error_of(epoch.initial, s)))
@@ -850,6 +954,7 @@ def test_a_delay_that_is_told_wrongly_is_named_and_what_is_declared_right(scenar
     status = aligner.status()
     assert status.state is State.ALIGNING
     assert 'raise gnss_delay_std' in status.reason
+    assert f'gnss_delay is {told:g} ' in status.reason
     found = float(status.reason.split('seem to be ')[1].split(' s late')[0])
     assert abs(found - late) < 0.03
 

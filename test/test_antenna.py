@@ -24,6 +24,20 @@ import numpy as np
 import pytest
 
 CORRELATED = np.array([[0.01, 0.004, 0.0], [0.004, 0.02, -0.003], [0.0, -0.003, 0.03]])
+SECOND = 1_000_000_000
+RADIUS = 6378137.0
+
+
+def told(stamp_ns, north=None, velocity=None):
+    """Return what the receiver says; metres north of 48 degrees."""
+    fix = None if north is None else Fix(stamp_ns, 48.0 + math.degrees(north / RADIUS), 11.0, 0.0,
+                                         None, 0)
+    return GnssEpoch(stamp_ns, fix, None if velocity is None else Velocity(
+        stamp_ns, np.array(velocity), CORRELATED))
+
+
+def north_of(epoch):
+    return RADIUS * (epoch.latitude - math.radians(48.0))
 
 
 def test_what_is_stated_again_and_again_is_believed():
@@ -84,18 +98,89 @@ def test_an_antenna_counts_what_it_does_not_believe():
     assert (counts['velocity_covariance'], counts['fix_covariance']) == (3, 4)
 
 
+@pytest.mark.parametrize('vertical', (0.0, 1.0))
+def test_a_vertical_velocity_that_is_told_to_be_absent_counts_for_nothing(vertical):
+    antenna = Antenna(Config(velocity_vertical='absent'), Counter())
+    for k in range(3):
+        epoch = antenna.epoch(told(k * SECOND, 0.0, (1.0, 2.0, vertical)))
+        assert np.array_equal(epoch.velocity_covariance[:2, :2], CORRELATED[:2, :2])
+        assert np.array_equal(epoch.velocity_covariance[2], [0.0, 0.0, 1e6])
+        assert np.array_equal(epoch.velocity_covariance[:, 2], [0.0, 0.0, 1e6])
+
+
+def test_a_receiver_that_has_measured_the_vertical_may_say_zero():
+    antenna = Antenna(Config(), Counter())
+    for k, up in enumerate((0.5, 0.0, -0.5, 0.0)):
+        epoch = antenna.epoch(told(k * SECOND, 0.0, (3.0, 1.0, up)))
+        assert np.array_equal(epoch.velocity_covariance, CORRELATED)
+
+
+def test_velocities_that_are_not_wanted_are_not_there():
+    antenna = Antenna(Config(use_velocity=False), Counter())
+    assert antenna.epoch(told(0, 0.0, (1.0, 2.0, 3.0))).v_n is None
+
+
+@pytest.mark.parametrize('silent, off, believed', [
+    (1, 550.0, True), (1, 650.0, False), (9, 2950.0, True), (9, 3050.0, False)])
+def test_a_fix_may_be_further_off_after_a_silence(silent, off, believed):
+    antenna = Antenna(Config(), Counter())
+    antenna.epoch(told(0, 0.0, (0.0, 0.0, 0.0)))
+    epoch = antenna.epoch(told(silent * SECOND, off))
+    assert epoch.position_measured == believed
+    assert north_of(epoch) == pytest.approx(off if believed else 0.0, abs=1e-3)
+
+
+def test_jumps_are_only_believed_one_after_the_other():
+    antenna = Antenna(Config(), Counter())
+    for k in range(61):
+        antenna.epoch(told(k * SECOND // 5, 0.0 if k % 5 == 0 else 1e5))
+        assert not antenna.jumped
+    for k in range(61, 66):
+        assert not antenna.jumped
+        antenna.epoch(told(k * SECOND // 5, 1e5))
+    assert antenna.jumped
+
+
+def test_without_fixes_the_place_goes_on_with_the_velocity_for_a_minute():
+    antenna = Antenna(Config(), Counter())
+    antenna.epoch(told(0, 0.0, (0.0, 20.0, 0.0)))
+    # Straight on where nothing is said; by what is said then; but not over two minutes.
+    for second, velocity, north in ((5, None, 100.0), (15, (0.0, 30.0, 0.0), 400.0),
+                                    (135, (0.0, 30.0, 0.0), 400.0)):
+        epoch = antenna.epoch(told(second * SECOND, velocity=velocity))
+        assert north_of(epoch) == pytest.approx(north, abs=1e-3)
+        assert not epoch.position_measured
+
+
+@pytest.mark.parametrize('std, fault', [(30.0, False), (0.1, True)])
+def test_how_good_fixes_are_decides_what_they_say_about_velocities(std, fault):
+    """Ten metres within a few seconds the other way are nothing where fixes are that bad."""
+    antenna = Antenna(Config(), Counter())
+    for k in range(400):
+        epoch = told(k * SECOND // 5, -0.4 * k, (0.0, 2.0, 0.1))
+        epoch.fix = epoch.fix._replace(covariance=std ** 2 * np.eye(3))
+        antenna.epoch(epoch)
+    assert bool(antenna.fault) == fault
+
+
 @pytest.mark.parametrize('velocity', (True, False))
 def test_gravity_is_in_doubt_by_the_way_since_the_last_gnss(velocity):
     """All of it unknown: g (v t / R) t / 2 of velocity, and nothing while there is GNSS."""
     antenna = Antenna(Config(), Counter())
-    speed, second = 50.0, 1_000_000_000
+    speed = 50.0
     for k in range(11):
-        stamp = k * second // 10
-        latitude = 48.0 + math.degrees(speed * 0.1 * k / 6378137.0)
-        antenna.epoch(GnssEpoch(stamp, Fix(stamp, latitude, 11.0, 0.0, None, 0), Velocity(
-            stamp, np.array([0.0, speed, 0.0]), None) if velocity else None))
+        stamp = k * SECOND // 10
+        antenna.epoch(told(stamp, speed * 0.1 * k, (0.0, speed, 0.0) if velocity else None))
         assert antenna.gravity_drift(stamp) == 0.0
     t = np.linspace(0.0, 40.0, 4001)
-    density = [antenna.gravity_drift(second + round(1e9 * later)) for later in t]
+    density = [antenna.gravity_drift(SECOND + round(1e9 * later)) for later in t]
     variance = np.sum(np.square(density)) * (t[1] - t[0])
-    assert math.sqrt(variance) == pytest.approx(9.8 * speed * 40.0 ** 2 / 2 / 6378137.0, rel=0.01)
+    assert math.sqrt(variance) == pytest.approx(9.8 * speed * 40.0 ** 2 / 2 / RADIUS, rel=0.01)
+
+
+def test_an_epoch_that_says_nothing_leaves_gravity_in_doubt():
+    antenna = Antenna(Config(), Counter())
+    antenna.epoch(told(0, 0.0, (0.0, 50.0, 0.0)))
+    antenna.epoch(told(4 * SECOND))
+    expected = 9.78 * 50.0 / RADIUS * 4.0 ** 1.5
+    assert antenna.gravity_drift(4 * SECOND) == pytest.approx(expected, rel=0.01)

@@ -18,7 +18,7 @@ import sqlite3
 import struct
 
 from hypothesis import given, HealthCheck, settings, strategies as st
-from ins_align import bag_files
+from ins_align import bag_files, sqlite_file
 from ins_align.bag_files import decompress, ros2_type
 from ins_align.bags import Bag, BagError
 from ins_align.config import Config
@@ -158,6 +158,24 @@ def test_cut_off_is_read_as_far_as_it_goes(copy, kind, kept):
         assert records
 
 
+@pytest.mark.parametrize('page_size', (512, 4096, 65536))
+def test_a_database_that_was_cut_off_is_seen_by_its_pages(copy, page_size):
+    """65536 does not fit into the two bytes of the header, which say 1."""
+    path = copy('sqlite3')
+    file = storage_file(path)
+    database = sqlite3.connect(file)
+    database.execute(f'PRAGMA page_size={page_size}')
+    database.execute('VACUUM')
+    database.close()
+    expected = by_library(path)
+    assert by_bag(path) == (expected, [])
+    content = file.read_bytes()
+    file.write_bytes(content[:int(0.9 * len(content))])
+    records, warnings = by_bag(path)
+    assert any('was cut off' in warning for warning in warnings)
+    assert 0 < len(records) and records == expected[:len(records)]
+
+
 @pytest.mark.parametrize('kind', ['mcap', 'mcap chunks', 'sqlite3', 'ros1', 'ros1 lz4'])
 def test_damage_in_the_middle_is_survived(copy, kind):
     path = copy(kind)
@@ -170,6 +188,47 @@ def test_damage_in_the_middle_is_survived(copy, kind):
     records, warnings = by_bag(path)
     assert warnings
     assert set(records[:len(records) // 2]) <= set(expected)
+
+
+@pytest.mark.parametrize('place', (0.3, 0.5, 0.7, 0.9))
+def test_messages_of_one_stamp_are_all_read_where_damage_parts_them(copy, monkeypatch, place):
+    """Three have one stamp, and blocks of a hundred end among them."""
+    monkeypatch.setattr(sqlite_file, 'BLOCK', 100)
+    path = copy('sqlite3')
+    file = storage_file(path)
+    database = sqlite3.connect(file)
+    rows = database.execute('SELECT id, timestamp FROM messages ORDER BY timestamp, id').fetchall()
+    database.executemany('UPDATE messages SET timestamp = ? WHERE id = ?', [
+        (rows[k - k % 3][1], key) for k, (key, _) in enumerate(rows)])
+    database.commit()
+    database.execute('VACUUM')             # the index behind all messages
+    database.close()
+    expected = by_bag(path)[0]
+    assert len(set(expected)) == len(expected) == 4400
+    content = bytearray(file.read_bytes())
+    at = int(place * len(content)) // 4096 * 4096
+    content[at:at + 4096] = bytes([255]) * 4096
+    file.write_bytes(content)
+    records, warnings = by_bag(path)
+    assert any('damaged' in warning for warning in warnings)
+    assert len(records) == len(set(records))
+    assert set(records) == set(expected[:expected.index(records[-1]) + 1])
+
+
+@pytest.mark.parametrize('place', (0.5, 0.7, 0.9))
+def test_what_was_read_before_the_damage_is_not_read_again(copy, monkeypatch, place):
+    monkeypatch.setattr(sqlite_file, 'BLOCK', 100)
+    path = copy('sqlite3')
+    expected = by_library(path)
+    file = storage_file(path)
+    content = bytearray(file.read_bytes())
+    at = int(place * len(content)) // 4096 * 4096
+    content[at:at + 4096] = bytes([255]) * 4096
+    file.write_bytes(content)
+    records, warnings = by_bag(path)
+    assert any('damaged' in warning for warning in warnings)
+    assert len(records) > 400 and set(records) < set(expected)
+    assert len(records) == len(set(records))
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1', 'ros1 lz4'])
@@ -324,6 +383,13 @@ def test_other_database(tmp_path):
     database.close()
     with pytest.raises(BagError, match='no recording'):
         Bag(tmp_path / 'a.db3')
+
+
+@pytest.mark.parametrize('name', ('a b.db3', 'a?mode=rw.db3', 'a#b.db3', '50%25.db3', "a'b.db3"))
+def test_a_database_may_have_any_name(recordings, tmp_path, name):
+    shutil.copy(storage_file(recordings['sqlite3']), tmp_path / name)
+    assert by_bag(tmp_path / name) == (by_library(recordings['sqlite3']), [])
+    assert [file.name for file in tmp_path.iterdir()] == [name]
 
 
 def test_database_left_behind_with_its_log(tmp_path, recordings):

@@ -71,6 +71,15 @@ def test_samples_out_of_order_are_sorted_and_duplicates_dropped():
     assert held(buffer) == [0, 10 * MS, 20 * MS, 25 * MS, 30 * MS, 40 * MS]
 
 
+def test_of_imu_samples_with_one_stamp_the_first_to_come_is_kept():
+    buffer, counts = imu_buffer()
+    for value in (1.0, 2.0, 3.0):
+        for stamp in (0, 10 * MS):
+            buffer.add(stamp, np.full(3, value), np.zeros(3))
+    buffer.consolidate()
+    assert buffer.samples[:, 0].tolist() == [1.0, 1.0] and counts['imu_duplicate'] == 4
+
+
 @pytest.mark.parametrize('value', (np.nan, np.inf, -np.inf, 1e30))
 @pytest.mark.parametrize('column', range(6))
 def test_broken_values_are_dropped_and_counted(value, column):
@@ -160,6 +169,28 @@ def test_two_strays_far_apart_are_not_a_clock():
     buffer, _ = imu_buffer()
     fill(buffer, [5000 * MS, 10 * MS, 2000 * MS])
     assert buffer.jumped_to_ns is None
+
+
+def test_late_samples_with_good_ones_between_them_are_no_clock():
+    buffer, counts = imu_buffer()
+    for k in range(5):
+        buffer.add(5000 * MS + k * 10 * MS, *sample_of(0))
+        buffer.add(1000 * MS + k * 10 * MS, *sample_of(0))
+        assert buffer.jumped_to_ns is None
+    # Nor are two of them where the second is the older one.
+    buffer.add(900 * MS, *sample_of(0))
+    assert buffer.jumped_to_ns is None
+    buffer.consolidate()
+    assert counts['imu_late'] == 6
+
+
+def test_an_array_of_good_samples_forgives_a_late_one_too():
+    buffer, _ = imu_buffer()
+    for k in range(3):
+        stamps = np.array([5000, 5010]) * MS + 20 * k * MS
+        buffer.add_many(stamps, np.zeros((2, 3)), np.zeros((2, 3)))
+        buffer.add(1000 * MS + k * 10 * MS, *sample_of(0))
+        assert buffer.jumped_to_ns is None
 
 
 def test_forgetting_keeps_what_interpolation_needs():
@@ -278,7 +309,8 @@ def test_gnss_without_imu_is_bounded():
         buffer.add_velocity(velocity(k), None)
     assert counts['gnss_overflow'] == 2_000
     released = buffer.release(12_000)
-    assert len(released) == 10_000 and released[-1].stamp_ns == 11_999
+    assert len(released) == 10_000
+    assert (released[0].stamp_ns, released[-1].stamp_ns) == (2_000, 11_999)
 
 
 def pairing_buffer():
@@ -320,3 +352,13 @@ def test_two_of_a_kind_are_no_pair():
     for stamp in (1000 * MS, 1040 * MS):
         buffer.add_velocity(velocity(stamp), None)
     assert len(buffer.release(2000 * MS)) == 2
+
+
+def test_an_epoch_is_whole_whatever_comes_right_behind_it():
+    buffer = pairing_buffer()
+    buffer.add_fix(fix(0), None)
+    for stamp in (0, 30 * MS):
+        buffer.add_velocity(velocity(stamp), None)
+    whole, alone = buffer.release(1000 * MS)
+    assert whole.fix is not None and whole.velocity.stamp_ns == whole.stamp_ns == 0
+    assert alone.fix is None and alone.velocity.stamp_ns == alone.stamp_ns == 30 * MS

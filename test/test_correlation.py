@@ -14,9 +14,12 @@
 """Errors of the GNSS that last from epoch to epoch, and the sigma that knows of them."""
 
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 from alignment import aligned, error_of, estimator_of, simulated
 from ins_align.correlation import Correlation, LAGS
+from ins_align.methods import MapMethod
 import numpy as np
 import pytest
 
@@ -55,6 +58,11 @@ def test_lasting_errors_count_less(rho):
     assert 0.6 * exact < found < exact < (1.0 + rho) / (1.0 - rho)
 
 
+def test_errors_that_do_not_last_any_more_are_forgotten():
+    factors = watched(np.concatenate([autoregressive(600, 0.9, 3), autoregressive(3000, 0.0, 4)]))
+    assert factors[599] > 3.0 and factors[-1] == 1.0
+
+
 def test_one_group_of_outliers_is_no_lasting_error():
     innovations = autoregressive(300, 0.0, 1)
     innovations[150:155] = 50.0
@@ -81,6 +89,34 @@ def test_share_of_the_gnss_is_what_its_noise_adds(scenario, grade):
     assert share == pytest.approx(np.max(variances[1] / variances[0]) - 1.0, abs=0.1)
     # Where all that the prior knows comes from the GNSS, there is more.
     assert share <= estimator_of(one).gnss_share(1.0) <= 1.0
+
+
+def test_a_share_of_the_prior_counts_where_the_prior_does(monkeypatch):
+    """What was handed over comes from the GNSS of before, which is as loud."""
+    monkeypatch.setattr('ins_align.alignment.MapMethod', partial(MapMethod, capacity=60))
+    s = simulated('flight', imu_grade='tactical', seed=3, duration=27.0)
+    estimator = estimator_of(aligned(s)[0])
+    assert estimator.prior.information[0, 0] > 0.0
+    assert estimator.gnss_share(1.0) > estimator.gnss_share(0.0) + 0.1
+
+
+def test_the_next_estimator_is_told_what_its_prior_has_of_the_gnss():
+    """Whoever goes on knows that of the one before, which was asked at its own first time."""
+    correlation, told = Correlation(), []
+    for innovation in autoregressive(300, 0.9, 5):
+        correlation.add(innovation)
+    for share in (0.6, 0.7):
+        def gnss_share(of_prior, share=share):
+            told.append(of_prior)
+            return share
+
+        estimator = SimpleNamespace(converged=True, measured=100, count=100, FIRST_FIT=4,
+                                    gnss_share=gnss_share)
+        for _ in range(3):                              # asked once at so many epochs
+            correlation.ask(estimator)
+        assert correlation.attitude == pytest.approx(1.0 + share * (correlation.gnss - 1.0))
+        correlation.restart()
+    assert told == [0.0, 0.6]
 
 
 @pytest.mark.parametrize('scenario, grade', [('hover', 'tactical'), ('car', 'tactical'),

@@ -81,6 +81,14 @@ def test_a_lapse_starts_the_hold_again():
     assert judge(declaration, 4.0, 0.0, GOOD).state is State.ALIGNED
 
 
+def test_an_outlier_starts_the_hold_again():
+    declaration = Declaration(Config(hold_time=2.0))
+    judge(declaration, 0.0, 1.6, GOOD)
+    judge(declaration, 1.8, 0.0, GOOD, fit(rejected=1))
+    assert judge(declaration, 2.0, 1.8, GOOD, fit(rejected=1)).state is State.ALIGNING
+    assert judge(declaration, 4.0, 0.0, GOOD, fit(rejected=1)).state is State.ALIGNED
+
+
 def test_what_was_withdrawn_has_to_hold_again():
     declaration = Declaration(Config(hold_time=2.0))
     assert judge(declaration, 0.0, 3.0, GOOD).state is State.ALIGNED
@@ -103,6 +111,19 @@ def test_sigma_is_widened_by_the_misfit():
     wide = covariance(0.1, 0.8)                       # times 1.5: 1.2 degrees
     assert judge(Declaration(Config()), 0.0, 5.0, wide).state is State.ALIGNED
     assert judge(Declaration(Config()), 0.0, 5.0, wide, misfit).state is State.LEVELLED
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_tilt_is_that_about_the_worst_horizontal_axis(seed):
+    """Whichever way that points: the largest eigenvalue of the two by two."""
+    P = covariance(0.1, 0.5)
+    root = np.radians(0.3) * np.random.default_rng(seed).standard_normal((2, 2))
+    P[:2, :2] = root @ root.T
+    sigma = np.degrees(np.sqrt(np.linalg.eigvalsh(P[:2, :2])[1]))
+    for factor, state in ((0.99, State.ALIGNING), (1.01, State.ALIGNED)):
+        config = Config(hold_time=0.0, tilt_std_threshold=float(factor * sigma))
+        verdict = Declaration(config).update(0.0, P, P, fit(), str)
+        assert verdict.state is state and f'tilt sigma {sigma:.2g}' in verdict.reason
 
 
 def test_thresholds_are_the_parameters():
@@ -138,6 +159,23 @@ def test_no_later_start_while_the_signs_are_in_doubt():
     assert not declaration.later_start
 
 
+@pytest.mark.parametrize('initial, current', [
+    (GOOD, covariance(5.0, 0.5)), (covariance(5.0, 14.0), covariance(5.0, 0.5))])
+def test_no_later_start_while_the_present_tilt_is_bad(initial, current):
+    declaration = Declaration(Config(hold_time=0.0))
+    verdict = declaration.update(0.0, initial, current, fit(), str)
+    assert verdict.state is State.ALIGNING and not declaration.later_start
+
+
+@pytest.mark.parametrize('doubt', ('', 'turn'))
+def test_an_initial_tilt_that_is_bad_declares_nothing(doubt):
+    """What is good now is worth a later start, but for a doubt about it."""
+    declaration = Declaration(Config(hold_time=0.0))
+    verdict = declaration.update(0.0, covariance(0.8, 0.5), GOOD, fit(), lambda: doubt)
+    assert verdict.state is State.ALIGNING and not declaration.levelled
+    assert declaration.later_start == (not doubt)
+
+
 @pytest.mark.parametrize('changes, words', [
     ({'chi2': 3000.0}, 'residuals'), ({'rejected': 40}, '40 of 102')])
 def test_contradicting_data_are_not_declared_and_withdraw(changes, words):
@@ -152,11 +190,33 @@ def test_contradicting_data_are_not_declared_and_withdraw(changes, words):
     assert judge(declaration, 5.4, 0.2, GOOD).state is State.ALIGNED
 
 
+def test_contradicting_data_withdraw_the_level_too():
+    declaration = Declaration(Config(hold_time=2.0))
+    assert judge(declaration, 0.0, 3.0, LEVEL).state is State.LEVELLED
+    judge(declaration, 3.2, 0.0, LEVEL, fit(objection='another lever arm'))
+    assert judge(declaration, 3.4, 1.8, LEVEL).state is State.ALIGNING
+    assert judge(declaration, 5.4, 0.0, LEVEL).state is State.LEVELLED
+
+
 def test_innovations_that_go_bad_withdraw_long_before_the_sum_shows_it():
     declaration = Declaration(Config(hold_time=2.0))
     judge(declaration, 0.0, 3.0, GOOD)
     long = {'chi2': 30000.0, 'dof': 30000}
     assert judge(declaration, 3.0, 2.0, GOOD, fit(**long)).state is State.ALIGNED
+    assert judge(declaration, 5.0, 10.0, GOOD, fit(nis=10.0, **long)).state is State.ALIGNING
+
+
+def test_one_wild_innovation_withdraws_nothing():
+    declaration = Declaration(Config(hold_time=2.0))
+    assert judge(declaration, 0.0, 3.0, GOOD).state is State.ALIGNED
+    assert judge(declaration, 3.2, 0.0, GOOD, fit(nis=1e6)).state is State.ALIGNED
+
+
+def test_an_epoch_without_an_innovation_leaves_the_average_as_it_is():
+    declaration = Declaration(Config(hold_time=2.0))
+    long = {'chi2': 30000.0, 'dof': 30000}
+    assert judge(declaration, 0.0, 3.0, GOOD).state is State.ALIGNED
+    assert judge(declaration, 3.2, 0.0, GOOD, fit(nis=np.nan, **long)).state is State.ALIGNED
     assert judge(declaration, 5.0, 10.0, GOOD, fit(nis=10.0, **long)).state is State.ALIGNING
 
 
@@ -166,6 +226,13 @@ def test_declared_heading_survives_a_little_more_sigma_and_not_twice_as_much():
     assert judge(declaration, 3.2, 1.0, covariance(0.1, 1.5)).state is State.ALIGNED
     assert judge(declaration, 5.0, 0.0, covariance(0.1, 2.5)).state is State.LEVELLED
     assert judge(declaration, 6.0, 0.0, covariance(0.1, 1.5)).state is State.LEVELLED
+
+
+def test_a_declared_level_survives_a_little_more_sigma_and_not_twice_as_much():
+    declaration = Declaration(Config(hold_time=2.0, tilt_std_threshold=0.5))
+    assert judge(declaration, 0.0, 3.0, LEVEL).state is State.LEVELLED
+    assert judge(declaration, 3.2, 1.0, covariance(0.9, 14.0)).state is State.LEVELLED
+    assert judge(declaration, 5.0, 0.0, covariance(1.1, 14.0)).state is State.ALIGNING
 
 
 def test_declared_heading_goes_with_the_tilt():
@@ -192,6 +259,19 @@ def test_without_gnss_nothing_is_declared_and_what_gets_lost_is_withdrawn():
     assert fallen.state is State.ALIGNING
 
 
+@pytest.mark.parametrize('factor, initial, current, state', [
+    (1.0, covariance(0.1, 1.2), covariance(0.1, 1.2), State.ALIGNED),
+    (1.8, covariance(0.1, 1.2), covariance(0.1, 1.2), State.LEVELLED),
+    (1.0, covariance(0.1, 2.1), GOOD, State.LEVELLED),
+    (1.0, GOOD, covariance(0.1, 2.1), State.LEVELLED)])
+def test_without_gnss_the_sigmas_are_widened_and_the_worse_one_counts(factor, initial, current,
+                                                                      state):
+    declaration = Declaration(Config(hold_time=2.0))
+    assert judge(declaration, 0.0, 3.0, GOOD).state is State.ALIGNED
+    misfit = fit(chi2=300.0 * factor ** 2)
+    assert declaration.update_without_gnss(2.0, initial, current, misfit).state is state
+
+
 def test_an_objection_withdraws_and_is_the_reason():
     declaration = Declaration(Config(hold_time=2.0))
     assert judge(declaration, 0.0, 3.0, GOOD).state is State.ALIGNED
@@ -204,12 +284,24 @@ def test_not_before_there_is_redundancy():
     assert verdict.state is State.ALIGNING and '4' in verdict.reason
 
 
+@pytest.mark.parametrize('dof', (0, 5))
+def test_nothing_is_contradicted_without_redundancy(dof):
+    """A handful of rows that do not fit, or none at all: more are needed."""
+    declaration = Declaration(Config())
+    few = fit(dof=dof, chi2=1e4, offered=4, delay=9.0)
+    verdict = declaration.update(0.0, GOOD, GOOD, few, str)
+    assert verdict.state is State.ALIGNING and verdict.reason.startswith('4 GNSS epochs so far')
+    assert not declaration.contradicted
+
+
 def test_not_before_the_linearisation_has_settled():
     assert judge(Declaration(Config()), 0.0, 10.0, GOOD,
                  fit(converged=False)).state is State.ALIGNING
 
 
 def test_a_receiver_that_understates_its_noise_is_named():
+    warm = judge(Declaration(Config()), 0.0, 3.0, GOOD, fit(walk=3.0))
+    assert 'gyros drift 3 times as fast as stated' in warm.reason
     loud = judge(Declaration(Config()), 0.0, 3.0, GOOD, fit(gnss_noise=(9.0, 1.0)))
     assert loud.state is State.ALIGNED
     assert 'velocities are 3.0 times as noisy' in loud.reason and 'positions' not in loud.reason

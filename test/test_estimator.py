@@ -23,14 +23,16 @@ from ins_align import scenarios
 from ins_align.config import PRESETS
 from ins_align.estimator import MapEstimator
 from ins_align.experiments.dense import bound, dense_solution
+from ins_align.handover import prior_from_now
 from ins_align.methods import MapMethod
 from ins_align.preintegration import Noise, preintegrate, SensorErrors, Steps
 from ins_align.results import State
 from ins_align.rotation import log_so3
 from ins_align.scenarios import Motion
 from ins_align.simulation import simulate
-from ins_align.unknowns import (ACCEL_ERRORS, BODY_FIXED, DELAY, first_prior, GYRO_MISALIGNMENT,
-                                SIZE, START_POSITION, START_VELOCITY, UNIFORM_ANGLE_STD)
+from ins_align.unknowns import (ACCEL_BIAS, ACCEL_ERRORS, BODY_FIXED, DELAY, first_prior,
+                                GYRO_BIAS, GYRO_MISALIGNMENT, SIZE, START_POSITION,
+                                START_VELOCITY, UNIFORM_ANGLE_STD)
 from ins_align.whitening import Measurements
 import numpy as np
 import pytest
@@ -73,7 +75,7 @@ def stated_covariance(estimator):
     solution = estimator.solution
     information = solution.information + solution.whitener.normal[1:, 1:]
     information[:3, :3] += np.eye(3) / UNIFORM_ANGLE_STD ** 2
-    wanted = np.flatnonzero(np.diag(estimator.covariance))
+    wanted = estimator.columns
     full = np.zeros((SIZE, SIZE))
     full[np.ix_(wanted, wanted)] = np.linalg.inv(information)
     return full
@@ -121,7 +123,7 @@ def test_recursion_is_the_dense_solution(scenario, grade, walk, case, monkeypatc
     assert np.allclose(found[which], sigma[which], rtol=0.02 if delayed else 0.01)
     assert estimator.solution.chi2 == pytest.approx(dense.chi2, rel=0.01 if delayed else 1e-3)
     # The allowance only takes information away.
-    stated = np.diag(estimator.covariance)[:3]
+    stated = estimator.variances[:3]
     assert np.all(stated >= found[:3] ** 2 * (1 - 1e-9)) and np.all(
         stated <= 1.1 * found[:3] ** 2)
 
@@ -171,6 +173,27 @@ def test_handover_gives_the_attitude_of_one_that_never_handed_over(changes, walk
         sigma = np.asarray(getattr(one, name + '_std'))
         assert np.allclose(getattr(other, name + '_std'), sigma, rtol=0.03), name
         assert np.all(np.abs(getattr(other, name) - getattr(one, name)) <= 0.15 * sigma), name
+
+
+def covariance_of(prior):
+    """Covariance of what a prior knows, zero elsewhere, shape (37, 37)."""
+    known = np.flatnonzero(np.diag(prior.information))
+    full = np.zeros((SIZE, SIZE))
+    full[np.ix_(known, known)] = np.linalg.inv(prior.information[np.ix_(known, known)])
+    return full
+
+
+def test_handover_widens_by_the_misfit_and_by_what_biases_may_have_wandered():
+    s = simulated('flight', imu_grade='tactical', duration=30.0, seed=2)
+    estimator = estimator_of(aligned(s)[0])
+    none, wander = np.zeros(3), np.zeros(SIZE)
+    still = covariance_of(prior_from_now(estimator, np.eye(3), none, none, 1.0, wander))
+    assert np.allclose(np.diag(still)[:3], np.diag(estimator.current()[1]), rtol=1e-5)
+    wide = covariance_of(prior_from_now(estimator, np.eye(3), none, none, 4.0, wander))
+    assert np.allclose(wide, 4.0 * still, rtol=1e-5, atol=1e-12 * np.abs(still).max())
+    wander[GYRO_BIAS], wander[ACCEL_BIAS] = 1e-10, 1e-4
+    moved = covariance_of(prior_from_now(estimator, np.eye(3), none, none, 1.0, wander))
+    assert np.allclose(np.diag(moved - still), wander, rtol=1e-3, atol=1e-14)
 
 
 @pytest.mark.parametrize('scenario', ('reverse', 'flight', 'hover'))

@@ -85,6 +85,13 @@ def test_fix_covariance_unknown(message):
     assert fix_from_msg(message).covariance is None
 
 
+@pytest.mark.parametrize('kind', (1, 2, 3))
+def test_fix_covariance_of_every_known_type_is_taken(kind):
+    """Approximated, 1, is what most drivers say."""
+    np.testing.assert_array_equal(fix_from_msg(fix(covariance_type=kind)).covariance,
+                                  np.diag([1.0, 2.0, 3.0]))
+
+
 def test_velocity_enu():
     block = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.0], [0.0, 0.0, 0.25]])
     result = velocity_from_msg(twist_with_covariance((1.0, 2.0, 3.0), block), Config())
@@ -126,11 +133,22 @@ def test_vertical_variance_unknown_takes_the_configured_one(frame):
                                np.diag([0.01, 0.01, 0.25]))
 
 
-def test_impossible_correlation_is_dropped():
-    block = np.array([[0.01, 5.0, 0.0], [5.0, 0.01, 0.0], [0.0, 0.0, 0.04]])
+@pytest.mark.parametrize('correlation', (-500.0, -1.5, -1.0, 1.0, 1.01, 500.0, np.nan, np.inf,
+                                         -np.inf))
+def test_impossible_correlation_is_dropped(correlation):
+    block = np.diag([1.0, 4.0, 9.0])
+    block[0, 1] = block[1, 0] = 2.0 * correlation
+    msg = twist_with_covariance((1.0, 2.0, 3.0), block)
+    np.testing.assert_array_equal(velocity_from_msg(msg, Config()).covariance,
+                                  np.diag([1.0, 4.0, 9.0]))
+
+
+def test_possible_correlation_is_kept_and_made_symmetric():
+    block = np.diag([1.0, 4.0, 9.0])
+    block[0, 1], block[1, 0] = 1.7, 1.9
     msg = twist_with_covariance((1.0, 2.0, 3.0), block)
     np.testing.assert_allclose(velocity_from_msg(msg, Config()).covariance,
-                               np.diag([0.01, 0.01, 0.04]))
+                               [[1.0, 1.8, 0.0], [1.8, 4.0, 0.0], [0.0, 0.0, 9.0]])
 
 
 def test_other_velocity_types():

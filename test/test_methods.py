@@ -119,3 +119,13 @@ def test_a_posteriori_factor_only_widens():
                 rejected_position=0, rejected=0, offered=2, delay=0.0)
     assert good.factor == 1.0 and bad.factor == 2.0 and empty.factor == np.inf
     assert replace(bad, lasting=4.0).factor == 4.0 and replace(good, lasting=1.5).factor == 1.0
+
+
+@pytest.mark.parametrize('ratio, dof, scale', [
+    (0.5, 200, 1.0), (1.29, 200, 1.0), (1.31, 200, 1.31), (9.0, 200, 9.0), (1.29, 800, 1.29),
+    (1.9, 18, 1.0), (2.1, 18, 2.1), (5.0, 0, 1.0)])
+def test_what_is_handed_on_is_widened_where_a_misfit_is_no_chance(ratio, dof, scale):
+    """Three sigmas of chi-square, whose variance is twice its degrees of freedom."""
+    fit = Fit(chi2=ratio * dof, dof=dof, innovation=NOTHING_NEW, converged=True,
+              rejected_velocity=0, rejected_position=0, rejected=0, offered=40, delay=0.0)
+    assert fit.significant_scale == pytest.approx(scale)

@@ -13,8 +13,8 @@
 # limitations under the License.
 """Checks on units and frames that need no alignment."""
 
-from ins_align.plausibility import (BEYOND_END, BLIND_ANGLE, END_TIMES, ForceCheck, RangeCheck,
-                                    stuck, VelocityCheck, without_spikes)
+from ins_align.plausibility import (BEYOND_END, BLIND_ANGLE, END_TIMES, FORCE_SAMPLES, FORCE_TIME,
+                                    ForceCheck, RangeCheck, stuck, VelocityCheck, without_spikes)
 import numpy as np
 import pytest
 
@@ -47,6 +47,24 @@ def test_force_check_waits_for_five_seconds_and_forgives():
     assert check.fault
     check.add(*forces(1.0, 600))
     assert not check.fault
+
+
+def test_force_check_waits_for_enough_samples():
+    check = ForceCheck()
+    for _ in range(FORCE_SAMPLES):
+        assert not check.fault
+        check.add(1.0, 1, FORCE_TIME)
+    assert check.fault
+
+
+def test_force_check_forgets_what_was_right_before():
+    check = ForceCheck()
+    for _ in range(100):
+        check.add(9.8 * 100, 100, 1.0)
+        assert not check.fault
+    for _ in range(2 * round(FORCE_TIME)):
+        check.add(1.0 * 100, 100, 1.0)
+    assert 'averages 1 m/s^2' in check.fault
 
 
 def drive(check, sent, *, speed=10.0, turn=0.1, seconds=60.0, rate=5.0, noise=0.5, wild=0.0):
@@ -93,6 +111,13 @@ def test_other_wrong_velocities_are_found(sent):
     assert fault and 'world frame' in fault
 
 
+def test_fixes_that_stay_where_they_are_contradict_a_velocity():
+    check = VelocityCheck()
+    for k in range(200):
+        check.add(0.2 * k, (0.8, 0.2, 0.0), np.array([10.0, 5.0, 0.0]), 0.5)
+    assert 'contradicts' in check.fault
+
+
 def test_straight_drive_to_the_north_east_tells_nothing():
     check = VelocityCheck()
     for k in range(200):
@@ -136,6 +161,14 @@ def test_wild_fixes_do_not_convict_the_velocity(speed, share):
     for sent, wrong in ((lambda v: v, False), (lambda v: v[[1, 0, 2]], speed > 0)):
         assert bool(drive(VelocityCheck(), sent, speed=speed, wild=share,
                           seconds=600.0).fault) == wrong
+
+
+@pytest.mark.parametrize('std, fault', [(3.0, True), (30.0, False)])
+def test_fixes_that_are_as_bad_as_the_journey_is_long_convict_nobody(std, fault):
+    check = VelocityCheck()
+    for k in range(500):
+        check.add(0.2 * k, (0.8 - 0.4 * k / RADIUS, 0.2, 0.0), np.array([0.0, 2.0, 0.0]), std)
+    assert bool(check.fault) == fault
 
 
 def test_across_the_antimeridian():
@@ -295,7 +328,8 @@ def test_end_of_a_range_is_found(axis, end, block):
                                            & (np.array(check.blind) <= check.stamps[run][-1]))
 
 
-def test_what_is_not_the_end_of_a_range():
+@pytest.mark.parametrize('block', (1, 7, None))
+def test_what_is_not_the_end_of_a_range(block):
     stamps, samples = swinging()
     resting = np.round(samples / 0.01) * 0.01
     resting[:, 2:4] = 0.0
@@ -304,8 +338,9 @@ def test_what_is_not_the_end_of_a_range():
     for values in (samples, resting,
                    np.round(samples / 1e-3) * 1e-3,               # steps of a converter
                    np.repeat(samples[::4], 4, axis=0),            # sent more often than measured
+                   np.repeat(samples[::8], 8, axis=0),
                    np.round(steady / 0.1) * 0.1):                 # coarse, and calm
-        assert checked(stamps, values).stamps.size == 0
+        assert checked(stamps, values, block).stamps.size == 0
 
 
 def test_range_check_forgets():

@@ -144,6 +144,47 @@ def test_values_at_an_epoch_are_interpolated():
     assert np.allclose(interval.omega, omega_of(epochs[1:]), atol=1e-6)
 
 
+@pytest.mark.parametrize('jitter', (0.0, 0.4))
+def test_changes_per_second_of_a_parabola_are_exact(jitter):
+    """At samples and at epochs between them, whose slopes come of the cubic."""
+    index = np.arange(-3, 60) + jitter * np.random.default_rng(1).uniform(-1, 1, 63)
+    stamps = 0.01 * index
+    a, b, c = np.array([[0.3, -0.2, 0.5], [1.0, 2.0, -1.0], [4.0, -3.0, 2.0]])
+
+    def value(t):
+        return a + b * t[..., None] + c * t[..., None] ** 2
+
+    steps = split_at_epochs(stamps, value(stamps), 10.0 * value(stamps),
+                            np.array([0.0533, 0.2171, 0.4987]))
+    ends = np.cumsum(np.hstack([[[0.0533], [0.2171]], steps.dt]), axis=1)
+    slope = b + 2 * c * ends[..., None]
+    assert np.allclose(steps.omega, value(ends)) and np.allclose(steps.f, 10 * value(ends))
+    assert np.allclose(steps.omega_dot, slope) and np.allclose(steps.f_dot, 10 * slope)
+
+
+def test_samples_in_bunches_are_one_to_the_slope():
+    """Two samples a hair apart differ by their noise, which is no change of the motion."""
+    stamps = np.sort(np.concatenate([0.01 * np.arange(40), 0.01 * np.arange(40) + 1e-5]))
+    noise = np.tile([1e-3, -1e-3], 40)[:, None]
+    gyro = 2.0 * stamps[:, None] + noise * np.ones(3)
+    steps = split_at_epochs(stamps, gyro, gyro, np.array([0.1, 0.3]))
+    # 2 and what 1 mrad/s makes of 10 ms; 200 rad/s^2 in 10 us.
+    assert np.abs(steps.omega_dot - 2.0).max() < 0.5
+
+
+@pytest.mark.parametrize('epoch', (0.5012, 0.505, 0.5089))
+def test_changes_at_an_epoch_are_those_of_the_values(epoch):
+    """Of samples that no parabola goes through."""
+    stamps = 0.01 * np.arange(100)
+    gyro, accel = np.random.default_rng(4).standard_normal((2, 100, 3))
+    steps = [split_at_epochs(stamps, gyro, accel, np.array([0.1, epoch + by]))
+             for by in (-1e-6, 0.0, 1e-6)]
+    for name in ('omega', 'f'):
+        before, after = (getattr(steps[k], name)[0, -1] for k in (0, 2))
+        assert np.allclose(getattr(steps[1], name + '_dot')[0, -1], (after - before) / 2e-6,
+                           rtol=1e-4, atol=1e-2)
+
+
 def test_interval_without_length_turns_nothing():
     interval = integrated([0.4, 0.4, 1.0])
     assert interval.duration[0] == 0
@@ -231,6 +272,19 @@ def test_noise_covariance_is_that_of_many_runs():
     # Mean normalised squared error: 9 +- 3 sigma of its mean.
     nees = np.mean(np.sum(errors * np.linalg.solve(clean.Q[0], errors.T).T, axis=1))
     assert nees == pytest.approx(9.0, rel=0.05)
+
+
+@pytest.mark.parametrize('count', (1, 2, 7))
+def test_white_noise_of_a_force_in_closed_form(count):
+    """Integrated once q^2 T, twice q^2 T^3 / 3, and q^2 T^2 / 2 between them, in any steps."""
+    stamps, duration = 0.2 * np.arange(-3, count + 4), 0.2 * count
+    steps = split_at_epochs(stamps, np.zeros((stamps.size, 3)), np.zeros((stamps.size, 3)),
+                            np.array([0.0, duration]))
+    Q = preintegrate(steps, SensorErrors.none(), Noise(0.0, 0.1)).Q[0]
+    for rows, columns, expected in ((slice(3, 6), slice(3, 6), duration),
+                                    (slice(3, 6), slice(6, 9), duration ** 2 / 2),
+                                    (slice(6, 9), slice(6, 9), duration ** 3 / 3)):
+        assert np.allclose(Q[rows, columns], 0.01 * expected * np.eye(3), rtol=1e-9)
 
 
 def test_noise_covariance_chains():
@@ -329,6 +383,9 @@ def test_mirrored_intervals_are_those_of_mirrored_sensors():
                                rtol=0.02, atol=0.02), name
         for name in ('gained', 'turned'):
             assert np.allclose(getattr(mirrored, name), getattr(expected, name)), name
+        for name in ('J_Rg', 'J_vg', 'J_pg', 'J_va', 'J_pa'):
+            there = getattr(expected, name)         # and the rotation is 0.2 rad
+            assert np.allclose(getattr(mirrored, name), there, atol=0.25 * np.abs(there).max())
 
 
 def test_storage_gives_back_what_was_put():

@@ -14,7 +14,7 @@
 """Motion just before an epoch against the integral of the motion itself."""
 
 from ins_align import recent as recent_module
-from ins_align.recent import AGES, exact, Recent, recent_motion, smooth
+from ins_align.recent import AGES, exact, Recent, recent_motion, RUNGS, smooth
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -96,6 +96,30 @@ def test_forces_and_rates_that_last():
         assert np.allclose(exact(recent.turned, age)[1], [[0.1 * age, 0.0, -0.2 * age]])
         calm, change = smooth(recent.gained, age)
         assert np.allclose(calm, value) and np.allclose(change, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize('age', (-0.05, 0.0, 0.013, 0.06, 0.14, 0.22, 0.3))
+def test_a_cubic_is_followed_exactly(age):
+    """Of an integral a t + b t^2 + c t^3: value a + 2 b t + 3 c t^2, change 2 b + 6 c t."""
+    a, b, c = np.array([[1.0, 2.0, 9.8], [3.0, -1.0, 0.5], [-7.0, 4.0, 5.0]])
+    integrals = (a * AGES[:, None] + b * AGES[:, None] ** 2 + c * AGES[:, None] ** 3)[None]
+    value, change = a + 2 * b * age + 3 * c * age ** 2, 2 * b + 6 * c * age
+    for found, expected in zip(smooth(integrals, age), (value, change)):
+        assert np.allclose(found, expected, atol=1e-9)
+    found, integral, _ = exact(integrals, age)
+    assert np.allclose(found, value, atol=1e-9)
+    assert np.allclose(integral, a * age + b * age ** 2 + c * age ** 3, atol=1e-12)
+
+
+@pytest.mark.parametrize('age', np.linspace(-0.1, 0.3, 33))
+def test_noise_of_the_integrals_does_not_grow_where_they_are_followed(age):
+    """A cubic goes on by one of its own steps at most: 4 (at age 0, which is 0), -6, 4, -1."""
+    squares = 0.0
+    for rung in range(RUNGS):
+        one = np.zeros((1, RUNGS, 1))
+        one[0, rung] = 1.0
+        squares += exact(one, age)[1].item() ** 2
+    assert squares <= 6 ** 2 + 4 ** 2 + 1 + 1e-9
 
 
 def test_where_samples_begin_or_were_silent_their_mean_goes_on():

@@ -105,7 +105,11 @@ def test_summary_says_what_matters(result):
     text = summary(result)
     assert f'ALIGNED after {result.status.time_to_align_s:.1f} s: heading sigma ' in text
     assert result.status.reason in text
-    assert f'{result.status.initial.yaw_deg:.3f}' in text
+    initial = result.status.initial
+    assert f'{initial.yaw_deg:.3f}' in text and f' {initial.heading_deg:.3f} ' in text
+    north = initial.C_nb.T @ [0.0, 1.0, 0.0]    # seen from the vehicle, at 0 deg ahead
+    assert np.degrees(np.arctan2(north[1], north[0])) % 360.0 == pytest.approx(
+        initial.heading_deg, abs=3.0)           # level to so much
     assert 'error roll' in text
     assert 'imu 3001' in text
     assert 'error roll' not in summary(dataclasses.replace(result, reference=None))

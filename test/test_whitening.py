@@ -19,9 +19,9 @@ from alignment import some_unknowns
 from ins_align.preintegration import Noise, preintegrate, SensorErrors, Steps
 from ins_align.recent import AGES, Recent
 from ins_align.rotation import exp_so3
-from ins_align.unknowns import DELAY, SIZE
-from ins_align.whitening import (Chain, chain_noise, GATE, Gate, Measurements, Rows,
-                                 sensitivities, START, Whitener)
+from ins_align.unknowns import DELAY, SIZE, START_VELOCITY
+from ins_align.whitening import (Chain, chain_noise, GATE, Gate, HEADING_RESOLVED_STD,
+                                 Measurements, Rows, sensitivities, START, Whitener)
 import numpy as np
 import pytest
 
@@ -113,6 +113,15 @@ def test_noise_of_an_interval_looks_like_an_error_of_the_start(row):
     assert np.allclose(D @ as_start * sign, numeric, atol=2e-6)
 
 
+def test_noise_in_excess_counts_as_far_as_it_is_believed():
+    x, intervals, gnss = some_unknowns(), some_intervals(), some_measurements()
+    chain = Chain.start().extended(intervals)
+    both = replace(intervals, Q_excess=3.0 * intervals.Q)
+    plain = chain_noise(x.C, gnss.time, chain, intervals, 9)
+    assert not np.any(intervals.Q_excess) and np.any(plain)
+    assert np.allclose(chain_noise(x.C, gnss.time, chain, both, 9, excess=0.2), 1.6 * plain)
+
+
 def test_chain_over_all_is_the_chain_one_by_one():
     intervals = some_intervals()
     whole = Chain.start().extended(intervals)
@@ -163,6 +172,27 @@ def test_whitener_is_dense_generalised_least_squares(size, kinds):
     assert np.allclose(whitener.X, cross @ np.linalg.solve(V, D), rtol=1e-7, atol=1e-9)
     assert np.allclose(whitener.P, walk[-1] - cross @ np.linalg.solve(V, cross.T), atol=1e-8)
     assert whitener.rows == 3 * n
+    assert whitener.log_det == pytest.approx(np.linalg.slogdet(V)[1])
+
+
+def test_information_on_the_heading_that_noise_feigns():
+    """A horizontal error of variance p, seen with r beside it: p / (p + r) on each of two axes."""
+    q, r, count = 0.04, 0.09, 6
+    whitener = Whitener(np.arange(SIZE), 6)
+    columns = np.zeros((count, 1, 3, 1 + SIZE))
+    columns[:, 0, :, 1:][:, :, START_VELOCITY] = np.eye(3)
+    noise = np.zeros((count, 6, 6))
+    noise[:, 3:, 3:] = q * np.eye(3)
+    covariance, wanted = np.tile(r * np.eye(3), (count, 1, 1, 1)), np.ones((count, 1), bool)
+    for part in (slice(0, 2), slice(2, count)):
+        rows = rows_of(columns[part], covariance[part], noise[part])
+        whitener.move_to(whitener.whitened(rows, wanted[part]), -1)
+    p = feigned = 0.0
+    for _ in range(count):
+        p += q
+        feigned += 2 * p / (p + r)
+        p = p * r / (p + r)
+    assert whitener.spurious == pytest.approx(feigned)
 
 
 def test_an_outlier_is_counted_and_leaves_no_trace():
@@ -183,3 +213,31 @@ def test_an_outlier_is_counted_and_leaves_no_trace():
         nis, normalised = gate.test(new, R)
         assert (nis[0] < GATE) == fine
         assert np.allclose(np.sum(normalised ** 2), nis, rtol=0.3)
+
+
+@pytest.mark.parametrize('scale, used', [(1.0, False), (47.0 / GATE, False), (49.0 / GATE, True)])
+def test_a_wider_gate_lets_through_what_a_usual_one_does_not(scale, used):
+    innovation = np.zeros((1, 1, 3, 1 + SIZE))
+    innovation[..., 0] = 4.0                               # 48 in its squares
+    rows = rows_of(innovation, np.eye(3)[None, None], np.zeros((1, 6, 6)))
+    gate, wanted = Gate(np.zeros(SIZE), 1e-9 * np.eye(SIZE)), np.ones((1, 1), bool)
+    whitened = Whitener(np.arange(SIZE), 6).whitened(rows, wanted, gate, scale)
+    assert whitened.used[0, 0] == used
+
+
+@pytest.mark.parametrize('share', (0.99, 1.01))
+def test_a_gate_is_round_while_the_heading_is_open(share):
+    """An error of the heading shows across the motion only to first order."""
+    P = 1e-6 * np.eye(SIZE)
+    P[2, 2] = (share * HEADING_RESOLVED_STD) ** 2
+    innovation, S = np.zeros((3, 1 + SIZE)), np.diag([0.01, 0.02, 0.03])
+    innovation[:, 0] = 3.0, 0.5, -0.4
+    innovation[:, 3] = 0.0, 20.0, 0.0
+    spread = np.diag([0.0, 400.0 * P[2, 2], 0.0])
+    if share > 1.0:
+        spread[0, 0] = spread[1, 1]
+    nis, normalised = Gate(np.zeros(SIZE), P).test(innovation, S)
+    residual = innovation[:, 0]
+    assert nis == pytest.approx(residual @ np.linalg.solve(spread + S, residual))
+    assert np.allclose(normalised, residual / np.sqrt(np.diag(spread + S)))
+    assert (nis < GATE) == (share > 1.0)
