@@ -223,9 +223,10 @@ def _noise(fit: Fit) -> str:
                    if factor > 1.0)
     if fit.walk > 1.0:
         more += f'; the biases of the gyros drift {fit.walk:.0f} times as fast as stated'
-    if fit.lasting > MENTIONED:
-        more += (f'; errors of the GNSS last from epoch to epoch: sigmas are up to '
-                 f'{math.sqrt(fit.lasting):.1f} times larger')
+    grown = fit.factor / math.sqrt(max(1.0, fit.chi2 / max(fit.dof, 1)))
+    if grown ** 2 > MENTIONED and fit.dof > 0:
+        more += (f'; errors of the GNSS last from epoch to epoch: sigmas are {grown:.1f} times '
+                 'larger')
     return more
 
 
