@@ -66,7 +66,7 @@ class NodeProcess:
             self._process.send_signal(number)
         return self.wait()
 
-    def wait(self, timeout=20.0):
+    def wait(self, timeout=60.0):
         """Return the exit status; `output` then holds all that was printed."""
         try:
             self.output += self._process.communicate(timeout=timeout)[0] or ''
