@@ -73,7 +73,7 @@ class Alignment:
         self._first_t0_ns: int | None = None
         self._forget(None)
 
-    def _forget(self, learnt: '_Learnt | None') -> None:
+    def _forget(self, learnt: _Learnt | None) -> None:
         """Forget everything but the counts and what was learnt of sensors, lever arm and delay."""
         if self._method is not None:
             self._epochs.update(_epoch_counts(self._method))

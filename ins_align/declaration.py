@@ -223,10 +223,9 @@ def _noise(fit: Fit) -> str:
                    if factor > 1.0)
     if fit.walk > 1.0:
         more += f'; the biases of the gyros drift {fit.walk:.0f} times as fast as stated'
-    grown = fit.factor / math.sqrt(max(1.0, fit.chi2 / max(fit.dof, 1)))
-    if grown ** 2 > MENTIONED and fit.dof > 0:
-        more += (f'; errors of the GNSS last from epoch to epoch: sigmas are {grown:.1f} times '
-                 'larger')
+    if fit.lasting_factor ** 2 > MENTIONED:
+        more += ('; errors of the GNSS last from epoch to epoch: sigmas are '
+                 f'{fit.lasting_factor:.1f} times larger')
     return more
 
 

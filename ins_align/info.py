@@ -394,13 +394,18 @@ def _about_imu(imu: ImuFacts) -> list[str]:
             f'at rest for {imu.rest_s:.0f} s: rate '
             f'({", ".join(f"{rate:+.4f}" for rate in imu.rest_rate_deg_s)}) deg/s, '
             f'specific force {imu.rest_force_error:+.3f} m/s^2 off gravity')
-    lines.append(f'no imu_grade covers this, {imu.grade} comes closest: more noise is measured '
-                 'while aligning, more bias is not'
-                 if imu.grade_is_sure and not imu.grade_covers else
-                 f'suits imu_grade {imu.grade}' if imu.grade_is_sure else
-                 f'imu_grade: no worse than {imu.grade}' if imu.grade != Config.imu_grade else
-                 f'imu_grade: never at rest to measure it; {imu.grade} is the default')
-    return lines
+    return [*lines, _about_grade(imu)]
+
+
+def _about_grade(imu: ImuFacts) -> str:
+    if imu.grade_is_sure and imu.grade_covers:
+        return f'suits imu_grade {imu.grade}'
+    if imu.grade_is_sure:
+        return (f'no imu_grade covers this, {imu.grade} comes closest: more noise is measured '
+                'while aligning, more bias is not')
+    if imu.grade != Config.imu_grade:
+        return f'imu_grade: no worse than {imu.grade}'
+    return f'imu_grade: never at rest to measure it; {imu.grade} is the default'
 
 
 def _motion_lines(found: Manoeuvres | None) -> list[str]:

@@ -77,6 +77,11 @@ class Fit:
         return math.sqrt(max(1.0, self.lasting * self.chi2 / self.dof))
 
     @property
+    def lasting_factor(self) -> float:
+        """Part of that factor, at least 1: errors of the GNSS last."""
+        return 1.0 if self.dof <= 0 else self.factor / math.sqrt(max(1.0, self.chi2 / self.dof))
+
+    @property
     def significant_scale(self) -> float:
         """Factor on covariances that are handed on: 1 unless the misfit cannot be chance."""
         if self.dof <= 0 or self.chi2 / self.dof < 1 + 3 * math.sqrt(2 / self.dof):

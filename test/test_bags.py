@@ -190,6 +190,14 @@ def test_damage_in_the_middle_is_survived(copy, kind):
     assert set(records[:len(records) // 2]) <= set(expected)
 
 
+def spoil_page(file, place):
+    """Overwrite the page of a sqlite3 file that lies at so much of its length."""
+    content = bytearray(file.read_bytes())
+    at = int(place * len(content)) // 4096 * 4096
+    content[at:at + 4096] = bytes([255]) * 4096
+    file.write_bytes(content)
+
+
 @pytest.mark.parametrize('place', (0.3, 0.5, 0.7, 0.9))
 def test_messages_of_one_stamp_are_all_read_where_damage_parts_them(copy, monkeypatch, place):
     """Three have one stamp, and blocks of a hundred end among them."""
@@ -205,10 +213,7 @@ def test_messages_of_one_stamp_are_all_read_where_damage_parts_them(copy, monkey
     database.close()
     expected = by_bag(path)[0]
     assert len(set(expected)) == len(expected) == 4400
-    content = bytearray(file.read_bytes())
-    at = int(place * len(content)) // 4096 * 4096
-    content[at:at + 4096] = bytes([255]) * 4096
-    file.write_bytes(content)
+    spoil_page(file, place)
     records, warnings = by_bag(path)
     assert any('damaged' in warning for warning in warnings)
     assert len(records) == len(set(records))
@@ -221,10 +226,7 @@ def test_what_was_read_before_the_damage_is_not_read_again(copy, monkeypatch, pl
     path = copy('sqlite3')
     expected = by_library(path)
     file = storage_file(path)
-    content = bytearray(file.read_bytes())
-    at = int(place * len(content)) // 4096 * 4096
-    content[at:at + 4096] = bytes([255]) * 4096
-    file.write_bytes(content)
+    spoil_page(file, place)
     records, warnings = by_bag(path)
     assert any('damaged' in warning for warning in warnings)
     assert len(records) > 400 and set(records) < set(expected)
