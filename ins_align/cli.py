@@ -19,6 +19,7 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 import errno
+import gc
 import json
 import os
 from pathlib import Path
@@ -363,6 +364,7 @@ def run_info(arguments: argparse.Namespace) -> int:
 def run_replay(arguments: argparse.Namespace) -> int:
     """Run ``ins_align replay``."""
     keep_to_one()
+    gc.set_threshold(100_000)  # rows and results by the thousand, none of which is garbage
     outputs = [path for path in (arguments.json, arguments.csv, arguments.plot) if path]
     for path in outputs:
         _check_writable(path)

@@ -32,7 +32,7 @@ from ins_align.solution import Course, NoiseLevels, Solution
 from ins_align.unknowns import (ACCEL_MATRIX, DELAY, GYRO_BIAS, GYRO_MATRIX, LEVER_ARM, Prior,
                                 SIZE, START_POSITION, START_VELOCITY, Unknowns)
 from ins_align.whitening import (Chain, GATE, Gate, HEADING_RESOLVED_STD, Measurements, POSITION,
-                                 VELOCITY, Whitened)
+                                 Rows, VELOCITY, Whitened)
 import numpy as np
 
 # Median of chi-square with three degrees of freedom.
@@ -99,11 +99,12 @@ class MapEstimator:
     MAX_ITERATIONS = 8
     # Noise is judged when the store has grown by this share.
     TUNE_FROM, TUNE_GROWTH = 12, 0.5
-    # That of the IMU is tried at steps of these factors, up to a largest one, and moved when the
-    # log likelihood gains so much. A walk that is a factor of e larger has to gain more, a smaller
-    # one may lose it.
-    EXCESS_STEPS, MAX_EXCESS, EXCESS_GAIN = (1 / 9, 9.0), 3.0, 3.0
-    WALK_STEPS, MAX_WALK, WALK_GAIN, WALK_COST = (1 / 9, 1 / 3, 3.0, 9.0), 27.0, 1.0, 5.0
+    # That of the IMU is tried at steps of these factors, down and up, to a largest one, and moved
+    # when the log likelihood gains so much. A walk that is a factor of e larger has to gain more,
+    # a smaller one may lose it.
+    EXCESS_STEPS, MAX_EXCESS, EXCESS_GAIN = ((1 / 9,), (9.0,)), 3.0, 3.0
+    WALK_STEPS, MAX_WALK = ((1 / 3, 1 / 9), (3.0, 9.0)), 27.0
+    WALK_GAIN, WALK_COST = 1.0, 5.0
     # The receiver's is taken for understated when the residuals' variance is so many times what it
     # should be and at least so much of it is white, as what does not fit the model is not; from
     # then on it follows when they differ by this factor.
@@ -307,14 +308,16 @@ class MapEstimator:
                  and self.free_axis_tilt < self.IDLE_AXIS_TILT)
         return bool(age >= (self.IDLE_TIME if still else self.MAX_IDLE_TIME))
 
-    def _run(self, s: Solution, gate: Gate | None, refused: np.ndarray) -> Whitened:
-        """Take all stored epochs into an empty solution; without a gate those not refused."""
+    def _rows(self, s: Solution, alike: Rows | None = None) -> Rows:
+        """Return what an empty solution makes of all stored epochs; see `Solution.rows`."""
         epochs = slice(0, self.count)
-        gnss = self._gnss.take(epochs)
-        present = gnss.present[:, :s.kinds]
+        return s.rows(self._gnss.take(epochs), self._corrected(epochs, s.point.sensors), alike)
+
+    def _run(self, s: Solution, rows: Rows, gate: Gate | None, refused: np.ndarray) -> Whitened:
+        """Take all stored epochs into an empty solution; without a gate those not refused."""
+        present = self._gnss.present[:self.count, :s.kinds]
         wanted = present if gate is not None else present & ~refused[:, :s.kinds]
-        return s.run(s.rows(gnss, self._corrected(epochs, s.point.sensors)), present, wanted, gate,
-                     self._gate_scale)
+        return s.run(rows, present, wanted, gate, self._gate_scale)
 
     def _corrected(self, epochs: slice, sensors: SensorErrors) -> Intervals:
         """Return stored intervals as they would be with other sensor errors."""
@@ -340,12 +343,13 @@ class MapEstimator:
         """
         for _ in range(self.MAX_ITERATIONS):
             s = self._start(point)
-            whitened = self._run(s, None if P is None else Gate(s.dx, P), refused)
+            rows = self._rows(s)
+            whitened = self._run(s, rows, None if P is None else Gate(s.dx, P), refused)
             if s.rejected_epochs > self.MAX_REJECTED * self.measured:
                 # Not a few outliers but a wrong picture: look at everything again.
                 s, P = self._start(point), None
                 refused[:] = False
-                whitened = self._run(s, None, refused)
+                whitened = self._run(s, rows, None, refused)
             if s.nonlinearity <= self.NONLINEARITY:
                 if not (self.gated and self._misfits(s)
                         and self._refuse_wild(s.residuals(whitened)[0], refused)):
@@ -415,25 +419,33 @@ class MapEstimator:
                noise: NoiseLevels | None = None) -> tuple[Solution, Whitened]:
         """Take the stored epochs once more, as `_start` has it."""
         solution = self._start(point, prior, columns, noise)
-        return solution, self._run(solution, None, self._refused[:self.count])
+        return solution, self._run(solution, self._rows(solution), None,
+                                   self._refused[:self.count])
 
-    def _tune_imu(self, s: Solution, name: str, steps: Sequence[float], most: float,
+    def _tune_imu(self, s: Solution, name: str, steps: Iterable[Sequence[float]], most: float,
                   gain: float, cost: float = 0.0) -> None:
         """
         Judge by the likelihood a level of the IMU's noise.
 
-        The overall scale is left to the a-posteriori factor.
+        The overall scale is left to the a-posteriori factor. Where a step is for the worse, a
+        larger one that way is not tried.
         """
         best, likelihood = self.noise, s.log_likelihood + gain
-        for step in steps:
-            trial = step * getattr(self.noise, name)
-            if not 0.99 * getattr(FIRST_NOISE, name) <= trial <= 1.01 * most:
-                continue
-            noise = self.noise._replace(**{name: trial})
-            solution, _ = self._rerun(s.estimate, noise=noise)
-            gained = solution.log_likelihood - cost * math.log(step)
-            if gained > likelihood:
-                best, likelihood = noise, gained
+        rows: Rows | None = None
+        for one_way in steps:
+            for step in one_way:
+                trial = step * getattr(self.noise, name)
+                if not 0.99 * getattr(FIRST_NOISE, name) <= trial <= 1.01 * most:
+                    break
+                noise = self.noise._replace(**{name: trial})
+                solution = self._start(s.estimate, noise=noise)
+                rows = self._rows(solution, rows)
+                self._run(solution, rows, None, self._refused[:self.count])
+                gained = solution.log_likelihood - cost * math.log(step)
+                if gained > likelihood:
+                    best, likelihood = noise, gained
+                if solution.log_likelihood < s.log_likelihood:
+                    break
         self.noise = best
 
     def _tune_gnss(self, point: Unknowns) -> None:

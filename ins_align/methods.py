@@ -268,7 +268,7 @@ class MapMethod:
         intervals = preintegrate(imu.steps, self._estimator.sensor_errors, imu.noise, imu.recent)
         for k, self._innovation in enumerate(self._estimator.add(intervals, gnss)):
             self._track, self._last_epoch = track.at(k), epochs[k]
-            self._last_imu = imu.take(slice(k, k + 1))
+            self._last_steps = imu, k
             self._correlation.add(self._innovation.normalised)
             self._offered += bool(present[k].any())
             self._look_for_velocity(epochs[k])
@@ -304,7 +304,8 @@ class MapMethod:
         self.moved += 1
         start = replace(self._last_epoch, v_n=None, position_measured=False)
         self._start(start, prior, self._estimator.noise)
-        self._take_start(start, self._last_imu.end())
+        imu, k = self._last_steps
+        self._take_start(start, imu.take(slice(k, k + 1)).end())
 
     def initial(self) -> tuple[Array, Array] | None:
         """Return ``C_nb(t0)`` and the covariance of its error in ENU."""

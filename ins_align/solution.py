@@ -160,16 +160,23 @@ class Solution:
         self.C, self.covariance = point.C, np.zeros((3, 3))
         self.gyro_bias = point.sensors.gyro_bias
 
-    def rows(self, gnss: Measurements, interval: Intervals) -> Rows:
-        """Linearise K epochs that follow the chain; their intervals with the point's biases."""
-        chain = self.chain.extended(interval)
-        Y = sensitivities(self.point, chain, gnss, interval)[:, :, self.whitener.columns]
+    def rows(self, gnss: Measurements, interval: Intervals, alike: Rows | None = None) -> Rows:
+        """
+        Linearise K epochs that follow the chain; their intervals with the point's biases.
+
+        `alike`: those of the same epochs and unknowns at the same point, with other noise.
+        """
+        kinds = self.kinds
+        if alike is None:
+            chain = self.chain.extended(interval)
+            Y = sensitivities(self.point, chain, gnss, interval)[:, :, self.whitener.columns]
+            Y = Y.reshape(Y.shape[0], 2, 3, -1)[:, :kinds]
+        else:
+            chain, Y = alike.chain, alike.Y
         noise = chain_noise(self.point.C, gnss.time, chain, interval, self._size,
                             self._noise.excess, self._rate_random_walk)
-        kinds = self.kinds
         covariance = gnss.covariance * np.array(self._noise.gnss)[:, None, None]
-        return Rows(chain, noise, Y.reshape(Y.shape[0], 2, 3, -1)[:, :kinds],
-                    covariance[:, :kinds], gnss.time)
+        return Rows(chain, noise, Y, covariance[:, :kinds], gnss.time)
 
     @property
     def kinds(self) -> int:
@@ -179,7 +186,7 @@ class Solution:
     def run(self, rows: Rows, present: np.ndarray, wanted: np.ndarray, gate: Gate | None,
             gate_scale: float) -> Whitened:
         """Take what is wanted of epochs at one go; outliers by one gate for all."""
-        whitened = self.whitener.whitened(rows, wanted)
+        whitened = self.whitener.whitened_at_once(rows, wanted)
         if gate is not None:
             nis, _ = gate.test(whitened.innovation, whitened.S)
             if not np.all(nis < GATE * gate_scale):

@@ -29,8 +29,8 @@ from ins_align.recent import AGES, exact, smooth
 from ins_align.rotation import (apply, Array, by_row, cross, cumulative_rotations, exp_so3, Index,
                                 running_sum, skew)
 from ins_align.unknowns import (ACCEL, ACCEL_BIAS, ACCEL_MATRIX, ATTITUDE, DELAY, GYRO, GYRO_BIAS,
-                                GYRO_MATRIX, LEVER_ARM, SIZE, START_POSITION, START_VELOCITY,
-                                Unknowns)
+                                GYRO_MATRIX, inverse_spd, LEVER_ARM, SIZE, START_POSITION,
+                                START_VELOCITY, Unknowns)
 import numpy as np
 
 # Below this heading sigma (rad) the problem is as good as linear in the heading.
@@ -42,6 +42,8 @@ VELOCITY, POSITION = slice(0, 3), slice(3, 6)
 MIN_DELAY, MAX_DELAY = -0.1, AGES[-1]
 # The unknowns that the errors of the chain look like, but for biases that walk.
 START = np.r_[ATTITUDE, START_VELOCITY, START_POSITION]
+# Epochs whose joint covariance is factored at one go: fewer cost calls, more cost operations.
+BLOCK = 8
 
 
 @dataclass
@@ -367,7 +369,7 @@ class Whitened:
     Attributes
     ----------
     P, X, normal, rows, spurious, log_det : ndarray
-        As in `Whitener`, with a leading axis of K.
+        As in `Whitener`, with a leading axis of K, or of 1 for the last epoch alone.
     used : ndarray of bool, shape (K, kinds)
         Which measurements were taken.
     innovation : ndarray, shape (K, kinds, 3, 1 + n)
@@ -489,9 +491,7 @@ class Whitener:
                 own[k, kind], inverse_of[k, kind] = seen, inverse
             P_after[k], X_after[k] = P, X
         squares = innovation.swapaxes(-1, -2) @ (inverse_of @ innovation)
-        # The heading's column is made of integrated IMU data, whose own errors look like motion:
-        # this is the information that they would feign, in expectation (errors in variables).
-        feigned = np.sum(inverse_of[..., :2, :] * own[..., :2, :], axis=(-2, -1))
+        feigned = _feigned(inverse_of, own)
 
         def total(start: float, steps: Array) -> Array:
             return running_sum(np.array(start), np.sum(steps, axis=1))
@@ -500,6 +500,72 @@ class Whitener:
                         self.rows + np.cumsum(3 * np.count_nonzero(used, axis=1)),
                         total(self.spurious, feigned),
                         total(self.log_det, np.log(determinant_of)), used, innovation, S_of)
+
+    def whitened_at_once(self, rows: Rows, wanted: np.ndarray) -> Whitened:
+        """
+        Filter epochs like `whitened`, several times faster, for the state after the last alone.
+
+        The errors of the chain are a random walk: the covariance of the measurements of a block
+        of epochs can be written down. Its Cholesky factor makes of them, row after row, the same
+        innovations as a filter does.
+        """
+        K, kinds = wanted.shape
+        there = wanted[:, :, None, None]
+        covariance = np.where(there, rows.covariance, np.eye(3))
+        Y = np.where(there, rows.Y, 0.0).reshape(K, 3 * kinds, -1)
+        D_of = Y[..., self._alike_columns]
+        P, X, normal = self.P, self.X, self.normal
+        white = np.empty(Y.shape)
+        roots = np.empty((K, kinds, 3, 3))          # of the covariance of each innovation
+        for start in range(0, K, BLOCK):
+            block = slice(start, min(start + BLOCK, K))
+            count = block.stop - start
+            walked = P + np.cumsum(rows.noise[block], axis=0)
+            PD = (D_of[block] @ walked).reshape(-1, len(P))
+            D = D_of[block].reshape(PD.shape)
+            S = D @ PD.T                            # of which the lower triangle holds
+            one = np.arange(count)[:, None], np.arange(kinds), slice(None)
+            shape, own = 2 * (count, kinds, 3), 2 * one
+            S.reshape(shape)[own] += covariance[block]
+            try:
+                root = np.linalg.cholesky(S)
+            except np.linalg.LinAlgError:           # rounding, or numbers that are none
+                return self.whitened(rows, wanted)
+            new = Y[block].reshape(len(D), -1) - D @ X
+            both = np.linalg.solve(root, np.hstack([new, PD]))
+            new, PD = both[:, :-len(P)], both[:, -len(P):]
+            X = X + PD.T @ new
+            P = walked[-1] - PD.T @ PD
+            P = 0.5 * (P + P.T)
+            normal = normal + new.T @ new
+            white[block] = new.reshape(count, 3 * kinds, -1)
+            roots[block] = root.reshape(shape)[own]
+        S_of = roots @ roots.swapaxes(-1, -2)
+        feigned = _feigned(inverse_spd(S_of), S_of - covariance)
+        log_det = 2.0 * np.sum(np.log(np.diagonal(roots, axis1=-2, axis2=-1)))
+        return Whitened(P[None], X[None], normal[None],
+                        np.array([self.rows + 3 * np.count_nonzero(wanted)]),
+                        np.array([self.spurious + np.sum(feigned)]),
+                        np.array([self.log_det + log_det]), wanted,
+                        roots @ white.reshape(rows.Y.shape), S_of)
+
+
+def _feigned(inverse: Array, own: Array) -> Array:
+    """
+    Information on the heading that the noise of the IMU feigns, shape (K, kinds).
+
+    The heading's column is made of integrated IMU data, whose own errors look like motion: this is
+    the information that they would feign, in expectation (errors in variables).
+
+    Parameters
+    ----------
+    inverse : ndarray, shape (K, kinds, 3, 3)
+        Of the covariance of each innovation.
+    own : ndarray, shape (K, kinds, 3, 3)
+        The part of that covariance which the errors of the chain make.
+
+    """
+    return np.sum(inverse[..., :2, :] * own[..., :2, :], axis=(-2, -1))
 
 
 def _inverse3(matrix: Array) -> tuple[Array, float]:

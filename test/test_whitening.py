@@ -20,7 +20,7 @@ from ins_align.preintegration import Noise, preintegrate, SensorErrors, Steps
 from ins_align.recent import AGES, Recent
 from ins_align.rotation import exp_so3
 from ins_align.unknowns import DELAY, SIZE, START_VELOCITY
-from ins_align.whitening import (Chain, chain_noise, GATE, Gate, HEADING_RESOLVED_STD,
+from ins_align.whitening import (BLOCK, Chain, chain_noise, GATE, Gate, HEADING_RESOLVED_STD,
                                  Measurements, Rows, sensitivities, START, Whitener)
 import numpy as np
 import pytest
@@ -173,6 +173,43 @@ def test_whitener_is_dense_generalised_least_squares(size, kinds):
     assert np.allclose(whitener.P, walk[-1] - cross @ np.linalg.solve(V, cross.T), atol=1e-8)
     assert whitener.rows == 3 * n
     assert whitener.log_det == pytest.approx(np.linalg.slogdet(V)[1])
+
+
+def some_rows(seed, epochs, size, kinds, width):
+    """Rows of random numbers, whose covariances are positive definite."""
+    r = np.random.default_rng(seed)
+    roots = r.standard_normal((epochs, size, size)), r.standard_normal((epochs, kinds, 3, 3))
+    noise, covariance = (root @ root.swapaxes(-1, -2) for root in roots)
+    return rows_of(r.standard_normal((epochs, kinds, 3, 1 + width)),
+                   covariance + 0.1 * np.eye(3), noise)
+
+
+@pytest.mark.parametrize('size, kinds, walks', [(6, 1, False), (6, 1, True), (9, 2, True)])
+@pytest.mark.parametrize('epochs', [1, BLOCK, 3 * BLOCK + 2])
+def test_blocks_at_once_are_what_the_filter_is_epoch_by_epoch(size, kinds, walks, epochs):
+    whitener = Whitener(np.arange(SIZE), size, walks)
+    before = some_rows(1, 3, size + 3 * walks, kinds, SIZE)
+    whitener.move_to(whitener.whitened(before, np.ones((3, kinds), bool)), -1)
+    rows = some_rows(2, epochs, size + 3 * walks, kinds, SIZE)
+    wanted = np.random.default_rng(3).random((epochs, kinds)) < 0.8
+    rows.Y[~wanted] = np.nan                        # what is not wanted is not looked at
+    expected, found = whitener.whitened(rows, wanted), whitener.whitened_at_once(rows, wanted)
+    for name in ('P', 'X', 'normal', 'rows', 'spurious', 'log_det'):
+        assert np.allclose(getattr(found, name), getattr(expected, name)[-1:], rtol=1e-9), name
+    for name in ('used', 'innovation', 'S'):
+        assert np.allclose(getattr(found, name), getattr(expected, name), rtol=1e-8), name
+
+
+def test_what_cannot_be_factored_is_filtered_epoch_by_epoch():
+    """Here because rounding has left a covariance with a variance below zero."""
+    rows = some_rows(4, BLOCK, 6, 1, SIZE)
+    rows.noise[2] -= 50.0 * np.eye(6)
+    whitener, wanted = Whitener(np.arange(SIZE), 6), np.ones((BLOCK, 1), bool)
+    with np.errstate(invalid='ignore'):             # the logarithm of a negative determinant
+        expected = whitener.whitened(rows, wanted)
+        found = whitener.whitened_at_once(rows, wanted)
+    assert np.isfinite(expected.normal).all()
+    assert np.array_equal(found.normal, expected.normal)
 
 
 def test_information_on_the_heading_that_noise_feigns():
