@@ -259,7 +259,7 @@ class GnssBuffer:
     lateness_ns : int
         How much later than newer IMU samples a message may arrive.
     counts : Counter
-        Where messages are counted.
+        Where messages are counted, and epochs that only repeat the one before: ``gnss_repeated``.
     pair_ns : int
         A fix and a velocity that are no further apart are of one epoch; 0: where the stamp is one.
 
@@ -271,6 +271,7 @@ class GnssBuffer:
         self._counts = counts
         self._pair_ns = pair_ns
         self._pending: dict[int, GnssEpoch] = {}
+        self._said: tuple[float, ...] = ()          # position and velocity, released last
 
     def add_fix(self, fix: Fix, imu_newest_ns: int | None) -> None:
         """Take a position, or count why not."""
@@ -339,8 +340,26 @@ class GnssBuffer:
                              and epoch.stamp_ns + self._pair_ns > upto_ns)
             if half_may_come or (joint is not None and joint.stamp_ns > upto_ns):
                 break
-            released.append(joint or epoch)
-            place += 1 if joint is None else 2
+            parts = [epoch] if close is None or joint is None else [epoch, close]
+            if self._repeats(parts):
+                self._counts['gnss_repeated'] += 1
+            else:
+                released.append(joint or epoch)
+            place += len(parts)
         for stamp in stamps[:place]:
             del self._pending[stamp]
         return released
+
+    def _repeats(self, parts: list[GnssEpoch]) -> bool:
+        """
+        Whether an epoch says to the last bit what the one before said, and that it moves.
+
+        No receiver measures that: a driver sends its last message again.
+        """
+        fix = next((part.fix for part in parts if part.fix), None)
+        velocity = next((part.velocity for part in parts if part.velocity), None)
+        before, self._said = self._said, ()
+        if fix is not None and velocity is not None and np.any(velocity.velocity):
+            self._said = (fix.latitude_deg, fix.longitude_deg, fix.altitude_m,
+                          *velocity.velocity.tolist())
+        return bool(self._said) and self._said == before

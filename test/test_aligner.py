@@ -735,6 +735,24 @@ def test_broken_messages_on_the_way_change_nothing_but_counts(flight, result):
         assert spoilt.counts[reason] > 100, reason
 
 
+def test_gnss_that_is_sent_again_between_its_epochs_is_that_of_its_epochs():
+    """A receiver of 1 Hz, whose driver publishes its last message at 5 Hz with stamps of now."""
+    s = simulated('flight', imu_grade='mems', duration=60.0, seed=3)
+
+    def of_epochs(stamped, measured):
+        return replace(s, gnss_stamps_ns=s.gnss_stamps_ns[stamped],
+                       gnss_arrival_ns=s.gnss_arrival_ns[stamped],
+                       lla_deg=s.lla_deg[measured], velocity=s.velocity[measured])
+
+    every = np.arange(len(s.gnss_stamps_ns))
+    fifth = every[::5]
+    slow, repeated = (aligned(of_epochs(*epochs))[0].status()
+                      for epochs in ((fifth, fifth), (every, every // 5 * 5)))
+    assert repeated.state is slow.state is State.ALIGNED
+    assert np.array_equal(repeated.current.quaternion_xyzw, slow.current.quaternion_xyzw)
+    assert repeated.counts['gnss_repeated'] == len(every) - len(fifth)
+
+
 def test_covariances_of_any_size_break_nothing(flight):
     sizes = (1e-12, 1e-4, 1.0, 1e12)
     aligner = Aligner(config_for(flight, use_position=True))

@@ -292,6 +292,33 @@ def test_duplicates_are_counted_and_the_first_is_kept():
     assert counts['fix_duplicate'] == 1 and counts['velocity_duplicate'] == 1
 
 
+@pytest.mark.parametrize('late', (0, 30 * MS))
+def test_epochs_that_move_and_repeat_the_one_before_are_left_out(late):
+    """A driver that sends what the receiver said last at a rate of its own."""
+    counts = Counter()
+    buffer = GnssBuffer(LATENESS, counts, PAIR_NS)
+    said = [(48.0, 3.0), (48.0, 3.0), (48.1, 3.0), (48.1, 3.0), (48.1, 3.0), (48.1, 3.1)]
+    for k, (latitude, north) in enumerate(said):
+        buffer.add_fix(fix(k * 200 * MS, latitude_deg=latitude), None)
+        buffer.add_velocity(velocity(k * 200 * MS + late, (0.0, north, 0.0)), None)
+        if k == 3:
+            epochs = buffer.release(700 * MS)
+    epochs += buffer.release(2000 * MS)
+    assert [epoch.stamp_ns - late for epoch in epochs] == [0, 400 * MS, 1000 * MS]
+    assert counts['gnss_repeated'] == 3
+
+
+def test_a_receiver_that_stands_or_says_half_repeats_nothing():
+    """At rest some receivers hold position and velocity; positions alone may do so too."""
+    buffer, counts = gnss_buffer()
+    for k in range(3):
+        buffer.add_fix(fix(k * MS), None)
+        buffer.add_velocity(velocity(k * MS, (0.0, 0.0, 0.0)), None)
+        buffer.add_fix(fix((10 + k) * MS), None)
+        buffer.add_velocity(velocity((20 + k) * MS, (1.0, 2.0, 0.0)), None)
+    assert len(buffer.release(100 * MS)) == 9 and counts['gnss_repeated'] == 0
+
+
 def test_messages_too_late_or_of_another_clock_are_counted():
     buffer, counts = gnss_buffer()
     newest = 100_000 * MS
@@ -321,8 +348,8 @@ def pairing_buffer():
 def test_fix_and_velocity_with_stamps_of_their_own_are_one_epoch(late):
     """At the velocity's stamp, the fix carried to it: 30 ms at 100 m/s are 3 m."""
     buffer = pairing_buffer()
-    for stamp in (1000 * MS, 1200 * MS):
-        buffer.add_fix(fix(stamp), None)
+    for stamp, longitude in ((1000 * MS, 11.0), (1200 * MS, 11.1)):
+        buffer.add_fix(fix(stamp, longitude_deg=longitude), None)
         buffer.add_velocity(velocity(stamp + late, (0.0, 100.0, 10.0)), None)
     epochs = buffer.release(2000 * MS)
     assert [epoch.stamp_ns for epoch in epochs] == [1000 * MS + late, 1200 * MS + late]
