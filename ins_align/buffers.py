@@ -259,7 +259,8 @@ class GnssBuffer:
     lateness_ns : int
         How much later than newer IMU samples a message may arrive.
     counts : Counter
-        Where messages are counted, and epochs that only repeat the one before: ``gnss_repeated``.
+        Where messages are counted, and epochs that only repeat the one before
+        (``gnss_repeated``) or are behind the end of the IMU (``gnss_after_imu``).
     pair_ns : int
         A fix and a velocity that are no further apart are of one epoch; 0: where the stamp is one.
 
@@ -326,7 +327,7 @@ class GnssBuffer:
         Return and forget the epochs up to a stamp, in order.
 
         A fix or a velocity alone waits for its other half, if that may still come, and what is
-        behind it waits too; `last`: nothing comes any more.
+        behind it waits too; `last`: nothing comes any more, what is behind that stamp is left out.
         """
         stamps = sorted(self._pending)
         released = []
@@ -348,6 +349,9 @@ class GnssBuffer:
             place += len(parts)
         for stamp in stamps[:place]:
             del self._pending[stamp]
+        if last:
+            self._counts['gnss_after_imu'] += len(self._pending)
+            self._pending.clear()
         return released
 
     def _repeats(self, parts: list[GnssEpoch]) -> bool:

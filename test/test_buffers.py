@@ -319,6 +319,15 @@ def test_a_receiver_that_stands_or_says_half_repeats_nothing():
     assert len(buffer.release(100 * MS)) == 9 and counts['gnss_repeated'] == 0
 
 
+def test_what_is_behind_the_end_is_left_out_and_counted():
+    buffer = GnssBuffer(LATENESS, counts := Counter(), PAIR_NS)
+    for k in range(4):
+        buffer.add_fix(fix(k * 1000 * MS), None)
+    assert len(buffer.release(1000 * MS)) == 1 and counts['gnss_after_imu'] == 0
+    assert len(buffer.release(2000 * MS, last=True)) == 2 and buffer.oldest_ns is None
+    assert counts['gnss_after_imu'] == 1
+
+
 def test_messages_too_late_or_of_another_clock_are_counted():
     buffer, counts = gnss_buffer()
     newest = 100_000 * MS
