@@ -27,10 +27,10 @@ from ins_align.config import Config
 from ins_align.declaration import Declaration
 from ins_align.handover import aged
 from ins_align.intake import Afresh, Loss, Run, Start, Step, Wait
-from ins_align.methods import MapMethod, Method, NoteMethod, Nuisance
+from ins_align.methods import MapMethod, Method, NoteMethod
 from ins_align.plausibility import ForceCheck
 from ins_align.preintegration import SensorErrors
-from ins_align.results import Attitude, Epoch, State, Status, Verdict
+from ins_align.results import Attitude, Epoch, Nuisance, State, Status, Verdict
 from ins_align.unknowns import Prior
 import numpy as np
 

@@ -22,7 +22,7 @@ from collections.abc import Callable
 import math
 
 from ins_align.config import Config
-from ins_align.methods import Fit
+from ins_align.fit import Fit
 from ins_align.results import State, Verdict
 from ins_align.rotation import Array
 from ins_align.told import seem_late

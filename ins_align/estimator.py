@@ -22,9 +22,10 @@ their sensitivity to x at once, and the normal equations accumulate (docs, "Theo
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 
+from ins_align.fit import Innovation, NOTHING_NEW
 from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals, SensorErrors
 from ins_align.rotation import apply, Array, cross, Index
@@ -42,27 +43,6 @@ MEDIAN_CHI2_3 = 2.366
 FIRST_NOISE = NoiseLevels(1 / 27)
 # Normalised innovation squared and normalised innovation by kind (velocity 0, position 1).
 Tests = dict[int, tuple[float, Array]]
-
-
-@dataclass(frozen=True)
-class Innovation:
-    """
-    What was new in an epoch.
-
-    Attributes
-    ----------
-    nis : float
-        Normalised innovation squared, per row; nan where nothing was tested.
-    normalised : ndarray, shape (3,)
-        Innovation of the velocity (of the position where only that is used) over its sigma.
-
-    """
-
-    nis: float
-    normalised: Array
-
-
-NOTHING_NEW = Innovation(math.nan, np.full(3, math.nan))
 
 
 class MapEstimator:

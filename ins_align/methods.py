@@ -19,18 +19,19 @@ t0), the current one, and how well its model fits.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-import math
+from dataclasses import replace
 from typing import Protocol
 
 from ins_align.antenna import AntennaEpoch
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.correlation import Correlation
-from ins_align.estimator import FIRST_NOISE, Innovation, MapEstimator, NOTHING_NEW
+from ins_align.estimator import FIRST_NOISE, MapEstimator
+from ins_align.fit import Fit, no_fit, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
 from ins_align.handover import prior_from_now, prior_without_attitude, wander
 from ins_align.imu_steps import ImuSteps
 from ins_align.preintegration import Noise, preintegrate, SensorErrors
+from ins_align.results import Nuisance
 from ins_align.rotation import Array, orthonormalized
 from ins_align.signs import SignCheck
 from ins_align.solution import NoiseLevels
@@ -48,64 +49,6 @@ VELOCITY_STOPPED_NS = 10_000_000_000
 # Epochs that are integrated at one go: few right after the linearisation point has moved, because
 # then it will soon again.
 MAX_AHEAD = 64
-
-
-@dataclass(frozen=True)
-class Fit:
-    """How well the data fit the model: sums, and the last epoch's innovation."""
-
-    chi2: float
-    dof: int
-    innovation: Innovation
-    converged: bool
-    rejected_velocity: int
-    rejected_position: int
-    rejected: int               # epochs with any of these
-    offered: int                # epochs that were offered to the model, rejected ones included
-    delay: float                # of the GNSS, seconds; the told one where none is estimated
-    # Variances of velocities and positions over the stated ones.
-    gnss_noise: tuple[float, float] = (1.0, 1.0)
-    walk: float = 1.0           # rate random walk of the gyros over the stated one
-    objection: str = ''         # what the data say against what is told, in words
-    lasting: float = 1.0        # factor on variances: errors of the GNSS last
-
-    @property
-    def factor(self) -> float:
-        """A-posteriori factor on sigmas, at least 1."""
-        if self.dof <= 0:
-            return math.inf
-        return math.sqrt(max(1.0, self.lasting * self.chi2 / self.dof))
-
-    @property
-    def lasting_factor(self) -> float:
-        """Part of that factor, at least 1: errors of the GNSS last."""
-        return 1.0 if self.dof <= 0 else self.factor / math.sqrt(max(1.0, self.chi2 / self.dof))
-
-    @property
-    def significant_scale(self) -> float:
-        """Factor on covariances that are handed on: 1 unless the misfit cannot be chance."""
-        if self.dof <= 0 or self.chi2 / self.dof < 1 + 3 * math.sqrt(2 / self.dof):
-            return 1.0
-        return self.chi2 / self.dof
-
-
-def _no_fit(offered: int, delay: float) -> Fit:
-    """Return what is known before there is a solution."""
-    return Fit(math.nan, 0, NOTHING_NEW, False, 0, 0, 0, offered, delay)
-
-
-@dataclass(frozen=True)
-class Nuisance:
-    """Estimates beside the attitude, with their sigmas."""
-
-    gyro_bias: Array
-    gyro_bias_std: Array
-    accel_bias: Array
-    accel_bias_std: Array
-    lever_arm: Array
-    lever_arm_std: Array
-    gnss_delay: float
-    gnss_delay_std: float
 
 
 class Method(Protocol):
@@ -326,7 +269,7 @@ class MapMethod:
         """Return how well the data fit."""
         solution = self._estimator.solution
         if solution is None:
-            return _no_fit(self._offered, self._config.gnss_delay)
+            return no_fit(self._offered, self._config.gnss_delay)
         velocities, positions, epochs = (before + since for before, since in zip(
             self._rejected, (*solution.rejected, solution.rejected_epochs)))
         past_chi2, past_dof = self._past
@@ -512,7 +455,7 @@ class NoteMethod:
         """Return how well the data fit."""
         dof = 3 * self._moments.count - 3 - 3 * self._nuisance
         if self._solution is None or dof <= 0:
-            return _no_fit(self._offered, self._config.gnss_delay)
+            return no_fit(self._offered, self._config.gnss_delay)
         return Fit(self._residual / sum(self._noise()), dof, NOTHING_NEW, True, 0, 0, 0,
                    self._offered, self._config.gnss_delay)
 

@@ -125,6 +125,32 @@ class Epoch:
 
 
 @dataclass(frozen=True)
+class Nuisance:
+    """
+    Estimates beside the attitude, with their sigmas.
+
+    Attributes
+    ----------
+    gyro_bias, accel_bias, lever_arm : ndarray, shape (3,)
+        At the last epoch, rad/s; m/s^2; IMU to antenna in the IMU frame, m.
+    gyro_bias_std, accel_bias_std, lever_arm_std : ndarray, shape (3,)
+        So they are of each.
+    gnss_delay, gnss_delay_std : float
+        Of the GNSS behind its stamps, s.
+
+    """
+
+    gyro_bias: Array
+    gyro_bias_std: Array
+    accel_bias: Array
+    accel_bias_std: Array
+    lever_arm: Array
+    lever_arm_std: Array
+    gnss_delay: float
+    gnss_delay_std: float
+
+
+@dataclass(frozen=True)
 class Status:
     """The aligner's state in numbers; see the attributes' names and units."""
 

@@ -15,8 +15,7 @@
 
 from ins_align.config import Config
 from ins_align.declaration import Declaration
-from ins_align.estimator import Innovation
-from ins_align.methods import Fit
+from ins_align.fit import Fit, Innovation
 from ins_align.results import State
 import numpy as np
 import pytest

@@ -156,8 +156,8 @@ def test_covariance_without_noise_is_the_cramer_rao_bound_at_every_time(scenario
 def test_handover_gives_the_attitude_of_one_that_never_handed_over(changes, walk, monkeypatch):
     # Not looked at here: what a misfit adds to sigmas, what biases may have wandered since, what
     # is left of second order.
-    monkeypatch.setattr('ins_align.methods.Fit.factor', 1.0)
-    monkeypatch.setattr('ins_align.methods.Fit.significant_scale', 1.0)
+    monkeypatch.setattr('ins_align.fit.Fit.factor', 1.0)
+    monkeypatch.setattr('ins_align.fit.Fit.significant_scale', 1.0)
     monkeypatch.setattr('ins_align.handover.WANDER', 0.0)
     monkeypatch.setattr(MapEstimator, 'NONLINEARITY', 0.01)
     s = simulated('flight', imu_grade='tactical', duration=30.0, seed=2, position_std=0.5,

@@ -16,8 +16,7 @@
 from dataclasses import replace
 
 from alignment import aligned, error_deg, error_of, normalised_error, simulated
-from ins_align.estimator import NOTHING_NEW
-from ins_align.methods import Fit
+from ins_align.fit import Fit, NOTHING_NEW
 import numpy as np
 import pytest
 from scipy.stats import chi2
