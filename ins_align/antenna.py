@@ -34,8 +34,10 @@ MAX_CARRIED = 60.0
 _UNKNOWN_VERTICAL_STD = 1e3
 # A variance this many times smaller than what the receiver usually states, the median of so many
 # epochs, is not believed: a receiver that is ten times better than it was will say so again. One
-# that was worse than the configuration expects need not.
+# that was worse than the configuration expects need not. In the first epoch any is believed that a
+# good receiver can mean, from 1 mm (1 mm/s) on.
 BETTER_THAN_USUAL, USUAL_EPOCHS = 100.0, 11
+BEST_VARIANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -202,7 +204,7 @@ class StatedNoise:
         """Expect what is configured."""
         self._default = np.diag([std ** 2, std ** 2, std_vertical ** 2])
         self._variances = self._default.diagonal().tolist()
-        self._recent = [deque([variance], USUAL_EPOCHS) for variance in self._variances]
+        self._recent: list[deque[float]] = [deque(maxlen=USUAL_EPOCHS) for _ in self._variances]
 
     def believed(self, covariance: Array | None) -> Array:
         """
@@ -220,7 +222,9 @@ class StatedNoise:
         factors = []
         for variance, recent, default in zip(variances, self._recent, self._variances):
             recent.append(variance)
-            usual = min(sorted(recent)[len(recent) // 2], default)
+            usual = default
+            if len(recent) > 1 or variance >= BEST_VARIANCE:
+                usual = min(sorted(recent)[len(recent) // 2], default)
             factors.append(usual / variance if usual > BETTER_THAN_USUAL * variance else 1.0)
         if max(factors) == 1.0:
             return covariance
