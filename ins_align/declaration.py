@@ -31,14 +31,14 @@ from ins_align.told import seem_late
 # Mean square of normalised residuals above which the model is contradicted.
 MAX_MISFIT = 4.0
 # Share of epochs that may be rejected as outliers.
-MAX_REJECTED = 0.25
+REJECTED_SHARE = 0.25
 # What was declared is withdrawn when its sigma is so many times the threshold.
 WITHDRAWN_AT = 2.0
 # Redundant rows before anything is declared.
 MIN_DOF = 12
 # A delay is to be expected within so many of its sigmas; and further off (s) it is more than a
 # correction to the model, whatever the sigma.
-DELAY_SIGMAS, MAX_DELAY = 3.0, 0.3
+DELAY_SIGMAS, UNEXPLAINED_DELAY = 3.0, 0.3
 # Factor on variances that is worth a word.
 MENTIONED = 1.5
 # Conditions that have to hold are seen to hold at epochs that are no further apart than this (s).
@@ -181,7 +181,8 @@ class Declaration:
             return Verdict(State.ALIGNING, f'{fit.offered} GNSS epochs so far: more are needed')
         if tilt > config.tilt_std_threshold and not self.levelled:
             return Verdict(State.ALIGNING,
-                           f'tilt sigma {_above(tilt, config.tilt_std_threshold)}: wait')
+                           f'tilt sigma {_above(tilt, config.tilt_std_threshold)}: wait, or turn '
+                           'or change speed')
         state = State.LEVELLED if self.levelled else State.ALIGNING
         if heading > config.heading_std_threshold:
             return Verdict(state, f'heading sigma {_above(heading, config.heading_std_threshold)}'
@@ -199,12 +200,12 @@ class Declaration:
         """Return what in the data contradicts the model; empty when nothing does."""
         if fit.dof < MIN_DOF:
             return ''
-        if fit.rejected > MAX_REJECTED * fit.offered:
+        if fit.rejected > REJECTED_SHARE * fit.offered:
             return (f'{fit.rejected} of {fit.offered} GNSS epochs do not fit the rest: check the '
                     'velocity frame, the IMU axes and signs, the lever arm, the GNSS delay')
         config = self.config
         unexplained = abs(fit.delay - config.gnss_delay)
-        if unexplained > min(DELAY_SIGMAS * config.gnss_delay_std, MAX_DELAY) > 0:
+        if unexplained > min(DELAY_SIGMAS * config.gnss_delay_std, UNEXPLAINED_DELAY) > 0:
             return f'{seem_late(fit.delay, config)}, or set gnss_delay'
         if fit.objection:
             return fit.objection

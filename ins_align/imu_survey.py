@@ -38,7 +38,7 @@ MIN_COURSE_SPEED = 2.0  # m/s above which a course means something
 MIN_COURSE_RATE = 0.05  # rad/s
 MIN_CORRELATION = 0.7
 DEGREES_RATIO = 15.0  # times the turn of the course: between 1 and 57, nearer to degrees
-MAX_RATE = 70.0  # rad/s: more than the 4000 deg/s that any usual gyroscope measures
+ANY_GYRO_RATE = 70.0  # rad/s: more than the 4000 deg/s that any usual gyroscope measures
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def survey_imu(samples: ImuSamples, times: Array, velocities: Series | None,
     if not FORCE_RANGE[0] < mean_force < FORCE_RANGE[1]:
         faults.append(f'the specific force averages {mean_force:.3g} m/s^2, gravity is 9.8: check '
                       'the unit (g?) and that gravity is not taken out')
-    if max_rate > MAX_RATE or (ratio is not None and ratio > DEGREES_RATIO):
+    if max_rate > ANY_GYRO_RATE or (ratio is not None and ratio > DEGREES_RATIO):
         faults.append('the angular rates look like deg/s: they must be rad/s')
     elif ratio is not None and ratio < 0.0:
         faults.append('in left turns the rate about the upward axis is negative: a sign of the '

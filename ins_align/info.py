@@ -32,7 +32,7 @@ from ins_align.earth import normal_gravity
 from ins_align.imu_survey import ImuFacts, survey_imu
 from ins_align.motion_survey import (
     find_manoeuvres, MANOEUVRE_SPEED, MANOEUVRE_TIME, Manoeuvres, on_grid, Series, track,
-    velocity_frame, velocity_from_positions, VelocityFrame, WEAK_SPEED, without_spikes)
+    velocity_frame, velocity_from_positions, VelocityFrame, WEAK_SPEED, without_wild_positions)
 from ins_align.report import format_table
 from ins_align.topic_survey import KINDS, MAX_ASTRAY, read_candidates, Recorded, Timing
 import numpy as np
@@ -208,7 +208,7 @@ class _Survey:
         if fix is None:
             return Series(np.zeros(0), np.zeros((0, 3)))
         series = self._series(self._data[fix.name])
-        return without_spikes(track(series.times, *series.vectors.T))
+        return without_wild_positions(track(series.times, *series.vectors.T))
 
     def _place(self, fix: TopicInfo | None) -> tuple[float, float]:
         """Return latitude, degrees, and altitude; somewhere on Earth if they are not known."""

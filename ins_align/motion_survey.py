@@ -89,7 +89,7 @@ def position_noise(positions: Series) -> float:
     return float(np.median(np.abs(second)) / 0.6745 / math.sqrt(6.0))
 
 
-def without_spikes(positions: Series) -> Series:
+def without_wild_positions(positions: Series) -> Series:
     """
     Leave out positions that are far from the median of the five around them.
 

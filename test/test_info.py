@@ -24,7 +24,7 @@ from ins_align.cli import main
 from ins_align.decoding import deserialize
 from ins_align.info import describe, inspect
 from ins_align.motion_survey import (
-    find_manoeuvres, Series, track, velocity_frame, without_spikes)
+    find_manoeuvres, Series, track, velocity_frame, without_wild_positions)
 from ins_align.replay import replay
 from ins_align.simulation import simulate, write_bag
 import numpy as np
@@ -393,7 +393,7 @@ def test_wild_fixes_do_not_change_the_frame(rate, seed):
     truth = simulate('car', seed=seed, duration=100.0, outlier_rate=rate)
     times = (truth.gnss_stamps_ns - truth.gnss_stamps_ns[0]) * 1e-9
     spoilt = track(times, *truth.lla_deg.T)
-    positions = without_spikes(spoilt)
+    positions = without_wild_positions(spoilt)
     # Of a spike in a random direction a part may point along the way or be short.
     wild = np.isin(times, positions.times, invert=True)
     assert np.count_nonzero(wild & truth.outlier) >= 0.8 * np.count_nonzero(truth.outlier)
@@ -428,9 +428,9 @@ def test_sharp_turns_and_gaps_are_no_spikes():
     east = 20.0 * np.minimum(times, 20.0)
     north = 20.0 * np.maximum(times - 20.0, 0.0)
     positions = Series(times, np.column_stack([east, north, 0.0 * times]))
-    assert without_spikes(positions).times.tolist() == times.tolist()
+    assert without_wild_positions(positions).times.tolist() == times.tolist()
     few = Series(times[:4], positions.vectors[:4])
-    assert without_spikes(few) is few
+    assert without_wild_positions(few) is few
 
 
 def test_velocities_and_positions_of_different_times_leave_the_frame_open():
