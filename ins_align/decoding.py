@@ -49,12 +49,26 @@ class ImuSamples(NamedTuple):
     decoded: np.ndarray  # (M,) bool: which of M messages the N samples come from
 
 
+class Attitudes(NamedTuple):
+    """Orientations that are known, in the order of their messages."""
+
+    stamps_ns: np.ndarray  # (N,) int64
+    quaternions: np.ndarray  # (N, 4), (x, y, z, w)
+
+
 class Orientations(NamedTuple):
     """Orientations in the order of their messages."""
 
     stamps_ns: np.ndarray  # (N,) int64
     quaternions: np.ndarray  # (N, 4), (x, y, z, w)
     covariances: np.ndarray  # (N, 9), rad^2
+
+    def known(self) -> Attitudes:
+        """Return those without a negative variance ("not known") and with a direction."""
+        good = (np.isfinite(self.quaternions).all(axis=1)
+                & (np.abs(self.quaternions).max(axis=1, initial=0.0) > 1e-3)
+                & ~(self.covariances[:, 0] < 0.0))
+        return Attitudes(self.stamps_ns[good], self.quaternions[good])
 
 
 class Refused(NamedTuple):

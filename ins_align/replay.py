@@ -27,7 +27,7 @@ from ins_align.ahead import run_ahead
 from ins_align.alignment import Alignment
 from ins_align.bags import Topics
 from ins_align.config import Config
-from ins_align.decoding import Orientations, Refused
+from ins_align.decoding import Attitudes, Refused
 from ins_align.intake import Intake, Step
 from ins_align.messages import Fix
 from ins_align.reading import Part, read, Request
@@ -49,23 +49,18 @@ class Reference:
 
     Parameters
     ----------
-    *parts : Orientations
+    *parts : Attitudes
         As for `add`.
 
     """
 
-    def __init__(self, *parts: Orientations) -> None:
+    def __init__(self, *parts: Attitudes) -> None:
         self._stamps_ns, self._quaternions = np.zeros(0, np.int64), np.zeros((0, 4))
-        self._added: list[tuple[np.ndarray, Array]] = []
-        for part in parts:
-            self.add(part)
+        self._added = list(parts)
 
-    def add(self, orientations: Orientations) -> None:
-        """Add those without a negative variance ("not known") and with a direction."""
-        good = (np.isfinite(orientations.quaternions).all(axis=1)
-                & (np.abs(orientations.quaternions).max(axis=1, initial=0.0) > 1e-3)
-                & ~(orientations.covariances[:, 0] < 0.0))
-        self._added.append((orientations.stamps_ns[good], orientations.quaternions[good]))
+    def add(self, attitudes: Attitudes) -> None:
+        """Add more, of whatever stamps."""
+        self._added.append(attitudes)
 
     def _sort(self) -> None:
         """Put what was added in the order of stamps; of one stamp the first counts."""
@@ -222,7 +217,7 @@ class _Prepared(NamedTuple):
     config: Config
     steps: list[Step]
     fixes: list[tuple[int, float, float]]  # stamp, latitude, longitude, degrees
-    orientations: Orientations
+    attitudes: Attitudes  # of the reference
     counts: Counter[str]  # of all messages so far
     done: float  # how much of the recording this ends at, 0 to 1
     warnings: tuple[str, ...]  # so far
@@ -238,7 +233,8 @@ def _prepared(request: Request) -> Generator[_Prepared, None, None]:
                  for _, message in part.gnss if isinstance(message, Fix)]
         intake.prepare()
         prepared = _Prepared(part.topics, part.config, intake.take_steps(), fixes,
-                             part.orientations, Counter(intake.counts), part.done, part.warnings)
+                             part.orientations.known(), Counter(intake.counts), part.done,
+                             part.warnings)
         yield prepared
     assert intake is not None
     intake.prepare(last=True)
@@ -280,9 +276,9 @@ class _Run:
         for step in part.steps:
             self._epochs += self._alignment.go(step)
         self._fixes += part.fixes
-        if part.orientations.stamps_ns.size:
+        if part.attitudes.stamps_ns.size:
             self._reference = self._reference or Reference()
-            self._reference.add(part.orientations)
+            self._reference.add(part.attitudes)
 
     def result(self, last: _Prepared) -> ReplayResult:
         """Return what came of all parts."""

@@ -24,7 +24,7 @@ from ins_align import sqlite_file
 from ins_align.aligner import Aligner, Attitude
 from ins_align.bag_files import BagError
 from ins_align.config import Config
-from ins_align.decoding import Orientations
+from ins_align.decoding import Attitudes, Orientations
 from ins_align.replay import CSV_HEADER, Reference, replay
 from ins_align.rotation import exp_so3, matrix_from_rpy, quaternion_from_matrix
 from ins_align.simulation import feed, simulate, write_bag
@@ -234,16 +234,12 @@ def test_uav_velocity_integration_formula():
     assert np.all(np.abs(rpy[:2]) < 2.0)
 
 
-def orientations(angles, stamps, variance=0.1):
-    count = len(stamps)
-    covariances = np.zeros((count, 9))
-    covariances[:, 0] = variance
-    return Orientations(np.array(stamps), quaternion_from_matrix(matrix_from_rpy(angles)),
-                        covariances)
+def attitudes(angles, stamps):
+    return Attitudes(np.array(stamps), quaternion_from_matrix(matrix_from_rpy(angles)))
 
 
 def test_reference_is_interpolated():
-    reference = Reference(orientations([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0]], [0, 10 ** 9]))
+    reference = Reference(attitudes([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0]], [0, 10 ** 9]))
     np.testing.assert_allclose(
         reference.attitude_at(5 * 10 ** 8), matrix_from_rpy([0.0, 0.0, np.pi]), atol=1e-12)
     np.testing.assert_allclose(reference.attitude_at(0), matrix_from_rpy([0.0, 0.0, 3.0]),
@@ -252,18 +248,26 @@ def test_reference_is_interpolated():
     assert reference.attitude_at(10 ** 9 + 1) is None
 
 
-def test_reference_has_gaps_and_unknown_attitudes():
-    known = orientations([[0.0, 0.0, 0.1]] * 3, [0, 10 ** 9, 4 * 10 ** 9])
+def test_reference_has_gaps():
+    known = attitudes([[0.0, 0.0, 0.1]] * 3, [0, 10 ** 9, 4 * 10 ** 9])
+    assert Reference(known).attitude_at(5 * 10 ** 8) is not None
     assert Reference(known).attitude_at(2 * 10 ** 9) is None
-    assert Reference(known._replace(covariances=np.full((3, 9), -1.0))).attitude_at(0) is None
-    assert Reference(known._replace(quaternions=np.zeros((3, 4)))).attitude_at(0) is None
-    assert Reference(known._replace(quaternions=np.full((3, 4), np.nan))).attitude_at(0) is None
+
+
+def test_attitudes_that_are_not_known_are_left_out():
+    stamps, quaternions = attitudes([[0.0, 0.0, 0.1]] * 5, range(5))
+    covariances = np.full((5, 9), 0.1)
+    covariances[1, 0] = -1.0
+    quaternions[2], quaternions[3, 1] = 0.0, np.nan
+    known = Orientations(stamps, quaternions, covariances).known()
+    np.testing.assert_array_equal(known.stamps_ns, [0, 4])
+    np.testing.assert_array_equal(known.quaternions, quaternions[[0, 4]])
 
 
 def test_reference_comes_in_parts_in_any_order():
     angles = np.random.default_rng(1).uniform(-1.0, 1.0, (4, 3))
-    parts = [orientations(angles[[2, 3]], [200, 300]), orientations(angles[[0, 1, 0]],
-                                                                    [0, 100, 200])]
+    parts = [attitudes(angles[[2, 3]], [200, 300]), attitudes(angles[[0, 1, 0]],
+                                                              [0, 100, 200])]
     growing = Reference(parts[0])
     assert growing.attitude_at(100) is None
     growing.add(parts[1])
@@ -274,7 +278,7 @@ def test_reference_comes_in_parts_in_any_order():
 
 
 def test_errors_are_estimate_less_reference_and_wrap():
-    reference = Reference(orientations([[0.1, 0.0, 3.1]] * 2, [0, 1]))
+    reference = Reference(attitudes([[0.1, 0.0, 3.1]] * 2, [0, 1]))
     C_nb = matrix_from_rpy([0.1, 0.02, -3.1])
     rotation, rpy = reference.errors_deg(Attitude(0, C_nb, np.eye(3)))
     np.testing.assert_allclose(rpy, np.degrees([0.0, 0.02, 2.0 * np.pi - 6.2]), atol=1e-9)

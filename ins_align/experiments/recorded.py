@@ -94,7 +94,7 @@ def load(path: Path) -> Recording:
     name = path.name.split('.')[0]
     return Recording(
         name, imu, np.array([before for before, _ in gnss]),
-        tuple(message for _, message in gnss), Reference(orientations),
+        tuple(message for _, message in gnss), Reference(orientations.known()),
         _reference_std(name, orientations), int(imu.stamps_ns[0]), int(imu.stamps_ns[-1]))
 
 
