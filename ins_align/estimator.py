@@ -509,7 +509,7 @@ class MapEstimator:
         assert other.solution is not None
         return other.solution
 
-    def loosened(self, free: Iterable[tuple[slice, float]]) -> Solution:
+    def loosened(self, free: Iterable[tuple[slice, float]], reconsider: bool = False) -> Solution:
         """
         Solve once more, linearised where it is, for unknowns that are less known; nothing changes.
 
@@ -518,6 +518,8 @@ class MapEstimator:
         free : iterable of (slice, float)
             Blocks of the 37 unknowns, which need not be among those that are estimated, and by how
             much they may be off beside what is known of them, 1 sigma.
+        reconsider : bool
+            Take what was refused as an outlier where it is none for unknowns that are so free.
 
         Raises
         ------
@@ -528,7 +530,12 @@ class MapEstimator:
         prior, columns = self.prior, self.columns
         for block, std in free:
             prior, columns = prior.loosened(block, std), np.union1d(columns, np.r_[block])
-        return self._rerun(self._solved.point, prior, columns)[0]
+        solution, _ = self._rerun(self._solved.point, prior, columns)
+        if reconsider and self._refused[:self.count].any():
+            gate = Gate(solution.dx, solution.P)
+            solution = self._start(solution.point, prior, columns)
+            self._run(solution, self._rows(solution), gate, self._refused[:self.count])
+        return solution
 
     def gnss_share(self, of_prior: float) -> float:
         """

@@ -14,6 +14,9 @@
 """Whether the data show that the signs of the IMU's axes are right, and when to ask them."""
 
 from ins_align.estimator import MapEstimator
+from ins_align.rotation import Array
+from ins_align.unknowns import ATTITUDE, GYRO_MATRIX
+import numpy as np
 
 # What is in doubt is judged again when the data have grown by the first share, and by the second
 # beyond so many epochs; signs are confirmed when every other choice has so much more chi-square.
@@ -26,6 +29,12 @@ WRONG = {
     (-1, 1): 'the angular rates reversed',
     (-1, -1): 'one IMU axis reversed (left-handed axes?)',
 }
+BETTER = 'the data fit better with {}: check the IMU axes'
+UNCONFIRMED = 'the signs of the IMU axes are not confirmed by the motion yet: turn'
+_SCALES = GYRO_MATRIX.start + np.array([0, 4, 8])
+# Scale factor error of a gyroscope that is reversed; the sigma with which the data are asked for
+# it; and what turns the attitude by less than so many sigmas does no harm.
+REVERSED, SCALE_STD, HARMLESS = 2.0, 2.0, 2.0
 
 
 class Occasions:
@@ -53,54 +62,101 @@ class Occasions:
 
 class SignCheck:
     """
-    Asks now and then whether another choice of signs would fit the data as well.
+    Asks whether other signs would fit the data as well.
 
-    A wrong sign, or one wrong axis (which is all three wrong in a body frame turned half around),
-    fits as well as the right ones until the vehicle has turned.
+    All signs of a sensor wrong, or one wrong axis (which is all wrong in a body frame turned half
+    around), fit as well as the right ones until the vehicle has turned; that is asked now and
+    then. One gyroscope that is reversed alone does no harm until the vehicle has turned about it;
+    that is asked whenever it matters.
     """
 
     def __init__(self) -> None:
         """Start in doubt."""
-        self._doubt = 'the signs of the IMU axes are not judged yet'
+        self._doubt_of_all = UNCONFIRMED
+        self._explained = False             # by what is named there
+        self._gyros_right = np.zeros(3, bool)
         self.restart()
 
     def restart(self) -> None:
         """Judge at the next question: the estimator is another one."""
         self._occasions = Occasions()
+        self._least = np.zeros(3)           # evidence against a reversed gyro from this estimator
 
     def doubt(self, estimator: MapEstimator) -> str:
         """Return why the data do not show yet that the signs are right, or nothing."""
-        if self._doubt and self._occasions.come(estimator):
-            chi2 = sign_evidence(estimator)
-            right = chi2.pop(RIGHT)
-            rival = min(chi2, key=chi2.__getitem__)
-            if chi2[rival] > right + GAIN:
-                self._doubt = ''
-            elif chi2[rival] > right - GAIN:
-                self._doubt = ('the signs of the IMU axes are not confirmed by the motion yet: '
-                               'turn')
-            else:
-                self._doubt = f'the data fit better with {WRONG[rival]}: check the IMU axes'
-        return self._doubt
+        of_one_gyro = self._doubt_of_one_gyro(estimator)
+        if self._doubt_of_all and self._occasions.come(estimator):
+            self._judge_all(estimator)
+        # Where all of them are reversed one alone seems to be, too, and the other way round.
+        return self._doubt_of_all if self._explained else of_one_gyro or self._doubt_of_all
+
+    def _judge_all(self, estimator: MapEstimator) -> None:
+        chi2, dof = sign_evidence(estimator)
+        right = chi2.pop(RIGHT)
+        rival = min(chi2, key=chi2.__getitem__)
+        gain = GAIN * max(1.0, right / dof)
+        self._explained = False
+        if chi2[rival] > right + gain:
+            self._doubt_of_all = ''
+        elif chi2[rival] > right - gain:
+            self._doubt_of_all = UNCONFIRMED
+        else:
+            self._doubt_of_all = BETTER.format(WRONG[rival])
+            self._explained = chi2[rival] < estimator.MISFIT * dof
+
+    def _doubt_of_one_gyro(self, estimator: MapEstimator) -> str:
+        if self._gyros_right.all():
+            return ''
+        evidence, harm = one_gyro_evidence(estimator)
+        # What was refused as outliers may be what spoke for it: that it did counts until t0 moves.
+        self._least = np.minimum(self._least, evidence)
+        reversed_ = ~self._gyros_right & (self._least < -GAIN)
+        if reversed_.any():
+            axis = 'xyz'[int(np.argmin(np.where(reversed_, self._least, 0.0)))]
+            return BETTER.format(f'the angular rate about {axis} reversed')
+        self._gyros_right |= evidence > GAIN
+        return UNCONFIRMED if np.any(~self._gyros_right & (harm > HARMLESS)) else ''
 
 
-def sign_evidence(estimator: MapEstimator) -> dict[tuple[int, int], float]:
+def sign_evidence(estimator: MapEstimator) -> tuple[dict[tuple[int, int], float], int]:
     """
     Fit the stored epochs afresh with the signs of gyros and accelerometers as they are or not.
 
     Returns
     -------
-    dict
-        Chi-square by (sign of the gyros, sign of the accelerometers), in units of what is usual
-        for the right signs.
+    chi2 : dict
+        Chi-square by (sign of the gyros, sign of the accelerometers).
+    dof : int
+        Its degrees of freedom, at least 1.
 
     """
     raw = estimator.raw_intervals()
-    chi2 = {}
-    scale = 1.0
-    for signs in (RIGHT, *WRONG):
-        solution = estimator.fitted_afresh(estimator.prior.mirrored(*signs), raw.mirrored(*signs))
-        if signs == RIGHT:
-            scale = max(1.0, solution.chi2 / max(solution.dof, 1))
-        chi2[signs] = solution.chi2 / scale
-    return chi2
+    fits = {signs: estimator.fitted_afresh(estimator.prior.mirrored(*signs), raw.mirrored(*signs))
+            for signs in (RIGHT, *WRONG)}
+    return {signs: fit.chi2 for signs, fit in fits.items()}, max(fits[RIGHT].dof, 1)
+
+
+def one_gyro_evidence(estimator: MapEstimator) -> tuple[Array, Array]:
+    """
+    Ask the stored epochs for the scale factors of the gyroscopes, of which nothing is known.
+
+    Returns
+    -------
+    evidence : ndarray, shape (3,)
+        Chi-square of one being reversed, over that of its being right, in units of what is usual.
+    harm : ndarray, shape (3,)
+        By how many of its stated sigmas the attitude, then or now, would be another one.
+
+    """
+    told = estimator.solution
+    assert told is not None
+    free = estimator.loosened([(slice(place, place + 1), SCALE_STD) for place in _SCALES],
+                              reconsider=True)
+    places = np.searchsorted(free.columns, _SCALES)
+    scale = free.estimate.sensors.gyro_matrix.diagonal()
+    variance = free.P[places, places]
+    usual = max(1.0, free.chi2 / max(free.dof, 1))
+    turns = np.stack([free.P[ATTITUDE, places], free.turned @ free.P[:, places]])
+    sigmas = np.sqrt(usual * np.stack([told.P.diagonal()[:3], told.covariance.diagonal()]))
+    harm = np.max(np.abs(REVERSED * turns / variance) / sigmas[..., None], axis=(0, 1))
+    return ((scale - REVERSED) ** 2 - scale ** 2) / (variance * usual), harm

@@ -69,7 +69,7 @@ class Course:
     chain : Chain
     whitened : Whitened
     time : ndarray, shape (K,)
-    dx, P, estimate, chi2, dof, nonlinearity, bent, C, gyro_bias, covariance
+    dx, P, estimate, chi2, dof, nonlinearity, bent, C, turned, gyro_bias, covariance
         As in `Solution`, with a leading axis of K.
 
     """
@@ -85,6 +85,7 @@ class Course:
     nonlinearity: Array
     bent: Array
     C: Array
+    turned: Array
     covariance: Array
     gyro_bias: Array
 
@@ -107,6 +108,8 @@ class Solution:
 
     Attributes
     ----------
+    columns : ndarray of int, shape (n,)
+        As told.
     chain : Chain
         At the last epoch, with the biases of `point`.
     whitener : Whitener
@@ -131,6 +134,8 @@ class Solution:
     C, covariance : ndarray, shape (3, 3)
         Attitude at the last epoch with respect to n0, ``C_n0b``, and the covariance of its left
         error, rad^2.
+    turned : ndarray, shape (3, n)
+        Derivative of that attitude's left error to the unknowns that are estimated.
     gyro_bias : ndarray, shape (3,)
         Of the gyros at the last epoch, rad/s; that of `estimate` is the one at t0.
 
@@ -141,7 +146,7 @@ class Solution:
         """Start empty, at t0."""
         information, step = prior.at(point)
         self.point = self.estimate = point
-        self._columns, self._size, self._noise = columns, size, noise
+        self.columns, self._size, self._noise = columns, size, noise
         self._rate_random_walk = rate_random_walk
         self.information = information[np.ix_(columns, columns)]
         self._mean_step = step[columns]
@@ -158,6 +163,7 @@ class Solution:
         self.bent = 0.0
         self.dof = 0
         self.C, self.covariance = point.C, np.zeros((3, 3))
+        self.turned = np.zeros((3, columns.size))
         self.gyro_bias = point.sensors.gyro_bias
 
     def rows(self, gnss: Measurements, interval: Intervals, alike: Rows | None = None) -> Rows:
@@ -231,6 +237,7 @@ class Solution:
         self.chi2, self.dof = float(course.chi2[k]), int(course.dof[k])
         self.nonlinearity, self.bent = float(course.nonlinearity[k]), float(course.bent[k])
         self.C, self.covariance = course.C[k], course.covariance[k]
+        self.turned = course.turned[k]
         self.gyro_bias = course.gyro_bias[k]
 
     def _course(self, rows: Rows, whitened: Whitened, index: slice) -> Course:
@@ -248,21 +255,21 @@ class Solution:
         P += (column[:, :, None] * column[:, None, :]
               * (feigned / (1 - feigned * column[:, 2]))[:, None, None])
         step = np.zeros((dx.shape[0], SIZE))
-        step[:, self._columns] = dx
+        step[:, self.columns] = dx
         estimate = self.point.moved(step)
         # The attitude and the biases now.
-        turned = np.zeros((len(time), 3, whitened.P.shape[1]))
-        turned[:, :, :3] = np.eye(3)
+        errors_of = np.zeros((len(time), 3, whitened.P.shape[1]))
+        errors_of[:, :, :3] = np.eye(3)
         gyro_bias = estimate.sensors.gyro_bias
         if self._rate_random_walk > 0:
-            turned[:, :, -3:] = self.point.C @ chain.R_g[:, :, :3]
+            errors_of[:, :, -3:] = self.point.C @ chain.R_g[:, :, :3]
             walked = whitened.X[:, -3:]
             gyro_bias = gyro_bias + walked[:, :, 0] - apply(walked[:, :, 1:], dx)
-        X = turned @ whitened.X
-        J = -X[:, :, 1:]
-        J[:, :, ATTITUDE] += np.eye(3)
-        J[:, :, self._gyro] += (estimate.C @ chain.R_g)[
-            :, :, self._columns[self._gyro] - GYRO.start]
+        X = errors_of @ whitened.X
+        turned = -X[:, :, 1:]
+        turned[:, :, ATTITUDE] += np.eye(3)
+        turned[:, :, self._gyro] += (estimate.C @ chain.R_g)[
+            :, :, self.columns[self._gyro] - GYRO.start]
         errors = X[:, :, 0] - apply(X[:, :, 1:], dx)
         before, after = exp_so3(np.stack([errors, apply(chain.R_g, step[:, GYRO])]))
         C = before @ estimate.C @ after @ chain.R
@@ -271,13 +278,13 @@ class Solution:
                       whitened.rows - dx.shape[1] + self._known,
                       _nonlinearity(step, P, time),
                       0.5 * np.sum(errors ** 2, axis=1) / np.sqrt(_tilt_variance(P)), C,
-                      J @ P @ J.transpose(0, 2, 1)
-                      + turned @ whitened.P @ turned.transpose(0, 2, 1), gyro_bias)
+                      turned, turned @ P @ turned.transpose(0, 2, 1)
+                      + errors_of @ whitened.P @ errors_of.transpose(0, 2, 1), gyro_bias)
 
     def step(self) -> Array:
         """Step from the point to the estimate, of all unknowns, shape (37,)."""
         dx = np.zeros(SIZE)
-        dx[self._columns] = self.dx
+        dx[self.columns] = self.dx
         return dx
 
     def chain_errors(self) -> Array:
@@ -286,7 +293,7 @@ class Solution:
 
     def gyro_bias_covariance(self) -> Array:
         """Covariance of `gyro_bias`, shape (3, 3)."""
-        J = np.eye(self._columns.size)[self._gyro[:3]]
+        J = np.eye(self.columns.size)[self._gyro[:3]]
         if self._rate_random_walk == 0.0:
             return J @ self.P @ J.T
         J -= self.whitener.X[-3:, 1:]
