@@ -196,7 +196,7 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
              outlier_position: float = 50.0,
              latitude_deg: float = 48.0, longitude_deg: float = 11.0, altitude: float = 300.0,
              heading_deg: float = 0.0, crab_deg: float = 0.0, stand_still: float = 0.0,
-             velocity_frame: str = 'enu', flip_axis: str = '',
+             velocity_frame: str = 'enu', flip_axis: str = '', flip_gyro: str = '',
              accel_sign: int = 1) -> Simulation:
     """
     Simulate the sensors of a moving vehicle.
@@ -260,6 +260,8 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
         'ned': the receiver sends north-east-down.
     flip_axis : str
         'x', 'y' or 'z': this axis of the IMU has the wrong sign.
+    flip_gyro : str
+        So has this angular rate alone.
     accel_sign : int
         -1: the accelerometer has the sign of gravity.
 
@@ -306,8 +308,8 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
     accel_std = scale * noise.velocity_random_walk * math.sqrt(imu_rate)
     sign = np.array(IMU_AXES[flip_axis])
     shape = truth_gyro.shape
-    gyro = sign * (truth_gyro @ gyro_matrix.T + gyro_bias + walk
-                   + gyro_std * streams[1].standard_normal(shape))
+    gyro = sign * IMU_AXES[flip_gyro] * (truth_gyro @ gyro_matrix.T + gyro_bias + walk
+                                         + gyro_std * streams[1].standard_normal(shape))
     accel = accel_sign * sign * (truth_accel @ accel_matrix.T + accel_bias
                                  + accel_std * streams[2].standard_normal(shape))
 

@@ -72,7 +72,7 @@ def checked_arguments(arguments: dict[str, Any]) -> ImuNoise:
     check('outages', 'pairs of a start and a later end in seconds',
           lambda value: all(np.shape(pair) == (2,) and pair[0] < pair[1] for pair in value))
     check('velocity_frame', 'enu or ned', lambda value: value in VELOCITY_FRAMES)
-    check('flip_axis', 'x, y, z or empty', lambda value: value in tuple(IMU_AXES))
+    check('flip_axis flip_gyro', 'x, y, z or empty', lambda value: value in tuple(IMU_AXES))
     check('accel_sign', '1 or -1', lambda value: value in (1, -1))
     duration = arguments['duration']
     if duration is None:

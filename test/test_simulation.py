@@ -328,6 +328,9 @@ def test_faults():
     flipped = simulate('car', duration=5.0, flip_axis='y')
     assert_same(flipped.gyro, plain.gyro * [1, -1, 1])
     assert_same(flipped.accel, plain.accel * [1, -1, 1])
+    flipped = simulate('car', duration=5.0, flip_gyro='x')
+    assert_same(flipped.gyro, plain.gyro * [-1, 1, 1])
+    assert_same(flipped.accel, plain.accel)
     assert_same(simulate('car', duration=5.0, accel_sign=-1).accel, -plain.accel)
 
 
@@ -494,6 +497,7 @@ def test_bag_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     ({'latitude_deg': 90.0}, 'latitude_deg must be'),
     ({'velocity_frame': 'body'}, 'velocity_frame must be enu or ned'),
     ({'flip_axis': 'w'}, 'flip_axis must be'),
+    ({'flip_gyro': 'xy'}, 'flip_gyro must be'),
     ({'accel_sign': 0}, 'accel_sign must be'),
 ])
 def test_bad_arguments_get_a_sentence(options, sentence):

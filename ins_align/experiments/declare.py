@@ -34,7 +34,8 @@ from ins_align.simulation import epochs_of, SCENARIOS, simulate, Simulation
 import numpy as np
 
 FAULTS = ('none', 'outliers', 'outages', 'delay', 'lever arm left out', 'several of these',
-          'NED taken for ENU', 'one IMU axis flipped', 'sign of gravity')
+          'NED taken for ENU', 'one IMU axis flipped', 'one gyro flipped',
+          'sign of gravity')
 DURATION = 100.0
 SILENT_DURATION = 600.0
 HORIZON = 120.0         # s; within this the bound has to cross the threshold
@@ -124,6 +125,8 @@ def trial(index: int) -> JsonDict:
         arguments['velocity_frame'] = 'ned'
     if fault == 'one IMU axis flipped':
         arguments['flip_axis'] = str(random.choice(['x', 'y', 'z']))
+    if fault == 'one gyro flipped':
+        arguments['flip_gyro'] = str(random.choice(['x', 'y', 'z']))
     if fault == 'sign of gravity':
         arguments['accel_sign'] = -1
     return {'index': index, 'fault': fault, 'scenario': scenario, 'simulate': arguments,
