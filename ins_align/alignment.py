@@ -182,8 +182,7 @@ class Alignment:
         if fault:
             self._declaration.withdraw()
             verdict = Verdict(State.FAULT, fault)
-        method.judged(self._declaration.contradicted or bool(fault),
-                      verdict.state in (State.LEVELLED, State.ALIGNED))
+        method.judged(self._declaration.contradicted or bool(fault), verdict.state)
         if verdict.state is State.ALIGNED and self.declared is None:
             self.declared = self._initial
             self._time_to_align_s = time_s

@@ -25,6 +25,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 import math
 
+from ins_align.excess import ExcessJudge, SHARES
 from ins_align.fit import Innovation, NOTHING_NEW
 from ins_align.formula import attitude_from_moments
 from ins_align.preintegration import Intervals, SensorErrors
@@ -40,7 +41,7 @@ import numpy as np
 MEDIAN_CHI2_3 = 2.366
 # Noise until the data say that it is more: a share of the excess of the IMU's, the receiver's as
 # stated.
-FIRST_NOISE = NoiseLevels(1 / 27)
+FIRST_NOISE = NoiseLevels(SHARES[0])
 # Normalised innovation squared and normalised innovation by kind (velocity 0, position 1).
 Tests = dict[int, tuple[float, Array]]
 
@@ -65,6 +66,8 @@ class MapEstimator:
         At first.
     rate_random_walk : float
         Of the gyros' biases, rad/s/sqrt(s); 0: they stay what they are.
+    excess_judge : ExcessJudge, optional
+        With what is known from earlier epochs.
 
     """
 
@@ -81,7 +84,7 @@ class MapEstimator:
     TUNE_FROM, TUNE_GROWTH = 12, 0.5
     # That of the IMU is tried at steps of these factors, down and up, to a largest one, and moved
     # when the log likelihood gains so much. A walk that is a factor of e larger has to gain more,
-    # a smaller one may lose it.
+    # a smaller one may lose it. (Once a heading is declared, the excess is judged otherwise.)
     EXCESS_STEPS, MAX_EXCESS, EXCESS_GAIN = ((1 / 9,), (9.0,)), 3.0, 3.0
     WALK_STEPS, MAX_WALK = ((1 / 3, 1 / 9), (3.0, 9.0)), 27.0
     WALK_GAIN, WALK_COST = 1.0, 5.0
@@ -113,7 +116,8 @@ class MapEstimator:
     def __init__(self, prior: Prior, *, use_position: bool = False,
                  estimate_lever_arm: bool = False, estimate_delay: bool = False,
                  estimate_matrices: bool = False, capacity: int = 1000,
-                 noise: NoiseLevels = FIRST_NOISE, rate_random_walk: float = 0.0) -> None:
+                 noise: NoiseLevels = FIRST_NOISE, rate_random_walk: float = 0.0,
+                 excess_judge: ExcessJudge | None = None) -> None:
         """Start at t0."""
         wanted = np.ones(SIZE, bool)
         wanted[START_POSITION] = use_position
@@ -134,6 +138,7 @@ class MapEstimator:
         self.solution: Solution | None = None
         self._last_fit = self._last_tuned = self._last_afresh = 0
         self.noise = noise
+        self._excess_judge = excess_judge or ExcessJudge()
         self._rate_random_walk = rate_random_walk
         self.gated = True
         self._recent: deque[float] = deque(maxlen=self.GATE_WINDOW)
@@ -240,8 +245,9 @@ class MapEstimator:
         if len(self._recent) == self.GATE_WINDOW:
             median = sorted(self._recent)[self.GATE_WINDOW // 2]
             self._gate_scale = max(1.0, median / MEDIAN_CHI2_3)
-        if self.count >= max(self.TUNE_FROM, self._last_tuned * (1 + self.TUNE_GROWTH)):
-            self._tune(s)
+        last = self.count - 1
+        self._excess_judge.hear(self._intervals.Q[last], self._intervals.Q_excess[last])
+        self._tune(s)
         growth = self.GROWTH_FAR if s.nonlinearity > self.FAR else self.GROWTH
         overfit = s.rejected_epochs > self.OVERFIT * self.measured
         if ((s.nonlinearity > self.NONLINEARITY or self._misfits(s) or overfit)
@@ -379,19 +385,22 @@ class MapEstimator:
         _, self.solution, self._refused[:self.count] = min(fits, key=lambda fit: fit[0])
 
     def _tune(self, s: Solution) -> None:
-        """Judge how noisy IMU and receiver are."""
-        self._last_tuned = self.count
+        """Judge how noisy IMU and receiver are, where it is time."""
         before = self.noise
-        if np.any(self._intervals.Q_excess[:self.count]):
-            # Vibration looks like white noise between samples and is less than that over seconds;
-            # and other errors grow with it.
-            self._tune_imu(s, 'excess', self.EXCESS_STEPS, self.MAX_EXCESS, self.EXCESS_GAIN)
-        if self._rate_random_walk > 0.0:
-            # Gyros that warm up drift faster than they do later.
-            self._tune_imu(s, 'walk', self.WALK_STEPS, self.MAX_WALK, self.WALK_GAIN,
-                           self.WALK_COST)
-        if s.chi2 > self.LOUD * s.dof or max(self.noise.gnss) > 1.0:
-            self._tune_gnss(s.estimate)
+        if self._excess_judge.due:
+            self._judge_excess(s)
+        if self.count >= max(self.TUNE_FROM, self._last_tuned * (1 + self.TUNE_GROWTH)):
+            self._last_tuned = self.count
+            if (not self._excess_judge.competent
+                    and np.any(self._intervals.Q_excess[:self.count])):
+                # Vibration is less than it seems, and other errors grow with it.
+                self._tune_imu(s, 'excess', self.EXCESS_STEPS, self.MAX_EXCESS, self.EXCESS_GAIN)
+            if self._rate_random_walk > 0.0:
+                # Gyros that warm up drift faster than they do later.
+                self._tune_imu(s, 'walk', self.WALK_STEPS, self.MAX_WALK, self.WALK_GAIN,
+                               self.WALK_COST)
+            if s.chi2 > self.LOUD * s.dof or max(self.noise.gnss) > 1.0:
+                self._tune_gnss(s.estimate)
         if self.noise != before:
             self._fit()
 
@@ -401,6 +410,17 @@ class MapEstimator:
         solution = self._start(point, prior, columns, noise)
         return solution, self._run(solution, self._rows(solution), None,
                                    self._refused[:self.count])
+
+    def _judge_excess(self, s: Solution) -> None:
+        """Have it judged what share of the excess of the IMU's noise is believed."""
+        likelihoods = []
+        rows: Rows | None = None
+        for share in SHARES:
+            solution = self._start(s.estimate, noise=self.noise._replace(excess=share))
+            rows = self._rows(solution, rows)
+            self._run(solution, rows, None, self._refused[:self.count])
+            likelihoods.append(solution.log_likelihood)
+        self.noise = self.noise._replace(excess=self._excess_judge.share(np.array(likelihoods)))
 
     def _tune_imu(self, s: Solution, name: str, steps: Iterable[Sequence[float]], most: float,
                   gain: float, cost: float = 0.0) -> None:

@@ -26,12 +26,13 @@ from ins_align.antenna import AntennaEpoch
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.correlation import Correlation
 from ins_align.estimator import FIRST_NOISE, MapEstimator
+from ins_align.excess import ExcessJudge
 from ins_align.fit import Fit, no_fit, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
 from ins_align.handover import prior_from_now, prior_without_attitude, wander
 from ins_align.imu_steps import ImuSteps
 from ins_align.preintegration import Noise, preintegrate, SensorErrors
-from ins_align.results import Nuisance
+from ins_align.results import Nuisance, State
 from ins_align.rotation import Array, orthonormalized
 from ins_align.signs import SignCheck
 from ins_align.solution import NoiseLevels
@@ -75,8 +76,8 @@ class Method(Protocol):
     def renew(self) -> None:
         """Move t0 to the last epoch before the next one is taken, where a method can."""
 
-    def judged(self, contradicted: bool, good: bool) -> None:
-        """Hear whether the data contradict the model, and whether the attitude is good enough."""
+    def judged(self, contradicted: bool, state: State) -> None:
+        """Hear whether the data contradict the model, and what is declared."""
 
     def unconfirmed(self) -> str:
         """Return what speaks against a heading: of signs, or of what is told for certain."""
@@ -128,6 +129,7 @@ class MapMethod:
         self._signs = SignCheck()
         self._told = ToldCheck(config)
         self._correlation = Correlation()
+        self._excess_judge = ExcessJudge()
         self._ahead = 1
         self._offered = 0
         self._rejected = [0, 0, 0]          # velocities, positions, epochs before t0
@@ -146,7 +148,8 @@ class MapMethod:
             estimate_lever_arm=self._config.lever_arm_std > 0,
             estimate_delay=self._config.gnss_delay_std > 0, capacity=self._capacity,
             estimate_matrices=self._estimates_matrices, noise=noise,
-            rate_random_walk=self._config.imu_noise.rate_random_walk)
+            rate_random_walk=self._config.imu_noise.rate_random_walk,
+            excess_judge=self._excess_judge)
 
     def _take_start(self, epoch: AntennaEpoch, imu: ImuSteps) -> None:
         """Take the epoch at t0."""
@@ -177,10 +180,11 @@ class MapMethod:
         """Move t0 to the last epoch before the next one is taken."""
         self._renewed = self._estimator.solution is not None
 
-    def judged(self, contradicted: bool, good: bool) -> None:
-        """Hear whether the data contradict the model, and whether the attitude is good enough."""
+    def judged(self, contradicted: bool, state: State) -> None:
+        """Hear whether the data contradict the model, and what is declared."""
         self._contradicted = contradicted
-        self._good |= good
+        self._good |= state in (State.LEVELLED, State.ALIGNED)
+        self._excess_judge.declared |= state is State.ALIGNED
 
     @property
     def _lost(self) -> bool:
@@ -236,6 +240,7 @@ class MapMethod:
         if self._lost:
             prior, self._past = self._first_prior, (0.0, 0)
             self._correlation = Correlation()
+            self._excess_judge = ExcessJudge()
         else:
             prior = prior_from_now(self._estimator, track.C_n0n, -track.still_v, -track.s_p,
                                    fit.significant_scale, self._wander * track.time)
@@ -244,6 +249,7 @@ class MapMethod:
         self._signs.restart()
         self._told.restart()
         self._correlation.restart()
+        self._excess_judge.restart()
         self.moved += 1
         start = replace(self._last_epoch, v_n=None, position_measured=False)
         self._start(start, prior, self._estimator.noise)
@@ -465,7 +471,7 @@ class NoteMethod:
     def renew(self) -> None:
         """Nothing to renew: t0 stays."""
 
-    def judged(self, contradicted: bool, good: bool) -> None:
+    def judged(self, contradicted: bool, state: State) -> None:
         """Nothing to hear: t0 stays."""
 
     def unconfirmed(self) -> str:
