@@ -181,11 +181,12 @@ class _Survey:
     def _imu(self, data: Recorded, motion: Series, gravity: float) -> TopicInfo:
         faults = list(data.refusals)
         times = data.times(self._start_ns)[data.usable]
-        order = np.argsort(times, kind='stable')
-        samples = ImuSamples(data.stamps_ns[data.usable][order],
-                             data.values[data.usable, :3][order],
-                             data.values[data.usable, 3:][order], data.usable)
-        facts = survey_imu(samples, times[order], motion, gravity)
+        # Of one stamp the first counts, as in an alignment.
+        times, first = np.unique(times, return_index=True)
+        samples = ImuSamples(data.stamps_ns[data.usable][first],
+                             data.values[data.usable, :3][first],
+                             data.values[data.usable, 3:][first], data.usable)
+        facts = survey_imu(samples, times, motion, gravity)
         if facts is not None:
             faults += facts.faults
         elif data.stamps_ns.size:

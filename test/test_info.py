@@ -168,6 +168,13 @@ def test_no_velocity_topic(changed):
     assert info.heading.startswith('yes')
 
 
+def test_an_imu_that_says_everything_twice(changed, drive):
+    """Of one stamp the first counts, as in an alignment."""
+    info = inspect(changed(lambda name, time, message: [(name, time, message)] * 2))
+    once, twice = (by_name(each, '/imu/data_raw') for each in (inspect(drive[0]), info))
+    assert twice.imu == once.imu
+
+
 def test_two_imus_quoted_for_a_shell(changed):
     """The one whose gravity is taken out is not proposed, and names stay words of a shell."""
     vector = typestore().types['geometry_msgs/msg/Vector3']
