@@ -19,11 +19,13 @@ import math
 from ins_align.config import ImuNoise
 from ins_align.earth import EARTH_RATE
 from ins_align.estimator import MapEstimator
-from ins_align.rotation import Array, exp_so3, skew
-from ins_align.unknowns import (ACCEL, ACCEL_BIAS, ATTITUDE, BODY_FIXED, GYRO, GYRO_BIAS, Prior,
-                                prior_of, SIZE, START_POSITION, START_VELOCITY, Unknowns)
+from ins_align.rotation import Array, exp_so3, Index, skew
+from ins_align.unknowns import (ACCEL, ACCEL_BIAS, ANTENNA, ATTITUDE, BODY_FIXED, GYRO, GYRO_BIAS,
+                                inverse_spd, Prior, prior_of, SIZE, START_POSITION, START_VELOCITY,
+                                Unknowns)
 from ins_align.whitening import HEADING_RESOLVED_STD, START
 import numpy as np
+
 # Biases wander by this share of their prior sigma in this time (s).
 WANDER, WANDER_TIME = 0.3, 100.0
 
@@ -56,8 +58,9 @@ def prior_from_now(estimator: MapEstimator, C_n0n: Array, shift_v: Array, shift_
     Return what is known now as the prior of an estimator whose t0 is the last epoch.
 
     While the heading is not resolved, the linear picture of how it hangs together with the
-    rest is not good for long: then tilt, biases, lever arm and delay are kept, the heading
-    and the start are not.
+    rest is not good for long: then tilt and biases are kept, the heading and the start are not.
+    Of lever arm and delay that is kept which was known before: without a change of speed nothing
+    shows them but the noise of the IMU, which feigns a swing that the GNSS does not see.
 
     Parameters
     ----------
@@ -81,11 +84,11 @@ def prior_from_now(estimator: MapEstimator, C_n0n: Array, shift_v: Array, shift_
     """
     columns = estimator.columns
     heading_free = not estimator.heading_std < HEADING_RESOLVED_STD
-    now, joint = _now(estimator, heading_free)
+    now, joint = _now(estimator, heading_free, scale)
     T = np.eye(joint.shape[0])
     for block in range(3):
         T[3 * block:3 * block + 3, 3 * block:3 * block + 3] = C_n0n.T
-    joint = scale * T @ joint @ T.T
+    joint = T @ joint @ T.T
     joint[9:, 9:] += np.diag(wander[columns])
     if heading_free:
         # The gyros cannot tell their biases from the Earth's rate seen under a heading that
@@ -97,13 +100,14 @@ def prior_from_now(estimator: MapEstimator, C_n0n: Array, shift_v: Array, shift_
         # about the specific force, which leads the vertical round a circle.
         joint[:2, :2] += estimator.free_axis_tilt ** 2 * np.eye(2)
     # Places of what is kept in the joint covariance, and in the vector of unknowns.
-    kept = np.flatnonzero(np.isin(columns, BODY_FIXED))
+    kept = _carried(estimator, heading_free)
     start = np.arange(2 if heading_free else estimator.size)
     places = np.concatenate([start, 9 + kept])
     unknowns = np.concatenate([START[start], columns[kept]])
     mean = replace(now, C=C_n0n.T @ now.C, start_velocity=C_n0n.T @ (now.start_velocity + shift_v),
                    start_position=C_n0n.T @ (now.start_position + shift_p))
-    return prior_of(mean, joint[np.ix_(places, places)], unknowns, heading_free)
+    prior = prior_of(mean, joint[np.ix_(places, places)], unknowns, heading_free)
+    return prior.with_antenna_of(estimator.prior) if heading_free else prior
 
 
 def prior_without_attitude(estimator: MapEstimator) -> Prior:
@@ -111,12 +115,21 @@ def prior_without_attitude(estimator: MapEstimator) -> Prior:
     if estimator.solution is None:
         return estimator.prior
     now, joint = _now(estimator, True)
-    kept = np.flatnonzero(np.isin(estimator.columns, BODY_FIXED))
+    heading_free = not estimator.heading_std < HEADING_RESOLVED_STD
+    kept = _carried(estimator, heading_free)
     mean = replace(now, C=np.eye(3), start_velocity=np.zeros(3), start_position=np.zeros(3))
-    return prior_of(mean, joint[np.ix_(9 + kept, 9 + kept)], estimator.columns[kept], False)
+    prior = prior_of(mean, joint[np.ix_(9 + kept, 9 + kept)], estimator.columns[kept], False)
+    return prior.with_antenna_of(estimator.prior) if heading_free else prior
 
 
-def _now(estimator: MapEstimator, heading_free: bool) -> tuple[Unknowns, Array]:
+def _carried(estimator: MapEstimator, heading_free: bool) -> Index:
+    """Places in the vector of unknowns of what the data tell of the body, shape (k,)."""
+    told = np.setdiff1d(BODY_FIXED, ANTENNA) if heading_free else BODY_FIXED
+    return np.flatnonzero(np.isin(estimator.columns, told))
+
+
+def _now(estimator: MapEstimator, heading_free: bool,
+         scale: float = 1.0) -> tuple[Unknowns, Array]:
     """
     Return the unknowns as if the last epoch were t0, in the axes and origin of the present n0.
 
@@ -158,4 +171,7 @@ def _now(estimator: MapEstimator, heading_free: bool) -> tuple[Unknowns, Array]:
         start_velocity=x.start_velocity + v + moved[3:6],
         start_position=x.start_position + time * x.start_velocity + p + moved[6:])
     total = np.vstack([J[:, estimator.columns], np.eye(n)]) - D @ s.whitener.X[:, 1:]
-    return now, total @ s.P @ total.T + D @ s.whitener.P @ D.T
+    # What the data told counts less by the scale; what was known before them does not.
+    P = s.P if scale == 1.0 else inverse_spd(
+        inverse_spd(s.P) / scale + (1.0 - 1.0 / scale) * s.information)
+    return now, total @ P @ total.T + scale * D @ s.whitener.P @ D.T

@@ -29,7 +29,7 @@ from ins_align.estimator import FIRST_NOISE, MapEstimator
 from ins_align.excess import ExcessJudge
 from ins_align.fit import Fit, no_fit, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
-from ins_align.handover import prior_from_now, prior_without_attitude, wander
+from ins_align.handover import aged, prior_from_now, prior_without_attitude, wander
 from ins_align.imu_steps import ImuSteps
 from ins_align.preintegration import Noise, preintegrate, SensorErrors
 from ins_align.results import Nuisance, State
@@ -237,7 +237,9 @@ class MapMethod:
         self.settle(last=True)
         track = self._track
         fit = self.fit()
-        if self._lost:
+        if self._estimator.solution is None:                    # full of epochs without GNSS
+            prior = aged(self._estimator.prior, self._config.imu_noise, float(track.time))
+        elif self._lost:
             prior, self._past = self._first_prior, (0.0, 0)
             self._correlation = Correlation()
             self._excess_judge = ExcessJudge()

@@ -91,6 +91,8 @@ ACCEL_BIAS, ACCEL_MATRIX = slice(15, 18), slice(18, 27)
 START_VELOCITY, START_POSITION = slice(27, 30), slice(30, 33)
 LEVER_ARM, DELAY = slice(33, 36), slice(36, 37)
 SIZE = 37
+# Of the antenna: where it is, and when.
+ANTENNA = np.r_[LEVER_ARM, DELAY]
 # Bias and matrix.
 GYRO, ACCEL = slice(GYRO_BIAS.start, GYRO_MATRIX.stop), slice(ACCEL_BIAS.start, ACCEL_MATRIX.stop)
 SENSORS = slice(GYRO.start, ACCEL.stop)
@@ -143,6 +145,16 @@ class Prior:
         covariance[block, block] += std ** 2 * np.eye(block.stop - block.start)
         return prior_of(self.mean, covariance[np.ix_(unknowns, unknowns)], unknowns,
                         self.heading_free)
+
+    def with_antenna_of(self, other: 'Prior') -> 'Prior':
+        """Return this, which knows nothing of lever arm and delay, with what another knows."""
+        known, covariance = other._known()
+        places = np.flatnonzero(np.isin(known, ANTENNA))
+        information = self.information.copy()
+        information[np.ix_(known[places], known[places])] = inverse_spd(
+            covariance[np.ix_(places, places)])
+        mean = replace(self.mean, lever_b=other.mean.lever_b, delay=other.mean.delay)
+        return replace(self, mean=mean, information=information)
 
     def at(self, point: Unknowns) -> tuple[Array, Array]:
         """
