@@ -240,7 +240,9 @@ class Intake:
         stamps = self.imu.stamps
         # Interpolation at an epoch wants two samples after it, and whether they are spikes shows
         # in the next one.
-        upto_ns = min(self.imu.newest_ns - (0 if last else self._lateness_ns), int(stamps[-3]))
+        settled_ns = self.imu.newest_ns - (0 if last else self._lateness_ns)
+        settled = int(np.searchsorted(stamps, settled_ns, side='right'))
+        upto_ns = int(stamps[max(settled, 3) - 3])
         self._silences = self._find_silences(self._cutter.check_range(upto_ns))
         for message in self._gnss.release(upto_ns, last):
             self._dry_epochs(message.stamp_ns)

@@ -407,8 +407,8 @@ def preintegrate(steps: Steps, sensors: SensorErrors, noise: Noise,
 
         def covariance(gyro: ArrayLike, accel: ArrayLike) -> Array:
             """Of the errors at the end, from densities in each step."""
-            gyro_least, gyro_more = _least_and_more(gyro)
-            accel_least, accel_more = _least_and_more(accel)
+            gyro_least, gyro_more = _least_and_more(gyro, dt)
+            accel_least, accel_more = _least_and_more(accel, dt)
             total = gyro_least * gyro_noise + accel_least * accel_noise
             if gyro_more.any():
                 total += _of_gyros(gyro_more * dt, v_rest, p_rest)
@@ -470,10 +470,14 @@ def _derivatives(dt: Array, turns: Array, u: Array, rate: Array,
             -np.sum(by_accelerometers, axis=1), -np.sum(remaining * by_accelerometers, axis=1))
 
 
-def _least_and_more(density: ArrayLike) -> tuple[Array, Array]:
-    """Square of a density, () or (K, n): the least of each interval, (K, 1, 1), and the rest."""
-    squares = np.atleast_2d(np.square(density))
-    least = squares.min(axis=1, keepdims=True)
+def _least_and_more(density: ArrayLike, dt: Array) -> tuple[Array, Array]:
+    """
+    Square of a density, () or (K, n): the least of each interval, (K, 1, 1), and the rest.
+
+    Steps that only fill up an interval have no say: there are as many as the longest one needs.
+    """
+    squares = np.broadcast_to(np.square(density), dt.shape)
+    least = squares.min(axis=1, keepdims=True, where=dt > 0, initial=squares.max(initial=0.0))
     return least[..., None], squares - least
 
 

@@ -115,7 +115,7 @@ def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'A
     rows = np.arange(epochs.size)[:, None]
     before = (sums[rows, own]
               + (-AGES - np.minimum(end, 0.0)[rows, own])[..., None] * both[rows, own])
-    span = np.sum(dt, axis=1)
+    span = np.cumsum(dt, axis=1)[:, -1]
     at_end = np.concatenate([accel[last], gyro[last]], axis=-1)
     mean = np.where(span > 0, sums[:, -1] / np.maximum(span, 1e-9), at_end)[:, None]
     missing = (AGES - span)[..., None]

@@ -355,6 +355,32 @@ def test_velocities_that_stop_at_once_are_the_same_in_any_split():
     assert normalised_error(last[0].current, s) < chi2.ppf(0.9999, 3)
 
 
+def test_samples_that_are_late_within_the_allowed_time_change_nothing(flight):
+    """Neither do the calls between them: nothing is used that they may still come before."""
+    stamps = flight.imu_stamps_ns[:4000]
+    late = np.random.default_rng(1).random(stamps.size) < 0.05
+    arrival = stamps + np.where(late, SECOND // 10 - 1, 0)
+    last = []
+    for share in (1.0, 0.1):
+        aligner = Aligner(config_for(flight, gnss_lateness=0.1))
+        calls = np.random.default_rng(2).random(stamps.size) < share
+        for k in range(len(flight.gnss_stamps_ns)):
+            aligner.add_fix(flight.fix(k))
+            aligner.add_velocity(flight.velocity_measurement(k))
+        epochs = []
+        for i, called in zip(np.argsort(arrival, kind='stable'), calls):
+            aligner.add_imu(int(stamps[i]), flight.gyro[i], flight.accel[i])
+            if called:
+                epochs += aligner.update()
+        last.append(epochs + aligner.flush())
+        assert aligner.counts['imu_late'] == 0
+    assert [e.stamp_ns for e in last[0]] == [e.stamp_ns for e in last[1]]
+    for one, other in zip(*last):
+        if one.current is not None:
+            assert np.array_equal(one.current.C_nb, other.current.C_nb)
+            assert np.array_equal(one.current.covariance, other.current.covariance)
+
+
 def test_counts_hold_every_epoch_over_a_restart(flight):
     """The IMU is silent for a second; one epoch of each kind has a wild measurement."""
     stamps = flight.imu_stamps_ns
@@ -1051,10 +1077,12 @@ def test_wild_velocities_that_a_fit_has_swallowed_are_found_out():
     """Taken for good, they make it believe in an absurd delay and widen the gate."""
     result = run_trial({
         'fault': 'outliers', 'scenario': 'hover', 'config': {},
-        'simulate': dict(imu_grade='navigation', seed=21, duration=100.0, heading_deg=-27.807932,
-                         latitude_deg=-18.637103, lever_arm=(0.925466, -0.187869, 1.114875),
-                         mount_rpy_deg=(-12.931369, -7.363821, 6.063578), outlier_rate=0.08609542,
-                         outlier_velocity=1.798264, outlier_position=48.443034)})
+        'simulate': {'imu_grade': 'navigation', 'seed': 21, 'duration': 100.0,
+                     'heading_deg': -27.807932, 'latitude_deg': -18.637103,
+                     'lever_arm': (0.925466, -0.187869, 1.114875),
+                     'mount_rpy_deg': (-12.931369, -7.363821, 6.063578),
+                     'outlier_rate': 0.08609542, 'outlier_velocity': 1.798264,
+                     'outlier_position': 48.443034}})
     assert result['state'] == 'ALIGNED' and result['withdrawals'] == 0
     assert largest(result) < 3.0
 

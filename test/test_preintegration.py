@@ -14,7 +14,7 @@
 """Preintegration against quadrature of closed-form motion, re-integration and Monte Carlo."""
 
 from ins_align.preintegration import (Intervals, Noise, preintegrate, SensorErrors,
-                                      split_at_epochs, white_noise)
+                                      split_at_epochs, Steps, white_noise)
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -367,6 +367,21 @@ def test_noise_in_excess_is_kept_apart():
     assert np.allclose(interval.Q_excess,
                        preintegrate(steps, SensorErrors.none(), Noise(2e-3, 3e-2)).Q)
     assert not np.any(preintegrate(steps, SensorErrors.none(), NOISE).Q_excess)
+
+
+def test_noise_of_an_interval_does_not_hang_on_the_others():
+    """Shorter ones are filled up with steps of no length."""
+    r = np.random.default_rng(0)
+    steps = Steps(np.array([[0.01] * 3 + [0.0] * 2]), *r.standard_normal((2, 1, 6, 3)),
+                  *np.zeros((2, 1, 6, 3)))
+    density = np.array([[0.3, 0.1, 0.2, 0.0, 0.0]])
+    noise = Noise(density, 10 * density, 0.5 * density, 5 * density)
+    alone = preintegrate(Steps(*(values[:, :n] for values, n in zip(vars(steps).values(),
+                                                                    (3, 4, 4, 4, 4)))),
+                         SensorErrors.none(),
+                         Noise(*(values[:, :3] for values in vars(noise).values())))
+    filled = preintegrate(steps, SensorErrors.none(), noise)
+    assert np.array_equal(filled.Q, alone.Q) and np.array_equal(filled.Q_excess, alone.Q_excess)
 
 
 def test_mirrored_intervals_are_those_of_mirrored_sensors():
