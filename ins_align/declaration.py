@@ -76,6 +76,7 @@ class Declaration:
         self.aligned = False
         self.later_start = False
         self.contradicted = False
+        self._against = ''                  # what spoke against it when it was judged last
         self._recent_nis = 1.0
         self._rejected = 0
 
@@ -117,13 +118,14 @@ class Declaration:
         self._heading_since_s = _since(self._heading_since_s, time_s, good
                                        and tilt_now <= max_tilt and heading_now <= max_heading)
         self.later_start = False
+        self._against = contradiction
         if contradiction:
             self.withdraw()
             return Verdict(State.ALIGNING, contradiction)
         self.levelled = self.levelled or self._held(self._level_since_s, time_s)
         doubt = ''
         if not self.aligned and self._held(self._heading_since_s, time_s):
-            doubt = unconfirmed()
+            self._against = doubt = unconfirmed()
             self.aligned = not doubt and tilt <= max_tilt and heading <= max_heading
             self.later_start = not doubt and not self.aligned
         self._withdraw_lost(tilt, heading)
@@ -151,14 +153,11 @@ class Declaration:
         silence = f'no GNSS for {silent_s:.0f} s'
         if silent_s > MAX_SILENCE:
             self._level_since_s = self._heading_since_s = None
-        if self.levelled or self.aligned:
-            tilt, heading = (max(worse) for worse in zip(*(
-                _sigmas_deg(P, fit.factor) for P in (initial, current))))
-            self._withdraw_lost(tilt, heading)
-        if self.levelled or self.aligned:
-            verdict = self._verdict(tilt, heading, fit)
-            return Verdict(verdict.state, f'{verdict.reason}; {silence}')
-        return Verdict(State.ALIGNING, silence)
+        tilt, heading = (max(worse) for worse in zip(*(
+            _sigmas_deg(P, fit.factor) for P in (initial, current))))
+        self._withdraw_lost(tilt, heading)
+        verdict = self._verdict(tilt, heading, fit)
+        return Verdict(verdict.state, f'{self._against or verdict.reason}; {silence}')
 
     def withdraw(self) -> None:
         """Withdraw all that is declared; what was good until now counts no more."""

@@ -16,7 +16,7 @@
 from ins_align.config import Config
 from ins_align.declaration import Declaration
 from ins_align.fit import Fit, Innovation
-from ins_align.results import State
+from ins_align.results import State, Verdict
 import numpy as np
 import pytest
 
@@ -245,7 +245,8 @@ def test_without_gnss_nothing_is_declared_and_what_gets_lost_is_withdrawn():
     declaration = Declaration(Config(hold_time=2.0))
     for silent in (2.0, 4.0, 60.0):
         verdict = declaration.update_without_gnss(silent, GOOD, GOOD, fit())
-        assert verdict.state is State.ALIGNING and verdict.reason == f'no GNSS for {silent:g} s'
+        assert verdict.state is State.ALIGNING
+        assert verdict.reason.endswith(f'hold for 2 s; no GNSS for {silent:g} s')
     assert judge(declaration, 60.2, 3.0, GOOD).state is State.ALIGNED
     kept = declaration.update_without_gnss(2.0, GOOD, covariance(0.1, 1.9), fit())
     assert kept.state is State.ALIGNED and 'sigma 1.9' in kept.reason
@@ -256,6 +257,18 @@ def test_without_gnss_nothing_is_declared_and_what_gets_lost_is_withdrawn():
     assert again.state is State.LEVELLED
     fallen = declaration.update_without_gnss(8.0, GOOD, covariance(1.1, 2.1), fit())
     assert fallen.state is State.ALIGNING
+
+
+@pytest.mark.parametrize('P, the_fit, doubt', [
+    (OPEN, None, ''), (LEVEL, None, ''), (GOOD, fit(rejected=40), ''),
+    (GOOD, fit(objection='another lever arm'), ''), (GOOD, None, 'turn'),
+    (GOOD, fit(dof=5, chi2=5.0, offered=4), '')])
+def test_without_gnss_what_spoke_against_a_declaration_is_still_said(P, the_fit, doubt):
+    declaration = Declaration(Config(hold_time=2.0))
+    before = judge(declaration, 0.0, 3.0, P, the_fit, doubt=doubt)
+    for silent in (2.0, 4.0, 60.0):
+        verdict = declaration.update_without_gnss(silent, P, P, the_fit or fit())
+        assert verdict == Verdict(before.state, f'{before.reason}; no GNSS for {silent:g} s')
 
 
 @pytest.mark.parametrize('factor, initial, current, state', [
