@@ -138,15 +138,15 @@ class Aligner:
     # Processing
 
     def update(self) -> list[Epoch]:
-        """Process every epoch that nothing late can precede any more."""
+        """Process what nothing late can precede any more; return the GNSS epochs in it."""
         return self._process(last=False)
 
     def flush(self) -> list[Epoch]:
-        """Process the rest, at the end of a recording."""
+        """Process the rest, at the end of a recording; return the GNSS epochs in it."""
         return self._process(last=True)
 
     def _process(self, last: bool) -> list[Epoch]:
-        """Process what can be; return the epochs that were not returned yet."""
+        """Process what can be; return the GNSS epochs that were not returned yet."""
         self._intake.prepare(last)
         self._go()
         done, self._done = self._done, []
@@ -155,7 +155,7 @@ class Aligner:
     def _go(self) -> None:
         """Go the steps that are prepared."""
         for step in self._intake.take_steps():
-            self._done += self._alignment.go(step)
+            self._done += [epoch for epoch in self._alignment.go(step) if not epoch.dry]
             self._now = None
 
     # Output

@@ -22,11 +22,10 @@ from collections import Counter
 import math
 from typing import NamedTuple
 
-from ins_align.antenna import AntennaEpoch
 from ins_align.config import Config
 from ins_align.declaration import Declaration
 from ins_align.handover import aged
-from ins_align.intake import Afresh, Loss, Run, Start, Step, Wait
+from ins_align.intake import Afresh, Located, Loss, Run, Start, Step, Wait
 from ins_align.methods import MapMethod, Method, NoteMethod
 from ins_align.plausibility import ForceCheck
 from ins_align.preintegration import SensorErrors
@@ -95,7 +94,7 @@ class Alignment:
         self.config = self._declaration.config = config
 
     def go(self, step: Step) -> list[Epoch]:
-        """Go a step; return the epochs with GNSS that were in it."""
+        """Go a step; return the epochs that were in it."""
         if isinstance(step, Run):
             return self._advance(step)
         if isinstance(step, Start):
@@ -120,7 +119,7 @@ class Alignment:
                                      self._prior(epoch.stamp_ns))
         else:
             self._method = NoteMethod(self.config, epoch, step.imu, epoch.v_n is None)
-        return self._judge(self._method, epoch, step.first.fault)
+        return self._judge(self._method, step.first)
 
     def _prior(self, stamp_ns: int) -> Prior | None:
         """Return what is known at a stamp of what was learnt before."""
@@ -136,9 +135,7 @@ class Alignment:
         taken = method.advance([located.epoch for located in run.located], run.imu)
         for epoch, located, forces in zip(taken, run.located, run.forces):
             self._force_check.add(*forces)
-            judged = self._judge(method, epoch, located.fault)
-            if not located.dry:
-                done.append(judged)
+            done.append(self._judge(method, located._replace(epoch=epoch)))
         return done
 
     def _lose(self, why: str) -> None:
@@ -151,9 +148,10 @@ class Alignment:
             learnt = None if prior is None else _Learnt(prior, self._stamp_ns)
         self._forget(learnt)
 
-    def _judge(self, method: Method, epoch: AntennaEpoch, fault: str) -> Epoch:
-        """Results and state after an epoch; `fault` is what is known to be wrong with the GNSS."""
+    def _judge(self, method: Method, located: Located) -> Epoch:
+        """Results and state after an epoch."""
         assert self._first_t0_ns is not None
+        epoch = located.epoch
         self._stamp_ns = stamp_ns = epoch.stamp_ns
         time_s = (stamp_ns - self._start_ns) * 1e-9
         method.settle()
@@ -178,7 +176,7 @@ class Alignment:
             scale = fit.factor ** 2 if math.isfinite(fit.factor) else 1.0
             self._initial = Attitude(method.t0_ns, initial[0], initial[1] * scale)
             self.current = Attitude(stamp_ns, current[0], current[1] * scale)
-        fault = self._force_check.fault or fault
+        fault = self._force_check.fault or located.fault
         if fault:
             self._declaration.withdraw()
             verdict = Verdict(State.FAULT, fault)
@@ -193,7 +191,7 @@ class Alignment:
         sensors = method.sensor_errors()
         return Epoch(stamp_ns, (stamp_ns - self._first_t0_ns) * 1e-9, verdict.state,
                      self._initial, self.current, fit.innovation.normalised,
-                     sensors.gyro_bias, sensors.accel_bias)
+                     sensors.gyro_bias, sensors.accel_bias, located.dry)
 
     def _set_verdict(self, verdict: Verdict) -> None:
         if verdict.state is not self._verdict.state:

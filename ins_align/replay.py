@@ -113,7 +113,7 @@ class ReplayResult:
 
     bag: str
     status: Status
-    epochs: tuple[Epoch, ...]
+    epochs: tuple[Epoch, ...]  # those without GNSS, too
     warnings: tuple[str, ...]
     reference: Reference | None
     topics: Topics
@@ -153,6 +153,8 @@ class ReplayResult:
         out = io.StringIO()
         out.write(CSV_HEADER + '\n')
         for epoch in self.epochs:
+            if epoch.dry:
+                continue
             cells = [str(epoch.stamp_ns), f'{epoch.t_s:.9f}', epoch.state.value]
             for attitude in (epoch.initial, epoch.current):
                 numbers = [math.nan] * 7 if attitude is None else [

@@ -266,10 +266,11 @@ class _Series:
     """
 
     def __init__(self, result: ReplayResult) -> None:
-        pairs = [(epoch, epoch.initial, epoch.current) for epoch in result.epochs
+        epochs = [epoch for epoch in result.epochs if not epoch.dry]
+        pairs = [(epoch, epoch.initial, epoch.current) for epoch in epochs
                  if epoch.current is not None and epoch.initial is not None]
         time = np.array([epoch.t_s for epoch, _, _ in pairs])
-        breaks = _breaks(result.epochs, time)
+        breaks = _breaks(epochs, time)
 
         def rows(values: Sequence[Any]) -> np.ndarray:
             return np.insert(np.array(values, float).reshape(-1, 3), breaks, np.nan, axis=0)
@@ -286,9 +287,7 @@ class _Series:
             for name in ('innovation', 'gyro_bias', 'accel_bias'))
         self.aligned = np.insert(
             np.array([epoch.state is State.ALIGNED for epoch, _, _ in pairs], bool), breaks, False)
-        self.declared = [epoch.t_s for before, epoch in zip((None, *result.epochs), result.epochs)
-                         if epoch.state is State.ALIGNED
-                         and (before is None or before.state is not State.ALIGNED)]
+        self.declared = declared_spans(result.epochs)
         self.errors = self.reference = None
         if result.reference is not None:
             none = (np.full(3, np.nan), np.full(3, np.nan))
@@ -434,10 +433,7 @@ def _plot_track(axes: Axes, result: ReplayResult) -> None:
 
 
 def _mark_declaration(axes: Axes, series: _Series) -> None:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], series.aligned.view(np.int8), [0]])))
-    for start, end in zip(edges[::2], edges[1::2]):
-        axes.axvspan(series.time[start], series.time[end - 1], color=DECLARED_GREEN, alpha=0.07,
-                     linewidth=0)
-    for number, time in enumerate(series.declared):
-        axes.axvline(time, color=DECLARED_GREEN, linewidth=1.2,
+    for number, (start, end) in enumerate(series.declared):
+        axes.axvspan(start, end, color=DECLARED_GREEN, alpha=0.07, linewidth=0)
+        axes.axvline(start, color=DECLARED_GREEN, linewidth=1.2,
                      label='declared aligned' if number == 0 else None)

@@ -97,7 +97,7 @@ class Attitude:
 @dataclass(frozen=True)
 class Epoch:
     """
-    What came of a GNSS epoch.
+    What came of an epoch.
 
     Attributes
     ----------
@@ -111,6 +111,8 @@ class Epoch:
         agree with the estimate before it, over its sigma; nan where nothing was tested.
     gyro_bias, accel_bias : ndarray, shape (3,)
         rad/s, m/s^2.
+    dry : bool
+        Whether it is without GNSS, on the way through an outage.
 
     """
 
@@ -122,6 +124,7 @@ class Epoch:
     innovation: Array
     gyro_bias: Array
     accel_bias: Array
+    dry: bool = False
 
 
 @dataclass(frozen=True)

@@ -183,6 +183,34 @@ def restarted(tmp_path_factory):
     return dataclasses.replace(result, epochs=tuple(epochs))
 
 
+@pytest.fixture(scope='module')
+def dry(tmp_path_factory):
+    """Replay a drive of 100 s whose GNSS says nothing from 20 s to 30 s and from 40 s on."""
+    truth = simulate('car', imu_grade='mems', seed=1, duration=100.0)
+    seconds = (truth.gnss_stamps_ns - truth.gnss_stamps_ns[0]) * 1e-9
+    heard = (seconds < 20.0) | (seconds > 30.0) & (seconds < 40.0)
+    names = ('gnss_stamps_ns', 'gnss_arrival_ns', 'lla_deg', 'velocity')
+    path = tmp_path_factory.mktemp('report') / 'dry'
+    write_bag(dataclasses.replace(truth, **{name: getattr(truth, name)[heard] for name in names}),
+              path)
+    return replay(path, Config(lever_arm=(1.0, 1.0, 1.0)))
+
+
+def test_what_is_declared_lasts_into_an_outage(dry):
+    (start, end), = declared_spans(dry.epochs)
+    assert start < 20.0 and 42.0 < end < 98.0 and dry.status.state is not State.ALIGNED
+    assert f'it was ALIGNED from {start:.1f} to {end:.1f} s' in summary(dry)
+    bands = [patch.get_extents().transformed(axes.transData.inverted())
+             for axes in drawn(plot(dry))[:1] for patch in axes.patches]
+    assert [(band.x0, band.x1) for band in bands] == [pytest.approx((start, end))]
+
+
+def test_the_table_has_no_row_without_gnss(dry):
+    times = [float(line.split(',')[1]) for line in dry.to_csv().splitlines()[1:]]
+    assert len(times) > 100 and times[-1] < 40.0
+    assert not [time for time in times if 20.0 < time < 30.0]
+
+
 def test_nothing_is_drawn_across_a_restart(restarted):
     shown = [epoch.t_s for epoch in restarted.epochs if epoch.initial and epoch.current]
     figure = plot(restarted)
