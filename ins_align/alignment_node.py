@@ -131,7 +131,13 @@ class AlignmentNode(Node):
     def __init__(self) -> None:
         """Declare the parameters, then open the topics."""
         # Overrides are declared untyped first, so that [1, 1, 1] is as good as [1.0, 1.0, 1.0].
-        super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True)
+        try:
+            super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True)
+        except ValueError as error:
+            if 'PARAMETER_NOT_SET' not in str(error):  # rcl loses the type of an empty list
+                raise
+            raise ConfigError('the value of a parameter is an empty list: write its numbers, as '
+                              'lever_arm:=[0.0, 0.0, 0.0], or leave it out') from None
         self.failure: BaseException | None = None
         self._worker = Worker(self._work, self._on_failure)
         self._config = self._declare_parameters()

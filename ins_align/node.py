@@ -40,7 +40,8 @@ def main(args: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0 after an interruption, 2 if an argument or a parameter is wrong.
+        Exit status: 0 after an interruption, 2 if an argument or a parameter is wrong, or without
+        a ROS installation.
 
     """
     keep_to_one()  # several times as cheap
@@ -57,7 +58,12 @@ def main(args: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, on_signal)
 
     # Now that the above holds: importing starts the threads and takes a while.
-    from ins_align.alignment_node import AlignmentNode
+    try:
+        from ins_align.alignment_node import AlignmentNode
+    except ModuleNotFoundError as error:
+        return _refused(f'the Python package {error.name} is not installed here: source the ROS '
+                        'installation first (source /opt/ros/jazzy/setup.bash), or, without one, '
+                        "pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces")
     from ins_align.config import ConfigError
     import rclpy
     from rclpy.exceptions import ParameterException

@@ -14,6 +14,8 @@
 """The node by itself: parameters, signals, topics, services, without any sensor."""
 
 import signal
+import subprocess
+import sys
 
 from ins_align.config import Config, parameters
 from node_harness import Listener, NodeProcess, running_node
@@ -34,6 +36,7 @@ def double(value):
 
 WRONG = (
     (['-p', 'lever_arm:=[1, 2]'], 'lever_arm must be three numbers'),
+    (['-p', 'lever_arm:=[]'], 'an empty list: write its numbers, as lever_arm:=[0.0, 0.0, 0.0]'),
     (['-p', 'lever_arm:=[1.0, .nan, 0.0]'], 'lever_arm[1] must be finite'),
     (['-p', 'hold_time:=-1'], 'hold_time must lie between 0 and 3600 s'),
     (['-p', 'imu_grade:=golden'], 'imu_grade must be one of navigation, tactical, mems, custom'),
@@ -54,6 +57,15 @@ def test_what_is_wrong_at_start_is_refused_with_a_sentence():
         assert says in node.output
         assert 'Traceback' not in node.output
         assert node.status == 2
+
+
+def test_without_ros_it_says_what_to_do():
+    hide = "import sys; sys.modules.update(dict.fromkeys(['rclpy', 'diagnostic_msgs']))"
+    done = subprocess.run(
+        [sys.executable, '-c', f'{hide}; from ins_align.node import main; sys.exit(main([]))'],
+        capture_output=True, text=True)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+    assert 'source /opt/ros/jazzy/setup.bash' in done.stderr
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
