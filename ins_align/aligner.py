@@ -30,7 +30,7 @@ from ins_align.intake import Intake
 from ins_align.messages import Fix, Velocity
 from ins_align.plausibility import IMU_BEFORE, without_spikes
 from ins_align.prediction import Prediction
-from ins_align.results import Attitude, Epoch, State, Status
+from ins_align.results import Attitude, Epoch, Event, Severity, State, Status
 from ins_align.rotation import Array
 import numpy as np
 
@@ -54,7 +54,7 @@ class Aligner:
         self.config = Config() if config is None else config
         self._intake = Intake(self.config)
         self._alignment = Alignment(self.config)
-        self._events: list[str] = []
+        self._events: list[Event] = []
         self._told: set[str] = set()                # of messages that were rejected
         self._done: list[Epoch] = []
         self._now: Prediction | None = None
@@ -110,7 +110,7 @@ class Aligner:
         self._intake.reject(reason, why)
         if why and why not in self._told and len(self._told) < MAX_TOLD:
             self._told.add(why)
-            self._events.append(why)
+            self._events.append(Event(Severity.WARNING, why))
 
     def reset(self, reason: str = 'on request') -> None:
         """Start over."""
@@ -160,8 +160,8 @@ class Aligner:
 
     # Output
 
-    def take_events(self) -> list[str]:
-        """Return and forget the sentences worth a log line since the last call."""
+    def take_events(self) -> list[Event]:
+        """Return and forget the events since the last call."""
         events, self._events = self._events + self._alignment.take_events(), []
         return events
 

@@ -29,10 +29,12 @@ from ins_align.intake import Afresh, Located, Loss, Run, Start, Step, Wait
 from ins_align.methods import MapMethod, Method, NoteMethod
 from ins_align.plausibility import ForceCheck
 from ins_align.preintegration import SensorErrors
-from ins_align.results import Attitude, Epoch, Nuisance, State, Status, Verdict
+from ins_align.results import (
+    Attitude, Epoch, Event, Nuisance, Severity, State, Status, Verdict)
 from ins_align.unknowns import Prior
 import numpy as np
 
+_DECLARED = {State.LEVELLED: 1, State.ALIGNED: 2}
 _NOTHING_YET = Verdict(State.WAITING_FOR_IMU, 'no IMU sample yet')
 
 
@@ -66,7 +68,7 @@ class Alignment:
         """Wait for the first step."""
         self.config = config
         self.counts: Counter[str] = Counter()
-        self._events: list[str] = []
+        self._events: list[Event] = []
         self._epochs: Counter[str] = Counter()      # of alignments that are over
         self._method: Method | None = None
         self._first_t0_ns: int | None = None
@@ -104,7 +106,7 @@ class Alignment:
         elif isinstance(step, Loss):
             self._lose(step.why)
         elif isinstance(step, Afresh):
-            self._events.append(step.event)
+            self._events.append(Event(Severity.WARNING, step.event))
             self._first_t0_ns = None
             self._forget(None)
         return []
@@ -143,7 +145,7 @@ class Alignment:
         learnt = self._learnt
         if self._method is not None and self._stamp_ns is not None:
             self.counts['restarts'] += 1
-            self._events.append(f'alignment starts over: {why}')
+            self._events.append(Event(Severity.WARNING, f'alignment starts over: {why}'))
             prior = self._method.prior_without_attitude()
             learnt = None if prior is None else _Learnt(prior, self._stamp_ns)
         self._forget(learnt)
@@ -194,14 +196,20 @@ class Alignment:
                      sensors.gyro_bias, sensors.accel_bias, located.dry)
 
     def _set_verdict(self, verdict: Verdict) -> None:
-        if verdict.state is not self._verdict.state:
-            self._events.append(f'{verdict.state.value}: {verdict.reason}')
+        before, state = self._verdict.state, verdict.state
+        if state is not before:
+            severity = Severity.INFO
+            if state is State.FAULT:
+                severity = Severity.ERROR
+            elif _DECLARED.get(state, 0) < _DECLARED.get(before, 0):
+                severity = Severity.WARNING
+            self._events.append(Event(severity, f'{state.value}: {verdict.reason}'))
         self._verdict = verdict
 
     # Output
 
-    def take_events(self) -> list[str]:
-        """Return and forget the sentences worth a log line since the last call."""
+    def take_events(self) -> list[Event]:
+        """Return and forget the events since the last call."""
         events, self._events = self._events, []
         return events
 

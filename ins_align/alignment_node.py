@@ -34,6 +34,7 @@ from ins_align.config import (
 from ins_align.imu_bytes import ImuSample, read_imu, with_orientation
 from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
 from ins_align.prediction import Follower, Prediction
+from ins_align.results import Event, Severity
 from ins_align.worker import Worker
 from nav_msgs.msg import Odometry
 import numpy as np
@@ -237,10 +238,19 @@ class AlignmentNode(Node):
         self._look_out()
         events = self._aligner.take_events()
         for event in events:
-            self.get_logger().info(event)
+            self._log(event)
         # By a clock that goes on when simulated time stands still.
         if events or time.monotonic() >= self._next_status:
             self._publish_status()
+
+    def _log(self, event: Event) -> None:
+        # rclpy wants one line of code for each severity.
+        if event.severity is Severity.ERROR:
+            self.get_logger().error(event.text)
+        elif event.severity is Severity.WARNING:
+            self.get_logger().warning(event.text)
+        else:
+            self.get_logger().info(event.text)
 
     def _feed(self, received_ns: int, item: Any) -> None:
         aligner = self._aligner

@@ -11,11 +11,12 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What an alignment yields: its state, attitudes, epochs, the status."""
+"""What an alignment yields: its state, attitudes, epochs, events, the status."""
 
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
+from typing import NamedTuple
 
 from ins_align.rotation import Array, quaternion_from_matrix, roll_pitch_yaw
 import numpy as np
@@ -38,6 +39,21 @@ class Verdict:
 
     state: State
     reason: str
+
+
+class Severity(Enum):
+    """How a log shows an event."""
+
+    INFO = 'info'
+    WARNING = 'warning'
+    ERROR = 'error'
+
+
+class Event(NamedTuple):
+    """A sentence worth a log line."""
+
+    severity: Severity
+    text: str
 
 
 @dataclass(frozen=True)

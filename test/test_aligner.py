@@ -21,6 +21,7 @@ from alignment import (aligned, config_for, error_deg, error_of, LEVER, normalis
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config, ConfigError, ImuNoise, PRESETS
 from ins_align.experiments.declare import largest, run_trial
+from ins_align.results import Severity
 from ins_align.rotation import exp_so3, matrix_from_quaternion, roll_pitch_yaw
 from ins_align.scenarios import Motion, Scenario, SCENARIOS
 from ins_align.simulation import feed
@@ -85,8 +86,8 @@ def test_states_in_their_order(flight):
     states = [epoch.state for epoch in feed(aligner, flight)]
     order = [state for k, state in enumerate(states) if k == 0 or state is not states[k - 1]]
     assert order[0] is State.ALIGNING and order[-1] is State.ALIGNED
-    words = aligner.take_events()
-    assert any(word.startswith('ALIGNED: heading sigma') for word in words)
+    *_, (severity, words) = aligner.take_events()
+    assert severity is Severity.INFO and words.startswith('ALIGNED: heading sigma')
     assert aligner.take_events() == []
 
 
@@ -175,7 +176,7 @@ def test_reset_starts_over(flight):
     status = aligner.status()
     assert status.state is State.WAITING_FOR_IMU and status.initial is None
     assert aligner.declared is None and status.counts['resets'] == 1
-    assert any('test' in word for word in aligner.take_events())
+    assert aligner.take_events()[-1] == (Severity.WARNING, 'alignment starts over: test')
     epochs = feed_part(aligner, flight, 15.0)
     assert aligner.status().t0_ns > flight.imu_stamps_ns[0] + 14 * SECOND
     assert epochs[0].t_s == 0.0
@@ -227,7 +228,7 @@ def test_why_velocities_were_refused_is_said_while_they_are_waited_for(flight):
     assert status.state is State.WAITING_FOR_GNSS
     assert status.reason == 'no GNSS velocity yet: in the wrong axes'
     assert status.counts['velocity_body_frame'] == 3
-    assert aligner.take_events().count('in the wrong axes') == 1
+    assert aligner.take_events().count((Severity.WARNING, 'in the wrong axes')) == 1
 
 
 def test_why_messages_were_refused_is_forgotten_when_others_come(flight):
@@ -251,7 +252,7 @@ def test_clock_set_back_starts_over(flight):
     feed_part(aligner, flight, 0.0, 20.0)
     status = aligner.status()
     assert status.counts['clock_jumps'] == 1
-    assert any('clock' in word for word in aligner.take_events())
+    assert any('clock' in event.text for event in aligner.take_events())
     assert status.initial is not None and normalised_error(
         status.initial, flight) < chi2.ppf(0.9999, 3)
 
@@ -316,6 +317,9 @@ def test_without_gnss_what_was_declared_is_withdrawn_when_it_is_lost():
             assert normalised_error(status.current, s) < chi2.ppf(0.9999, 3)
     assert State.ALIGNED in states and states[-1] is State.ALIGNING
     assert '; no GNSS for 19' in status.reason and status.counts['withdrawals'] == 1
+    events = [(event.severity, event.text.split(':')[0]) for event in aligner.take_events()]
+    assert events == [(Severity.INFO, 'ALIGNING'), (Severity.INFO, 'ALIGNED'),
+                      (Severity.WARNING, 'ALIGNING')]
 
 
 @pytest.mark.parametrize('use_position', ('auto', False))
@@ -894,6 +898,8 @@ def test_accelerations_in_g_are_a_fault():
     aligner = Aligner(config_for(s))
     states = [epoch.state for epoch in give_all(aligner, s, force_scale=1 / 9.80665)]
     assert states[-1] is State.FAULT and State.ALIGNED not in states
+    severity, words = aligner.take_events()[-1]
+    assert severity is Severity.ERROR and words.startswith('FAULT: ')
     assert 'm/s^2' in aligner.status().reason
     assert aligner.declared is None
 

@@ -15,6 +15,7 @@
 
 from copy import deepcopy
 from itertools import groupby
+import re
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
@@ -317,4 +318,23 @@ def test_reset_in_the_middle(tmp_path):
     check_attitude(first, simulation)
     check_attitude(second, simulation)
     assert listener.count('resets') == 1
-    assert 'requested by service' in node.output
+    assert severities(node, 'ALIGNED: ') == ['INFO', 'INFO']
+    assert severities(node, 'alignment starts over: requested by service') == ['WARN']
+
+
+def test_accelerations_in_g_are_an_error(tmp_path):
+    messages = simulated_messages(flight(duration=12.0))
+    for _, topic, msg in messages:
+        if topic == IMU:
+            force = msg.linear_acceleration
+            force.x, force.y, force.z = force.x / 9.8, force.y / 9.8, force.z / 9.8
+    with Listener() as listener, running_node(PARAMETERS) as node:
+        listener.wait_for(lambda: listener.statuses)
+        play(script_of(messages), tmp_path, RATE)
+        listener.wait_for(lambda: listener.status['state'] == 'FAULT')
+    assert severities(node, 'FAULT: ') == ['ERROR']
+
+
+def severities(node, text):
+    """Return how the log shows the lines that begin with a text."""
+    return re.findall(rf'\[(\w+)\] \[[\d.]+\] \[ins_align\]: {text}', node.output)
