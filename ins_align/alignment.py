@@ -162,10 +162,10 @@ class Alignment:
         measured = epoch.v_n is not None or epoch.position_measured
         if measured:
             self._measured_ns = stamp_ns
+        silent_s = (stamp_ns - self._measured_ns) * 1e-9
         if initial is None or current is None:
             self._initial = self.current = None
-            verdict = Verdict(State.ALIGNING, f'{fit.offered} GNSS epochs so far: more are '
-                                              'needed')
+            verdict = self._declaration.update_without_attitude(silent_s, fit)
         else:
             if measured:
                 verdict = self._declaration.update(time_s, initial[1], current[1], fit,
@@ -173,8 +173,8 @@ class Alignment:
                 if self._declaration.later_start:
                     method.renew()
             else:
-                verdict = self._declaration.update_without_gnss(
-                    (stamp_ns - self._measured_ns) * 1e-9, initial[1], current[1], fit)
+                verdict = self._declaration.update_without_gnss(silent_s, initial[1], current[1],
+                                                                fit)
             scale = fit.factor ** 2 if math.isfinite(fit.factor) else 1.0
             self._initial = Attitude(method.t0_ns, initial[0], initial[1] * scale)
             self.current = Attitude(stamp_ns, current[0], current[1] * scale)

@@ -77,6 +77,8 @@ class Declaration:
         self.later_start = False
         self.contradicted = False
         self._against = ''                  # what spoke against it when it was judged last
+        self._contradiction = ''            # when there was redundancy last
+        self._offered = 0                   # epochs until then
         self._recent_nis = 1.0
         self._rejected = 0
 
@@ -105,7 +107,9 @@ class Declaration:
         nis = fit.innovation.nis
         if math.isfinite(nis):
             self._recent_nis += (min(nis, 10.0) - self._recent_nis) / RECENT
-        contradiction = self._contradiction(fit)
+        contradiction = self._contradicted_by(fit)
+        if fit.dof >= MIN_DOF:
+            self._contradiction, self._offered = contradiction, fit.offered
         self.contradicted = bool(contradiction)
         tilt, heading = _sigmas_deg(initial, fit.factor)
         tilt_now, heading_now = _sigmas_deg(current, fit.factor)
@@ -150,14 +154,19 @@ class Declaration:
         Verdict
 
         """
-        silence = f'no GNSS for {silent_s:.0f} s'
         if silent_s > MAX_SILENCE:
             self._level_since_s = self._heading_since_s = None
         tilt, heading = (max(worse) for worse in zip(*(
             _sigmas_deg(P, fit.factor) for P in (initial, current))))
         self._withdraw_lost(tilt, heading)
         verdict = self._verdict(tilt, heading, fit)
-        return Verdict(verdict.state, f'{self._against or verdict.reason}; {silence}')
+        return Verdict(verdict.state,
+                       f'{self._against or verdict.reason}{_silence(silent_s)}')
+
+    def update_without_attitude(self, silent_s: float, fit: Fit) -> Verdict:
+        """Judge an epoch at which there is no attitude yet; parameters as above."""
+        return Verdict(State.ALIGNING,
+                       self._too_few(fit) + (_silence(silent_s) if silent_s else ''))
 
     def withdraw(self) -> None:
         """Withdraw all that is declared; what was good until now counts no more."""
@@ -177,7 +186,7 @@ class Declaration:
             return Verdict(State.ALIGNED, f'heading sigma {heading:.2g} deg, '
                                           f'tilt sigma {tilt:.2g} deg{_noise(fit)}')
         if fit.dof < MIN_DOF:
-            return Verdict(State.ALIGNING, f'{fit.offered} GNSS epochs so far: more are needed')
+            return Verdict(State.ALIGNING, self._too_few(fit))
         if tilt > config.tilt_std_threshold and not self.levelled:
             return Verdict(State.ALIGNING,
                            f'tilt sigma {_above(tilt, config.tilt_std_threshold)}: wait, or turn '
@@ -192,10 +201,16 @@ class Declaration:
         return Verdict(state, f'heading sigma {heading:.2g} deg is good enough: it has to hold '
                               f'for {config.hold_time:g} s')
 
+    def _too_few(self, fit: Fit) -> str:
+        """Return what is missing where there is no redundancy, at a start or a later one."""
+        if self._contradiction:
+            return f'{self._contradiction}; it has started over'
+        return f'{fit.offered - self._offered} GNSS epochs so far: more are needed'
+
     def _held(self, since_s: float | None, time_s: float) -> bool:
         return since_s is not None and time_s - since_s >= self.config.hold_time - 1e-6
 
-    def _contradiction(self, fit: Fit) -> str:
+    def _contradicted_by(self, fit: Fit) -> str:
         """Return what in the data contradicts the model; empty when nothing does."""
         if fit.dof < MIN_DOF:
             return ''
@@ -214,6 +229,10 @@ class Declaration:
                     'allows: check the lever arm, the GNSS delay, the velocity frame, the IMU '
                     'axes and signs, the covariances that the receiver states')
         return ''
+
+
+def _silence(silent_s: float) -> str:
+    return f'; no GNSS for {silent_s:.0f} s'
 
 
 def _noise(fit: Fit) -> str:

@@ -306,6 +306,23 @@ def test_nothing_is_contradicted_without_redundancy(dof):
     assert not declaration.contradicted
 
 
+def test_a_later_start_remembers_what_contradicted_the_one_before():
+    declaration = Declaration(Config())
+    judge(declaration, 0.0, 3.0, GOOD, fit(objection='another lever arm', offered=650))
+    few = fit(dof=5, offered=653)
+    words = 'another lever arm; it has started over'
+    assert declaration.update_without_attitude(0.0, few) == Verdict(State.ALIGNING, words)
+    assert declaration.update(3.2, GOOD, GOOD, few, str) == Verdict(State.ALIGNING, words)
+    assert not declaration.contradicted
+    assert declaration.update_without_gnss(4.0, GOOD, GOOD, few).reason == (
+        f'{words}; no GNSS for 4 s')
+    judge(declaration, 3.4, 0.0, GOOD, fit(offered=660))
+    few = fit(dof=5, offered=663)
+    assert declaration.update_without_attitude(0.0, few).reason == (
+        '3 GNSS epochs so far: more are needed')
+    assert declaration.update_without_attitude(4.0, few).reason.endswith('needed; no GNSS for 4 s')
+
+
 def test_not_before_the_linearisation_has_settled():
     assert judge(Declaration(Config()), 0.0, 10.0, GOOD,
                  fit(converged=False)).state is State.ALIGNING
