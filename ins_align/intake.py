@@ -38,7 +38,11 @@ DRY_INTERVAL_NS = 2_000_000_000
 NO_VELOCITY_NS = 2_000_000_000
 # The IMU samples of a run of epochs that are handled at one go, and what an epoch costs beside.
 MAX_RUN_SAMPLES, EPOCH_SAMPLES = 4096, 16
-# Positions that are left out, as they are counted, and why.
+# IMU samples and positions that are left out, as they are counted, and why.
+_IMU_LEFT_OUT = {'imu_undecodable': 'that cannot be decoded',
+                 'imu_nan': 'without numbers or with impossible ones',
+                 'imu_duplicate': 'with the stamp of another (does the driver set stamps?)',
+                 'imu_late': 'too late'}
 _LEFT_OUT = {'fix_no_fix': 'without a fix', 'fix_nan': 'without numbers',
              'fix_late': 'later than gnss_lateness allows', 'fix_ahead': 'far ahead of the IMU'}
 _NO_SAMPLE = f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s'
@@ -236,6 +240,8 @@ class Intake:
         """
         self.imu.consolidate(last)
         if self.imu.newest_ns is None or self.imu.stamps.size < 4:
+            if left_out := self._left_out(_IMU_LEFT_OUT):
+                self._wait(State.WAITING_FOR_IMU, f'no IMU sample of use yet: {left_out}')
             return
         stamps = self.imu.stamps
         # Interpolation at an epoch wants two samples after it, and whether they are spikes shows
@@ -270,10 +276,13 @@ class Intake:
 
     def _no_position(self) -> str:
         """Say that there is no position, and what has become of those that came."""
-        left_out = ', '.join(
-            f'{count} {why}' for name, why in _LEFT_OUT.items()
-            if (count := self.counts[name] - self._counts_before[name]))
+        left_out = self._left_out(_LEFT_OUT)
         return 'no GNSS position yet' + (left_out and f': {left_out}')
+
+    def _left_out(self, reasons: dict[str, str]) -> str:
+        """List what was left out for these reasons since it started to wait."""
+        return ', '.join(f'{count} {why}' for name, why in reasons.items()
+                         if (count := self.counts[name] - self._counts_before[name]))
 
     def _dry_epochs(self, upto_ns: int) -> None:
         """Go on without GNSS up to a stamp in steps of bounded length."""

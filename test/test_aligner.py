@@ -231,6 +231,27 @@ def test_why_velocities_were_refused_is_said_while_they_are_waited_for(flight):
     assert aligner.take_events().count((Severity.WARNING, 'in the wrong axes')) == 1
 
 
+@pytest.mark.parametrize('stamps, rate, words', [
+    (np.zeros(200, int), 0.1, '199 with the stamp of another (does the driver set stamps?)'),
+    (np.arange(200) * SECOND // 100, math.nan, '200 without numbers or with impossible ones')])
+@pytest.mark.parametrize('at_once', (False, True))
+def test_why_no_imu_sample_is_of_use_is_said(stamps, rate, words, at_once):
+    aligner = Aligner()
+    aligner.update()
+    assert aligner.status().reason == 'no IMU sample yet'
+    gyro, accel = np.full((200, 3), rate), np.full((200, 3), 5.0)
+    if at_once:
+        aligner.add_imu(stamps, gyro, accel)
+        aligner.update()
+    else:
+        for sample in zip(stamps.tolist(), gyro, accel):
+            aligner.add_imu(*sample)
+            aligner.update()
+    status = aligner.status()
+    assert status.state is State.WAITING_FOR_IMU
+    assert status.reason == f'no IMU sample of use yet: {words}'
+
+
 def test_why_messages_were_refused_is_forgotten_when_others_come(flight):
     aligner = Aligner(config_for(flight))
     aligner.reject('velocity_body_frame', 'in the wrong axes')
