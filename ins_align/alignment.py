@@ -85,6 +85,7 @@ class Alignment:
         self._verdict = _NOTHING_YET
         self._start_ns = 0                          # the first t0 since it started over
         self._measured_ns = 0                       # the last epoch with a measurement
+        self._without_velocity = ''                 # why none that came was of use
         self._initial: Attitude | None = None
         self._stamp_ns: int | None = None
         self._time_to_align_s: float | None = None
@@ -114,6 +115,7 @@ class Alignment:
     def _start(self, step: Start) -> Epoch:
         epoch = step.first.epoch
         self._start_ns = epoch.stamp_ns
+        self._without_velocity = step.without_velocity
         if self._first_t0_ns is None:
             self._first_t0_ns = epoch.stamp_ns
         if self.config.method == 'map':
@@ -182,6 +184,11 @@ class Alignment:
         if fault:
             self._declaration.withdraw()
             verdict = Verdict(State.FAULT, fault)
+        if epoch.v_n is not None:
+            self._without_velocity = ''
+        if self._without_velocity:
+            verdict = Verdict(verdict.state, f'{verdict.reason}; no GNSS velocity is used: '
+                                             f'{self._without_velocity}')
         method.judged(self._declaration.contradicted or bool(fault), verdict.state)
         if verdict.state is State.ALIGNED and self.declared is None:
             self.declared = self._initial

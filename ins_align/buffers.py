@@ -264,6 +264,12 @@ class GnssBuffer:
     pair_ns : int
         A fix and a velocity that are no further apart are of one epoch; 0: where the stamp is one.
 
+    Attributes
+    ----------
+    off_ns : dict
+        Of ``fix_late``, ``fix_ahead``, ``velocity_late``, ``velocity_ahead``: how far from the
+        newest IMU sample the last one was.
+
     """
 
     def __init__(self, lateness_ns: int, counts: Counter[str], pair_ns: int = 0) -> None:
@@ -273,6 +279,7 @@ class GnssBuffer:
         self._pair_ns = pair_ns
         self._pending: dict[int, GnssEpoch] = {}
         self._said: tuple[float, ...] = ()          # position and velocity, released last
+        self.off_ns: dict[str, int] = {}
 
     def add_fix(self, fix: Fix, imu_newest_ns: int | None) -> None:
         """Take a position, or count why not."""
@@ -305,11 +312,11 @@ class GnssBuffer:
     def _epoch(self, stamp_ns: int, imu_newest_ns: int | None, kind: str) -> GnssEpoch | None:
         """Return the pending epoch of a stamp; None and a count when it cannot be used."""
         if imu_newest_ns is not None:
-            if stamp_ns < imu_newest_ns - self._lateness_ns:
-                self._counts[f'{kind}_late'] += 1
-                return None
-            if stamp_ns > imu_newest_ns + MAX_AHEAD_NS:
-                self._counts[f'{kind}_ahead'] += 1
+            late = stamp_ns < imu_newest_ns - self._lateness_ns
+            if late or stamp_ns > imu_newest_ns + MAX_AHEAD_NS:
+                reason = f'{kind}_late' if late else f'{kind}_ahead'
+                self._counts[reason] += 1
+                self.off_ns[reason] = abs(stamp_ns - imu_newest_ns)
                 return None
         if len(self._pending) >= MAX_PENDING:
             oldest = min(self._pending)

@@ -38,13 +38,18 @@ DRY_INTERVAL_NS = 2_000_000_000
 NO_VELOCITY_NS = 2_000_000_000
 # The IMU samples of a run of epochs that are handled at one go, and what an epoch costs beside.
 MAX_RUN_SAMPLES, EPOCH_SAMPLES = 4096, 16
-# IMU samples and positions that are left out, as they are counted, and why.
+# IMU samples and GNSS messages that are left out, as they are counted, and why.
 _IMU_LEFT_OUT = {'imu_undecodable': 'that cannot be decoded',
                  'imu_nan': 'without numbers or with impossible ones',
                  'imu_duplicate': 'with the stamp of another (does the driver set stamps?)',
                  'imu_late': 'too late'}
-_LEFT_OUT = {'fix_no_fix': 'without a fix', 'fix_nan': 'without numbers',
-             'fix_late': 'later than gnss_lateness allows', 'fix_ahead': 'far ahead of the IMU'}
+_GNSS_LEFT_OUT = {'no_fix': 'without a fix', 'undecodable': 'that cannot be decoded',
+                  'nan': 'without numbers',
+                  'late': 'further behind the IMU than gnss_lateness allows',
+                  'ahead': 'far ahead of the IMU'}
+_FIX_LEFT_OUT, _VELOCITY_LEFT_OUT = (
+    {f'{kind}_{name}': why for name, why in _GNSS_LEFT_OUT.items()}
+    for kind in ('fix', 'velocity'))
 _NO_SAMPLE = f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s'
 
 
@@ -69,12 +74,15 @@ class Start:
         Of no length, at the epoch.
     use_position : bool
         Whether positions are measurements to align with.
+    without_velocity : str
+        Why velocities that came are of no use.
 
     """
 
     first: Located
     imu: ImuSteps
     use_position: bool
+    without_velocity: str = ''
 
 
 @dataclass(frozen=True)
@@ -276,13 +284,18 @@ class Intake:
 
     def _no_position(self) -> str:
         """Say that there is no position, and what has become of those that came."""
-        left_out = self._left_out(_LEFT_OUT)
+        left_out = self._left_out(_FIX_LEFT_OUT)
         return 'no GNSS position yet' + (left_out and f': {left_out}')
 
     def _left_out(self, reasons: dict[str, str]) -> str:
         """List what was left out for these reasons since it started to wait."""
-        return ', '.join(f'{count} {why}' for name, why in reasons.items()
+        return ', '.join(f'{count} {why}{self._off(name)}' for name, why in reasons.items()
                          if (count := self.counts[name] - self._counts_before[name]))
+
+    def _off(self, name: str) -> str:
+        """Return how far a message was from the IMU, where that is why it was left out."""
+        off_ns = self._gnss.off_ns.get(name)
+        return '' if off_ns is None else f' (the last one by {off_ns * 1e-9:.1f} s)'
 
     def _dry_epochs(self, upto_ns: int) -> None:
         """Go on without GNSS up to a stamp in steps of bounded length."""
@@ -365,9 +378,10 @@ class Intake:
         wanted = config.use_velocity is not False
         alone = (not wanted or (config.use_velocity == 'auto' and config.method != 'vif'
                                 and epoch.stamp_ns - self._first_fix_ns >= NO_VELOCITY_NS))
+        no_velocity = self._refusal or self._left_out(_VELOCITY_LEFT_OUT)
         if epoch.v_n is None and not alone:
-            refusal = f': {self._refusal}' if self._refusal else ''
-            self._wait(State.WAITING_FOR_GNSS, f'no GNSS velocity yet{refusal}')
+            self._wait(State.WAITING_FOR_GNSS,
+                       'no GNSS velocity yet' + (no_velocity and f': {no_velocity}'))
             return
         use_position = config.use_position
         if use_position == 'auto':
@@ -384,7 +398,8 @@ class Intake:
             return
         self._last_ns = epoch.stamp_ns
         imu = self._cutter.start(epoch.stamp_ns)
-        self.steps.append(Start(located, imu, bool(use_position)))
+        self.steps.append(Start(located, imu, bool(use_position),
+                                no_velocity if wanted and epoch.v_n is None else ''))
 
     def _lose(self, why: str) -> None:
         """Let the alignment start over; biases are kept."""

@@ -212,8 +212,48 @@ def test_positions_that_are_left_out_are_told_in_the_reason(flight):
         aligner.add_fix(flight.fix(k))
         aligner.add_fix(flight.fix(28)._replace(status=-1))
     aligner.update()
-    assert aligner.status().reason == ('no GNSS position yet: 10 without a fix, '
-                                       '10 later than gnss_lateness allows')
+    assert aligner.status().reason == (
+        'no GNSS position yet: 10 without a fix, '
+        '10 further behind the IMU than gnss_lateness allows (the last one by 4.2 s)')
+
+
+@pytest.mark.parametrize('off_s, words', [
+    (37.0, '50 far ahead of the IMU (the last one by'),
+    (-18.0, '50 further behind the IMU than gnss_lateness allows (the last one by')])
+def test_how_far_the_clocks_are_apart_is_said(flight, off_s, words):
+    aligner = Aligner(config_for(flight))
+    aligner.add_imu(flight.imu_stamps_ns[:1000], flight.gyro[:1000], flight.accel[:1000])
+    for k in range(50):
+        fix = flight.fix(k)
+        aligner.add_fix(fix._replace(stamp_ns=fix.stamp_ns + round(off_s * SECOND)))
+    aligner.update()
+    reason = aligner.status().reason
+    behind_s = (flight.imu_stamps_ns[999] - flight.gnss_stamps_ns[49]) * 1e-9
+    assert f'{words} {abs(off_s - behind_s):.1f} s)' in reason
+
+
+@pytest.mark.parametrize('without', ('numbers', 'axes'))
+def test_velocities_of_no_use_are_told_also_where_positions_do(flight, without):
+    aligner = Aligner(config_for(flight))
+    for k in range(60):
+        aligner.add_fix(flight.fix(k))
+        if without == 'axes':
+            aligner.reject('velocity_body_frame', 'in the wrong axes')
+        else:
+            aligner.add_velocity(flight.velocity_measurement(k)._replace(
+                velocity=np.full(3, np.nan)))
+    aligner.add_imu(flight.imu_stamps_ns[:1200], flight.gyro[:1200], flight.accel[:1200])
+    aligner.update()
+    status = aligner.status()
+    assert status.state is State.ALIGNING and status.counts['epochs_used'] > 20
+    assert '; no GNSS velocity is used: ' + (
+        'in the wrong axes' if without == 'axes' else '60 without numbers') in status.reason
+    for k in range(60, 100):
+        aligner.add_fix(flight.fix(k))
+        aligner.add_velocity(flight.velocity_measurement(k))
+    aligner.add_imu(flight.imu_stamps_ns[1200:], flight.gyro[1200:], flight.accel[1200:])
+    aligner.flush()
+    assert 'no GNSS velocity' not in aligner.status().reason
 
 
 def test_why_velocities_were_refused_is_said_while_they_are_waited_for(flight):
