@@ -38,6 +38,9 @@ from ins_align.topic_survey import KINDS, MAX_ASTRAY, read_candidates, Recorded,
 import numpy as np
 
 MAX_LATENESS = 60.0  # s, the limit of the parameter gnss_lateness
+MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
+MIN_AHEAD = 0.3  # s: GNSS stamps this far ahead of the IMU's are no jitter
+MIN_START = 5.0  # s that an alignment starts before a manoeuvre
 MAX_NO_FIX = 0.1  # share of positions without a fix that is worth a word
 FRAMES_THAT_FIT = ('enu', 'ned')
 
@@ -160,7 +163,8 @@ class _Survey:
         faults = []
         count = data.stamps_ns.size
         if count and not data.usable.any():
-            faults.append('no message has a fix')
+            faults.append('no message has a fix' if data.no_fix == count else
+                          'no message has a fix and numbers that can be used')
         return self._topic(data, faults, **_stated(data),
                            no_fix_share=data.no_fix / count if count else None)
 
@@ -176,10 +180,14 @@ class _Survey:
             faults += _frame_faults(frame)
             values = data.values[data.usable]
             absent = bool((values[:, 2] == 0.0).all() and (values[:, :2] != 0.0).any())
+        elif data.stamps_ns.size:
+            faults.append('no message has numbers that can be used')
         return self._topic(data, faults, **_stated(data), frame=frame, vertical_absent=absent)
 
     def _imu(self, data: Recorded, motion: Series, gravity: float) -> TopicInfo:
-        faults = list(data.refusals)
+        faults = []
+        if data.unmeasured and len(self._of('imu')) > 1:
+            faults.append(_says_unmeasured(data))
         times = data.times(self._start_ns)[data.usable]
         # Of one stamp the first counts, as in an alignment.
         times, first = np.unique(times, return_index=True)
@@ -191,6 +199,10 @@ class _Survey:
             faults += facts.faults
         elif data.stamps_ns.size:
             faults.append('it has too few usable samples')
+        timing = data.timing(self._start_ns)
+        if timing.rate_hz is not None and timing.rate_hz < MIN_RATE:
+            faults.append(f'its rate is {timing.rate_hz:.2g} Hz: an alignment starts over after '
+                          f'{MAX_GAP_NS * 1e-9:g} s without a sample')
         return self._topic(data, faults, imu=facts)
 
     def _series(self, data: Recorded) -> Series:
@@ -248,6 +260,10 @@ class _Survey:
             return
         facts, timing = imu.imu, imu.timing
         self._notes.extend(facts.too_small)
+        data = self._data[imu.name]
+        if data.unmeasured and not imu.faults:
+            self._notes.append(f'{imu.name}: {_says_unmeasured(data)}; its numbers are used all '
+                               'the same (covariances that are not known are 0)')
         if timing.longest_gap is not None and timing.longest_gap.duration_s > MAX_GAP_NS * 1e-9:
             self._notes.append(
                 f'the IMU is silent for {timing.longest_gap.duration_s:.1f} s at '
@@ -295,10 +311,24 @@ class _Survey:
                                    f'{"behind" if age > imu_age else "ahead of"} those of '
                                    f'{imu.name}: they are of different clocks')
             return
+        self._advise_delay(chosen, imu.timing.stamp_age_s)
         if lateness is not None and Config.gnss_lateness < lateness < MAX_LATENESS:
             self._settings.append(f'gnss_lateness={math.ceil(2.0 * lateness) / 2.0 + 0.5:g}')
             self._notes.append(f'GNSS messages come up to {lateness:.1f} s later than newer IMU '
-                               'samples')
+                               'samples; if it is their clock that is behind, and not the '
+                               f'messages, set gnss_delay={-lateness:.1f} instead')
+
+    def _advise_delay(self, chosen: dict[str, TopicInfo | None], imu_age: float | None) -> None:
+        """See whether GNSS messages are recorded before they could have been measured."""
+        ages = [topic.timing.stamp_age_s for topic in (chosen['fix'], chosen['velocity'])
+                if topic is not None and topic.timing.stamp_age_s is not None]
+        if not ages or imu_age is None or imu_age - max(ages) < MIN_AHEAD:
+            return
+        ahead = imu_age - max(ages)
+        self._settings.append(f'gnss_delay={ahead:.1f}')
+        self._notes.append(f'the stamps of GNSS messages are {ahead:.1f} s ahead of those of the '
+                           'IMU: their clocks differ, which gnss_delay puts right as far as '
+                           'messages were recorded at once')
 
     def _command(self, chosen: dict[str, TopicInfo | None]) -> str | None:
         """Return the command, tried as far as its choice of topics goes."""
@@ -419,8 +449,10 @@ def _motion_lines(found: Manoeuvres | None) -> list[str]:
         for start in found.starts:
             if start - apart[-1] > MANOEUVRE_TIME:
                 apart.append(start)
-        lines.append(f'    changes by {MANOEUVRE_SPEED:g} m/s: {len(found.starts)}; --start a few '
-                     f'seconds before one of them, at {_listing(apart)} s')
+        lines.append(f'    changes by {MANOEUVRE_SPEED:g} m/s: {len(found.starts)}, at '
+                     f'{_listing(apart)} s')
+        if apart[0] > MIN_START:
+            lines[-1] += f'; --start {apart[0] - MIN_START:.0f} leaves out what came before'
     return lines
 
 
@@ -439,6 +471,11 @@ def _stated(data: Recorded) -> dict[str, Any]:
         return {'covariance_share': 0.0 if stated.size else None}
     horizontal, vertical = np.median(data.sigmas[stated], axis=0).tolist()
     return {'covariance_share': float(np.mean(stated)), 'sigma': (horizontal, vertical)}
+
+
+def _says_unmeasured(data: Recorded) -> str:
+    return (f'its messages say that it does not measure {" and ".join(data.unmeasured)} '
+            '(covariance -1)')
 
 
 def _frame_faults(frame: VelocityFrame) -> list[str]:

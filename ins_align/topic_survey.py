@@ -85,6 +85,7 @@ class Recorded:
         self.no_fix = 0
         self.undecodable = 0
         self.refusals: Counter[str] = Counter()  # why messages cannot be used, in words
+        self.unmeasured: list[str] = []  # what an IMU says that it does not measure
         self._rows: list[tuple[Any, ...]] = []
         self._config = Config(velocity_type=topic.msgtype.rsplit('/', 1)[-1]
                               if kind == 'velocity' else Config.velocity_type)
@@ -92,7 +93,7 @@ class Recorded:
     def add(self, times_ns: list[int], messages: list[bytes]) -> None:
         """Decode messages."""
         if self.kind == 'imu':
-            if not self._rows and not self.refusals:
+            if not self._rows:
                 self._look_at(messages[0])
             samples = decode_imu(messages, self.topic)
             self.undecodable += int(np.count_nonzero(~samples.decoded))
@@ -184,10 +185,9 @@ class Recorded:
             message = deserialize(data, self.topic)
         except MessageError:
             return
-        if -1.0 in (message.angular_velocity_covariance[0],
-                    message.linear_acceleration_covariance[0]):
-            self.refusals['its messages say that it does not measure rate or specific force '
-                          '(covariance -1)'] = 0
+        self.unmeasured = [what for what, covariance in (
+            ('angular rate', message.angular_velocity_covariance),
+            ('specific force', message.linear_acceleration_covariance)) if covariance[0] == -1.0]
 
     def _add_gnss(self, time_ns: int, message: Fix | Velocity) -> None:
         if isinstance(message, Fix):

@@ -21,6 +21,7 @@ import shlex
 from ins_align.bag_files import BagError
 from ins_align.bags import Bag
 from ins_align.cli import main
+from ins_align.config import Config
 from ins_align.decoding import deserialize
 from ins_align.info import describe, inspect
 from ins_align.motion_survey import (
@@ -310,6 +311,77 @@ def test_silence_after_which_an_alignment_starts_over(changed, drive, silence, w
     notes = [note for note in inspect(path).notes if 'starts over' in note]
     assert len(lost) == len(notes) == bool(word)
     assert all(word in note for note in notes)
+
+
+def test_a_start_is_advised_where_there_is_something_to_leave_out(drive, tmp_path):
+    info = inspect(drive[0])
+    assert f'--start {info.manoeuvres.starts[0] - 5.0:.0f} leaves out' in describe(info)
+    write_bag(simulate('car', seed=1, duration=30.0), tmp_path / 'a')
+    info = inspect(tmp_path / 'a')
+    assert info.manoeuvres.starts[0] < 5.0 and '--start' not in describe(info)
+
+
+def test_velocities_without_numbers_are_left_out(changed):
+    info = inspect(changed(velocity_changed(lambda *_: [math.nan] * 3)))
+    assert by_name(info, '/fix_velocity').faults == ('no message has numbers that can be used',)
+    assert command_of(info) == ['--set', 'use_velocity=false']
+    assert 'positions alone' in info.notes[0] and info.heading.startswith('yes')
+
+
+def test_an_imu_that_is_too_slow(changed, drive):
+    start = drive[1][0][1]
+    info = inspect(changed(lambda name, time, message: [] if name == '/imu/data_raw' and (
+        (time - start) % 1_000_000_000 >= 10_000_000) else [(name, time, message)]))
+    assert info.command is None and 'its rate is 1 Hz' in info.obstacles[0]
+
+
+@pytest.mark.parametrize('ahead, setting', [(3, 'gnss_delay=3.0'), (-3, 'gnss_lateness=3.5')])
+def test_clocks_some_seconds_apart(changed, ahead, setting):
+    def change(name, time, message):
+        if name != '/imu/data_raw':
+            message.header.stamp.sec += ahead
+        return [(name, time, message)]
+
+    path = changed(change)
+    info = inspect(path)
+    assert command_of(info)[2:] == ['--set', setting]
+    note, = info.notes
+    assert '3.0 s' in note and 'gnss_delay' in note
+    config = Config(imu_grade='tactical', gnss_delay=float(ahead))
+    assert f'gnss_delay={ahead:.1f}' in f'{note} {setting}' and replay(path, config).aligned
+
+
+def test_an_imu_that_says_it_does_not_measure(changed):
+    """Where it is the only one it is read all the same, as by `replay`."""
+    def change(name, time, message):
+        if name == '/imu/data_raw':
+            covariance = message.angular_velocity_covariance.copy()
+            covariance[0] = -1.0
+            message = dataclasses.replace(message, angular_velocity_covariance=covariance)
+        return [(name, time, message)]
+
+    def with_another(name, time, message):
+        return change(name, time, message) + (
+            [('/imu', time, message)] if name == '/imu/data_raw' else [])
+
+    path = changed(change)
+    info = inspect(path)
+    assert command_of(info) == ['--set', 'imu_grade=tactical']
+    assert 'does not measure angular rate (covariance -1)' in info.notes[0]
+    assert replay(path).aligned
+    two = inspect(changed(with_another, name='two', topics={**TOPICS, '/imu': IMU}))
+    assert two.chosen['imu'] == '/imu' and two.notes == ()
+    assert 'does not measure' in by_name(two, '/imu/data_raw').faults[0]
+
+
+def test_fixes_without_numbers(changed):
+    def change(name, time, message):
+        if name == '/fix':
+            message.altitude = math.nan
+        return [(name, time, message)]
+
+    info = inspect(changed(change))
+    assert info.command is None and 'numbers that can be used' in info.obstacles[0]
 
 
 def test_nothing_has_a_fix(changed):
