@@ -30,7 +30,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import QuaternionStamped, TwistStamped, TwistWithCovarianceStamped
 from ins_align.aligner import Aligner, Attitude, State, Status
 from ins_align.config import (
-    Config, config_from_mapping, ConfigError, NODE_NAME, Parameter as ParameterInfo, parameters)
+    Config, config_from_mapping, ConfigError, no_effect, NODE_NAME, Parameter as ParameterInfo,
+    parameters)
 from ins_align.imu_bytes import ImuSample, read_imu, with_orientation
 from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
 from ins_align.prediction import Follower, Prediction
@@ -406,7 +407,7 @@ class AlignmentNode(Node):
         for name in given.keys() - RCLPY_PARAMETERS:
             # A parameter file for many nodes is not wrong, a slip of the pen must not pass unseen.
             if name not in names and not name.startswith('qos_overrides.'):
-                self.get_logger().warning(f'parameter {name!r} is not known and has no effect')
+                self.get_logger().warning(f'parameter {name!r} {no_effect(name)}')
             self.undeclare_parameter(name)
         for own in known:
             self.declare_parameter(own.name, getattr(config, own.name), parameter_descriptor(own),

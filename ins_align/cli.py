@@ -431,7 +431,7 @@ def _write_json(path: str, content: Any) -> None:
 
 def _config(arguments: argparse.Namespace) -> Config:
     from ins_align.config import (
-        config_from_mapping, ConfigError, load_params, parameters, parse_override)
+        config_from_mapping, ConfigError, load_params, no_effect, parameters, parse_override)
 
     known = {parameter.name for parameter in parameters()}
     try:
@@ -440,7 +440,7 @@ def _config(arguments: argparse.Namespace) -> Config:
             # As the node has it: a file for many nodes is not wrong, a slip must not pass unseen.
             with _readers_may_leave(sys.stderr):
                 print(f'ins_align {arguments.command}: warning: parameter {name!r} of '
-                      f'{arguments.params} is not known and has no effect', file=sys.stderr)
+                      f'{arguments.params} {no_effect(name)}', file=sys.stderr)
             del values[name]
         values.update(parse_override(text) for text in arguments.overrides)
         return config_from_mapping(values)

@@ -183,6 +183,13 @@ class Config:
         if self.method == 'vif' and self.use_velocity is False:
             raise ConfigError('method vif needs velocities, but use_velocity is false: set it to '
                               'auto or true, or use the method pif or map')
+        if self.use_position is True and (self.method == 'vif' or (
+                self.method == 'pif' and self.use_velocity is not False)):
+            raise ConfigError(
+                f'method {self.method} does not align with positions beside velocities, but '
+                'use_position is true: set it to auto, '
+                + ('' if self.method == 'vif' else 'or use_velocity to false, ')
+                + 'or use the method map')
         if self.imu_grade == 'custom':
             missing = [name for name in ImuNoise._fields[:4] if getattr(self, name) == 0.0]
             if missing:
@@ -233,11 +240,22 @@ def config_from_mapping(values: Mapping[str, Any]) -> Config:
     known = [field.name for field in dataclasses.fields(Config)]
     for name in values:
         if name not in known:
-            close = difflib.get_close_matches(str(name), known)
-            hint = f'did you mean {" or ".join(close)}?' if close else \
-                f'the parameters are {", ".join(known)}'
+            hint = _did_you_mean(name) or f'the parameters are {", ".join(known)}'
             raise ConfigError(f'unknown parameter {reprlib.repr(name)}: {hint}')
     return Config(**values)
+
+
+def no_effect(name: str) -> str:
+    """Say of a parameter of another node, or a slip of the pen, that it has no effect."""
+    hint = _did_you_mean(name)
+    return 'is not known and has no effect' + (hint and f': {hint}')
+
+
+def _did_you_mean(name: str) -> str:
+    """Ask for the parameters that come close to a name; empty where none does."""
+    close = difflib.get_close_matches(
+        str(name), [field.name for field in dataclasses.fields(Config)])
+    return f'did you mean {" or ".join(close)}?' if close else ''
 
 
 def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:

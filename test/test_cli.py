@@ -411,9 +411,11 @@ def test_output_without_room(flight, command):
 def test_parameters_of_others_in_a_file_are_told(flight, tmp_path, capsys):
     path = tmp_path / 'many.yaml'
     text = (flight / 'ins_align.yaml').read_text()
-    path.write_text(text + '/**:\n  ros__parameters:\n    map_frame: map\n')
+    path.write_text(
+        text + '/**:\n  ros__parameters:\n    map_frame: map\n    hold_tme: 2.0\n')
     assert main(['replay', str(flight), '--params', str(path)]) == 0
-    assert "parameter 'map_frame'" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "parameter 'map_frame'" in said and 'has no effect: did you mean hold_time?' in said
 
 
 @pytest.mark.parametrize('closed', [1, 2])

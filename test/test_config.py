@@ -112,6 +112,18 @@ def test_contradictions_refused(values):
         Config(**values)
 
 
+@pytest.mark.parametrize('method, use_velocity, refused', [
+    ('vif', 'auto', True), ('pif', 'auto', True), ('pif', True, True), ('pif', False, False),
+    ('map', 'auto', False)])
+def test_positions_that_a_method_would_not_use_are_refused(method, use_velocity, refused):
+    values = {'method': method, 'use_velocity': use_velocity, 'use_position': True}
+    if refused:
+        with pytest.raises(ConfigError, match=f'{method} .*use_position is true'):
+            Config(**values)
+    else:
+        assert Config(**values).use_position is True
+
+
 def test_unknown_parameter_names_the_close_ones():
     with pytest.raises(ConfigError, match="'lever_am'.*did you mean lever_arm"):
         config_from_mapping({'lever_am': [0, 0, 0]})

@@ -110,7 +110,8 @@ def test_parameters_and_status_of_an_idle_node():
     assert {name for name in names if not by_name[name].read_only} == {
         'heading_std_threshold', 'tilt_std_threshold', 'hold_time'}
     assert list(values[0].double_array_value) == [1.0, 2.0, 3.0]
-    assert "parameter 'lever_am' is not known" in node.output
+    assert ("parameter 'lever_am' is not known and has no effect: did you mean lever_arm"
+            in node.output)
 
     for refused, says in ((too_small, 'range'), (word, 'type'), (not_finite, 'nan'),
                           (read_only, 'read-only')):
