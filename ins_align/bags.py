@@ -42,8 +42,10 @@ VELOCITY_TYPES = {
 REFERENCE_NAMESPACE = '/reference/'
 REFERENCE_TOPIC = '/reference/imu'  # truth or the best that is known: to compare with, never input
 
+STORAGE_NAME = re.compile(r'\.(mcap|db3|bag)(\.zstd)?$')  # of the files of a recording
 LOOK_NS = 60_000_000_000  # of a recording in which topics that are left out are looked for
 MAX_METADATA_BYTES = 1 << 24
+_MAGICS = (mcap_file.MAGIC, rosbag1_file.MAGIC, sqlite_file.MAGIC, ZSTD_MAGIC)
 # A compressed file may unpack to this much, or to more at no more than this ratio.
 UNPACKED_BYTES_FREE = 1 << 30
 MAX_UNPACK_RATIO = 200
@@ -178,7 +180,7 @@ class Bag:
         if not self.path.is_dir():
             return [self.path]
         files = sorted((file for file in self.path.iterdir()
-                        if re.search(r'\.(mcap|db3|bag)(\.zstd)?$', file.name)),
+                        if STORAGE_NAME.search(file.name)),
                        key=lambda file: [part.zfill(20) for part in
                                          re.findall(r'\d+|\D+', file.name)])
         names = self._listed_names()
@@ -360,6 +362,15 @@ def _unpacked(path: Path, stack: ExitStack, warnings: list[str]) -> Path:
                                    'which no recording of its size does')
                 output.write(piece)
     return target
+
+
+def begins_like_a_recording(path: Path) -> bool:
+    """Whether there is a file that a recording may lie in, whole or damaged."""
+    try:
+        with open(path, 'rb') as file:
+            return file.read(16).startswith(_MAGICS)
+    except OSError:
+        return False
 
 
 def _open_file(path: Path) -> ChunkedFile | sqlite_file.SqliteFile:

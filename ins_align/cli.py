@@ -332,7 +332,7 @@ def _add_experiment(commands: Any) -> None:
 
 def run_info(arguments: argparse.Namespace) -> int:
     """Run ``ins_align info``."""
-    _check_writable(arguments.json)
+    _check_writable(arguments.json, arguments.bags)
     from ins_align.bag_files import BagError
     from ins_align.info import describe, inspect
 
@@ -365,9 +365,13 @@ def run_replay(arguments: argparse.Namespace) -> int:
     """Run ``ins_align replay``."""
     keep_to_one()
     gc.set_threshold(100_000)  # rows and results by the thousand, none of which is garbage
+    several = len(arguments.bags) > 1
+    labels = _labels(arguments.bags) if several else ['']
     outputs = [path for path in (arguments.json, arguments.csv, arguments.plot) if path]
+    outputs += [_with_label(path, label) for path in (arguments.csv, arguments.plot) if path
+                for label in labels if label]
     for path in outputs:
-        _check_writable(path)
+        _check_writable(path, [*arguments.bags, *filter(None, [arguments.params])])
         if outputs.count(path) > 1:
             raise UsageError(f'{path} is given for two outputs')
     config = _config(arguments)
@@ -376,8 +380,6 @@ def run_replay(arguments: argparse.Namespace) -> int:
     from ins_align.batch import Task
     from ins_align.progress import progress_bar
 
-    several = len(arguments.bags) > 1
-    labels = _labels(arguments.bags) if several else ['']
     tasks = [Task(bag, config, arguments.imu_topic, arguments.fix_topic, arguments.velocity_topic,
                   arguments.start, arguments.duration, _with_label(arguments.csv, label),
                   _with_label(arguments.plot, label))
@@ -462,13 +464,13 @@ def _labels(bags: Sequence[str]) -> list[str]:
 
 
 def _with_label(path: str | None, label: str) -> str | None:
-    if not path or not label:
+    if not path or not label or not Path(path).name:
         return path
     return str(Path(path).with_stem(f'{Path(path).stem}_{label}'))
 
 
-def _check_writable(path: str | None) -> None:
-    """Find out before the work whether its result can be written."""
+def _check_writable(path: str | None, inputs: Sequence[str]) -> None:
+    """Find out before the work whether its result can be written, and spoils no input."""
     if path is None:
         return
     from ins_align.report import is_stream
@@ -477,13 +479,30 @@ def _check_writable(path: str | None) -> None:
         if not os.access(path, os.W_OK):
             raise UsageError(f'cannot write {path}: no permission')
         return
-    folder = Path(os.path.realpath(path)).parent
+    target = Path(os.path.realpath(path))
+    folder = target.parent
+    if spoilt := _spoilt(target, list(map(os.path.realpath, inputs))):
+        raise UsageError(f'cannot write {path}: {spoilt}, choose another name')
     if not folder.is_dir():
         raise UsageError(f'cannot write {path}: there is no directory {folder}')
     if Path(path).is_dir():
         raise UsageError(f'cannot write {path}: it is a directory')
     if not os.access(folder, os.W_OK):
         raise UsageError(f'cannot write {path}: no permission to write to {folder}')
+
+
+def _spoilt(target: Path, inputs: Sequence[str]) -> str:
+    """Say what would be lost if something were written there; both without links."""
+    from ins_align.bags import begins_like_a_recording, STORAGE_NAME
+
+    if str(target) in inputs:
+        return 'it is to be read'
+    if begins_like_a_recording(target):
+        return 'it is a recording and would be lost'
+    if str(target.parent) in inputs and (STORAGE_NAME.search(target.name)
+                                         or target.name == 'metadata.yaml'):
+        return 'it would become a part of the recording around it'
+    return ''
 
 
 def _check_plot(path: str) -> None:

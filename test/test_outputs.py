@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 
+from ins_align.cli import main
 import pytest
 from recordings import (FIX, IMU, make_fix, make_imu, make_twist, START_NS, TWIST, typestore,
                         write_messages, write_recording)
@@ -94,6 +95,55 @@ def test_killed_simulation_leaves_no_recording(tmp_path):
     path = tmp_path / 'flight'
     killed('Path.rename', 'simulate', path, '--duration', '2')
     assert not path.exists()
+
+
+@pytest.mark.parametrize('arguments, reason', [
+    (['info', '--json', 'a.db3', 'b.db3'], 'a.db3: it is a recording and would be lost'),
+    (['replay', '--json', 'a.db3', 'b.db3'], 'a.db3: it is a recording and would be lost'),
+    (['replay', '--csv', 'a.db3', 'b.db3', 'b.db3'], 'a.db3: it is a recording and would be lost'),
+    (['replay', '--json', 'link', 'b.db3'], 'link: it is a recording and would be lost'),
+    (['replay', '--csv', 'x.json', 'a.db3', 'b.db3', '--json', 'x_a.json'],
+     'x_a.json is given for two outputs'),
+    (['replay', '--csv', 'x.json', 'x/a.db3', 'b.db3'],
+     'x_a.json: it is a recording and would be lost'),
+    (['replay', '--json', 'empty', 'empty'], 'empty: it is to be read'),
+    (['replay', '--json', 'p.yaml', 'a.db3', '--params', './p.yaml'], 'p.yaml: it is to be read'),
+    (['replay', '--json', 'x/new.mcap', 'x/'], 'x/new.mcap: it would become a part of the'),
+    (['replay', '--json', 'x/metadata.yaml', 'x'], 'metadata.yaml: it would become a part of')])
+def test_no_output_takes_the_place_of_a_recording(standing, tmp_path, capsys, monkeypatch,
+                                                  arguments, reason):
+    monkeypatch.chdir(tmp_path)
+    content = next(standing.glob('*.db3')).read_bytes()
+    Path('x').mkdir()
+    for name in ('a.db3', 'b.db3', 'x/a.db3'):
+        Path(name).write_bytes(content)
+    if 'x_a.json: it' in reason:
+        Path('x_a.json').write_bytes(content)
+    Path('link').symlink_to('a.db3')
+    Path('empty').touch()
+    Path('p.yaml').write_text('/**: {ros__parameters: {}}')
+    before = {path: path.read_bytes() for path in Path().rglob('*') if path.is_file()}
+    monkeypatch.setattr('ins_align.bags.Bag.__init__', None)  # nothing is read
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert reason in error and error.count('\n') == 1
+    assert {path: path.read_bytes() for path in Path().rglob('*') if path.is_file()} == before
+
+
+@pytest.mark.parametrize('magic', [b'\x89MCAP0\r\n', b'SQLite format 3\x00', b'#ROSBAG V2.0\n',
+                                   b'\x28\xb5\x2f\xfd'])
+def test_recordings_of_every_format_are_spared(standing, tmp_path, capsys, magic):
+    path = tmp_path / 'a.json'
+    path.write_bytes(magic + b'and more')
+    assert main(['info', '--json', str(path), str(standing)]) == 2
+    assert path.read_bytes() == magic + b'and more'
+
+
+def test_other_files_are_replaced(standing, tmp_path, capsys):
+    path = tmp_path / 'a.mcap'
+    path.write_text('{}')
+    assert main(['info', '--json', str(path), str(standing)]) == 0
+    assert json.loads(path.read_text())['topics']
 
 
 # What a recording says
