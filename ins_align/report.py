@@ -22,6 +22,7 @@ import os
 from pathlib import Path
 from typing import Any, IO, TYPE_CHECKING
 
+from ins_align.bag_files import one_line
 from ins_align.results import Epoch, State
 import numpy as np
 
@@ -216,8 +217,8 @@ def plot(result: ReplayResult) -> Figure:
     figure = new_figure(16.0, 11.0)
     status = result.status
     after = '' if status.time_to_align_s is None else f' after {status.time_to_align_s:.1f} s'
-    name = Path(result.bag).name or result.bag
-    figure.suptitle(f'{name}: {status.state.value}{after}', fontsize=13)
+    name = one_line(Path(result.bag).name or result.bag)
+    figure.suptitle(f'{name}: {status.state.value}{after}', fontsize=13, parse_math=False)
     columns = figure.add_gridspec(1, 2, width_ratios=(3, 2))
     left, right = figure.add_subfigure(columns[0]), figure.add_subfigure(columns[1])
     series = _Series(result)
@@ -309,18 +310,20 @@ def _breaks(epochs: Sequence[Epoch], time: np.ndarray) -> np.ndarray:
 def _plot_angles(axes: Axes, series: _Series, lines: tuple[tuple[int, str, str], ...]) -> None:
     if not len(series.time):
         return
+    angles = np.where(series.angle_sigma < LOST_SIGMA_DEG, series.angles, np.nan)
     for column, name, colour in lines:
-        sigma = series.angle_sigma[:, column]
-        angle = np.where(sigma < LOST_SIGMA_DEG, series.angles[:, column], np.nan)
-        axes.plot(*_broken_at_wraps(series.time, angle), color=colour, linewidth=2.0, label=name)
-        limits = axes.get_ylim()
-        axes.fill_between(series.time, angle - sigma, angle + sigma, color=colour, alpha=0.25,
-                          linewidth=0, label='1 sigma', where=_continues(angle))
-        axes.set_ylim(limits)
+        axes.plot(*_broken_at_wraps(series.time, angles[:, column]), color=colour, linewidth=2.0,
+                  label=name)
     if series.reference is not None:
         for number, (column, _, _) in enumerate(lines):
             axes.plot(*_broken_at_wraps(series.time, series.reference[:, column]), color='black',
                       linewidth=0.8, linestyle='--', label=None if number else 'reference')
+    limits = axes.get_ylim()  # the first sigmas would make flat lines of these
+    for column, name, colour in lines:
+        angle, sigma = angles[:, column], series.angle_sigma[:, column]
+        axes.fill_between(series.time, angle - sigma, angle + sigma, color=colour, alpha=0.25,
+                          linewidth=0, label=f'{name}, 1 sigma', where=_continues(angle))
+    axes.set_ylim(limits)
 
 
 def _continues(angle: np.ndarray) -> np.ndarray:

@@ -166,6 +166,27 @@ def test_figure_marks_the_declaration(result):
     assert [line.get_xdata()[0] for line in marks] == [first]
 
 
+def test_figure_shows_every_angle_whole(result):
+    steep = [dataclasses.replace(epoch, current=epoch.current and SimpleNamespace(
+        roll_deg=epoch.current.roll_deg, pitch_deg=epoch.current.pitch_deg + 80.0,
+        yaw_deg=epoch.current.yaw_deg, sigma_deg=epoch.current.sigma_deg))
+        for epoch in result.epochs]
+    reference = SimpleNamespace(errors_deg=lambda attitude: (np.zeros(3), np.full(3, 100.0)))
+    tilt = plot(dataclasses.replace(result, epochs=tuple(steep), reference=reference)).axes[0]
+    low, high = tilt.get_ylim()
+    lines = [line.get_ydata() for line in tilt.lines if len(line.get_xdata()) > 10]
+    assert len(lines) == 4  # two of the reference
+    assert max(map(np.nanmax, lines)) > 75.0 and min(map(np.nanmin, lines)) < -75.0
+    for values in lines:
+        assert low < np.nanmin(values) and np.nanmax(values) < high
+
+
+def test_figure_takes_every_name(result):
+    figure = plot(dataclasses.replace(result, bag='/data/$a_{b_$ \udcff'))
+    drawn(figure)
+    assert figure.get_suptitle().startswith('$a_{b_$ ?: ALIGNED')
+
+
 @pytest.fixture(scope='module')
 def restarted(tmp_path_factory):
     """Replay a drive whose IMU says nothing from 20 s to 21.5 s."""
