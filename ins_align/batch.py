@@ -19,6 +19,7 @@ Here, in other processes of this machine, or on the machines of a Dask cluster.
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -169,9 +170,17 @@ def process_on_cluster(tasks: Sequence[Task], address: str, progress: Callable[[
         raise ClusterError('--dask needs Dask, which is not installed: '
                            'pip install distributed') from None
     try:
+        # A client by itself waits for a stranger for ever.
+        asyncio.run(asyncio.wait_for(_ask_scheduler(address), CONNECT_TIMEOUT))
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
+    except Exception as error:  # strangers answer all kinds of things
         reason = str(error).partition('\n')[0] or type(error).__name__
+        if isinstance(error, asyncio.TimeoutError):
+            reason = f'nothing was heard for {CONNECT_TIMEOUT:g} s'
+        elif isinstance(error, MemoryError):  # for what was taken for a size
+            reason = 'something else does'
+        elif isinstance(error, ValueError):
+            reason += '; an address is like tcp://localhost:8786'
         raise ClusterError(f'no Dask scheduler answers at {address}: {reason}') from None
     with client:
         # Not pure: the same recording twice among the arguments is two tasks.
@@ -187,6 +196,19 @@ def process_on_cluster(tasks: Sequence[Task], address: str, progress: Callable[[
                 progress(index + 1.0)
         finally:
             client.cancel(futures)
+
+
+async def _ask_scheduler(address: str) -> None:
+    """Raise whatever tells that there is no scheduler."""
+    from distributed import Security
+    from distributed.comm import get_address_host_port
+    from distributed.core import rpc
+
+    get_address_host_port(address)  # there is a port
+    arguments = Security().get_connection_args('client')
+    async with rpc(address, connection_args=arguments) as scheduler:
+        if 'workers' not in await scheduler.identity():
+            raise OSError('it is no scheduler')
 
 
 def _process_there(task: Task) -> Outcome:

@@ -412,7 +412,7 @@ def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace, progress: Pr
     """Process recordings where the arguments say."""
     from ins_align.batch import ClusterError, process_all, process_on_cluster
 
-    if not arguments.dask:
+    if arguments.dask is None:
         yield from process_all(tasks, arguments.jobs or processors(), progress.advance)
         return
     try:

@@ -13,9 +13,11 @@
 # limitations under the License.
 """Replay of several recordings on a Dask cluster, one worker of which dies on the way."""
 
+import contextlib
 import json
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -94,6 +96,45 @@ def test_no_cluster_there(flight, capsys, monkeypatch):
     error = capsys.readouterr().err
     assert 'no Dask scheduler answers at tcp://127.0.0.1:9' in error
     assert len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize('greeting, reason', [
+    (b'', 'nothing was heard for 1 s'), (b'SSH-2.0-OpenSSH_9.6\r\n', 'something else does')])
+def test_something_else_is_there(flight, capsys, monkeypatch, greeting, reason):
+    monkeypatch.setattr('ins_align.batch.CONNECT_TIMEOUT', 1.0)
+    callers = []
+    with socket.create_server(('127.0.0.1', 0)) as server:
+
+        def greet():
+            with contextlib.suppress(OSError):
+                while True:
+                    callers.append(server.accept()[0])
+                    callers[-1].sendall(greeting)
+
+        threading.Thread(target=greet, daemon=True).start()
+        start = time.monotonic()
+        address = f'tcp://127.0.0.1:{server.getsockname()[1]}'
+        assert main(['replay', str(flight), '--dask', address]) == 2
+        assert time.monotonic() - start < 10.0
+        server.shutdown(socket.SHUT_RDWR)
+    assert callers
+    assert capsys.readouterr().err == (
+        f'ins_align replay: no Dask scheduler answers at {address}: {reason}\n')
+    for caller in callers:
+        caller.close()
+
+
+def test_a_worker_is_no_scheduler(cluster, flight, capsys):
+    worker = next(iter(cluster.scheduler_info['workers']))
+    assert main(['replay', str(flight), '--dask', worker]) == 2
+    assert f'no Dask scheduler answers at {worker}: it is no' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('address', ['localhost', 'tcp://127.0.0.1', 'x://localhost:1', ''])
+def test_address_that_is_none(flight, capsys, address):
+    assert main(['replay', str(flight), '--dask', address]) == 2
+    error = capsys.readouterr().err
+    assert error.count('\n') == 1 and 'an address is like tcp://localhost:8786' in error
 
 
 def test_dask_is_not_installed(flight, capsys, monkeypatch):
