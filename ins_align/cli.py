@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 import errno
 import gc
+import io
 import json
 import os
 from pathlib import Path
@@ -125,6 +126,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stream in ('stdout', 'stderr'):
         if getattr(sys, stream) is None:  # closed by who started us
             setattr(sys, stream, open(os.devnull, 'w'))
+        if isinstance(getattr(sys, stream), io.TextIOWrapper):  # of any encoding
+            getattr(sys, stream).reconfigure(errors='backslashreplace')
     arguments, unknown = parser().parse_known_args(argv)
     if unknown:
         arguments.parser.error(f'unrecognized arguments: {" ".join(unknown)}')

@@ -430,6 +430,23 @@ def test_streams_that_are_closed_from_the_start(flight, tmp_path, closed):
     assert json.loads(path.read_text())['aligned']
 
 
+@pytest.mark.parametrize('command, encoding, name, shown', [
+    ('replay', 'ascii', 'Übung', r'\xdcbung'), ('info', 'ascii', 'Übung', r'\xdcbung'),
+    ('replay', 'latin-1', 'Übung 日', r'Übung \u65e5'),
+    ('replay', 'utf-8', 'a\udcff', r'a\udcff')])
+def test_streams_of_another_encoding(standing, tmp_path, command, encoding, name, shown):
+    (tmp_path / name).symlink_to(standing)
+    (tmp_path / f'{name}.json').write_text('x')
+    done = subprocess.run(
+        [*COMMAND, command, tmp_path / name, tmp_path / f'{name}.json'],
+        capture_output=True, cwd=Path(__file__).parents[1],
+        env={**os.environ, 'PYTHONIOENCODING': encoding})
+    assert done.returncode == 2
+    assert f'{shown}\n' in done.stdout.decode(encoding)
+    assert 'no recording' in done.stderr.decode(encoding)
+    assert 'Traceback' not in done.stderr.decode(encoding)
+
+
 @pytest.mark.parametrize('command, status', [
     (['replay', '--params'], 0), (['replay', '--duration', '2', '--params'], 1), (['info'], 0)])
 @pytest.mark.parametrize('buffered, number, errors_too', [
