@@ -177,8 +177,11 @@ class Bag:
         """List the files in the order in which they were recorded."""
         if not self.path.exists():
             raise BagError(f'{self.path} does not exist')
-        if not self.path.is_dir():
+        if self.path.is_file():
             return [self.path]
+        if not self.path.is_dir():
+            raise BagError(f'{self.path} is a pipe or a device, from which no recording can be '
+                           'read: give a file')
         files = sorted((file for file in self.path.iterdir()
                         if STORAGE_NAME.search(file.name)),
                        key=lambda file: [part.zfill(20) for part in

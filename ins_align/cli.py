@@ -347,15 +347,15 @@ def run_info(arguments: argparse.Namespace) -> int:
             info = inspect(bag)
         except BagError as error:
             if not several:
-                raise UsageError(error) from None
+                raise UsageError(_of(bag, str(error))) from None
             with _readers_may_leave(sys.stderr):
-                print(f'ins_align info: {error}', file=sys.stderr)
+                print(f'ins_align info: {_of(bag, str(error))}', file=sys.stderr)
             objects.append({'bag': bag, 'error': str(error)})
             status = UNUSABLE
             continue
         with _readers_may_leave(sys.stderr):
             for warning in info.warnings:
-                print(f'ins_align info: warning: {warning}', file=sys.stderr)
+                print(f'ins_align info: warning: {_of(bag, warning)}', file=sys.stderr)
         with _readers_may_leave(sys.stdout):
             print(describe(info) + '\n')
         objects.append(info.to_json())
@@ -390,17 +390,17 @@ def run_replay(arguments: argparse.Namespace) -> int:
     objects = []
     statuses = []
     with progress_bar(len(tasks)) as progress:
-        for outcome in _outcomes(tasks, arguments, progress):
+        for bag, outcome in zip(arguments.bags, _outcomes(tasks, arguments, progress)):
             if outcome.error:
                 if not several:
-                    raise UsageError(outcome.error)
+                    raise UsageError(_of(bag, outcome.error))
                 with _readers_may_leave(sys.stderr):
-                    progress.note(f'ins_align replay: {outcome.error}')
+                    progress.note(f'ins_align replay: {_of(bag, outcome.error)}')
                 statuses.append(UNUSABLE)
             else:
                 with _readers_may_leave(sys.stderr):
                     for warning in outcome.warnings:
-                        progress.note(f'ins_align replay: warning: {warning}')
+                        progress.note(f'ins_align replay: warning: {_of(bag, warning)}')
                 with _readers_may_leave(sys.stdout):
                     progress.say(outcome.summary + '\n')
                 statuses.append(ALIGNED if outcome.json['aligned'] else NOT_ALIGNED)
@@ -408,6 +408,18 @@ def run_replay(arguments: argparse.Namespace) -> int:
     if arguments.json:
         _write_json(arguments.json, objects if several else objects[0])
     return max(statuses)
+
+
+def _of(bag: str, text: str) -> str:
+    """Let a sentence on a recording begin with the path as it was given."""
+    from ins_align.bag_files import one_line
+
+    path = Path(bag)
+    name, last = one_line(str(path)), one_line(path.name)
+    for begin in (name, last):
+        if begin and text.startswith((f'{begin} ', f'{begin}:')):
+            return name + text[len(begin):]
+    return f'{name}: {text}'
 
 
 def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace, progress: Progress,

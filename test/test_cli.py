@@ -272,6 +272,33 @@ def test_unusable_files(tmp_path, capsys, content, message):
     assert not (tmp_path / 'a.json').exists()
 
 
+@pytest.mark.parametrize('command', ['replay', 'info'])
+def test_files_of_recordings_are_told_apart(tmp_path, capsys, command):
+    """Those of one recorder have the same names."""
+    bags = []
+    for name in ('monday', 'tuesday'):
+        bags.append(str(write_recording(tmp_path / name / 'bag', 'mcap', 2.0)))
+        file, = (tmp_path / name / 'bag').glob('*.mcap')
+        file.write_bytes(b'' if name == 'monday' else file.read_bytes()[:-100])
+    assert main([command, bags[0]]) == 2
+    assert one_sentence(capsys) == f'ins_align {command}: {bags[0]}: bag.mcap is empty\n'
+    assert main([command, *bags]) == 2
+    error = capsys.readouterr().err
+    assert f'ins_align {command}: {bags[0]}: bag.mcap is empty\n' in error
+    assert f'ins_align {command}: warning: {bags[1]}: bag.mcap was cut off' in error
+    assert main([command, str(tmp_path / 'missing')]) == 2
+    assert f'{command}: {tmp_path}/missing does not exist' in one_sentence(capsys)
+
+
+@pytest.mark.parametrize('command', ['replay', 'info'])
+def test_recording_from_a_pipe(standing, command):
+    done = subprocess.run([*COMMAND, command, '/dev/stdin'], input=b'\x89MCAP0\r\n',
+                          capture_output=True, cwd=Path(__file__).parents[1])
+    assert done.returncode == 2
+    assert done.stderr.decode() == (f'ins_align {command}: /dev/stdin is a pipe or a device, from '
+                                    'which no recording can be read: give a file\n')
+
+
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
 def test_no_imu(tmp_path, capsys, kind):
     path = write_recording(tmp_path / 'a.bag', kind, 1.0, {'/fix': FIX, '/fix_velocity': TWIST})
@@ -300,8 +327,8 @@ def test_cut_off_is_used_as_far_as_it_goes(flight, tmp_path, capsys):
     status = main(['replay', str(tmp_path / 'cut.mcap'), '--set', 'lever_arm=[1,1,1]'])
     captured = capsys.readouterr()
     assert status == 0
-    assert captured.err == ('ins_align replay: warning: cut.mcap was cut off or not closed: '
-                            'it is read as far as it goes\n')
+    assert captured.err == (f'ins_align replay: warning: {tmp_path}/cut.mcap was cut off or not '
+                            'closed: it is read as far as it goes\n')
 
 
 @pytest.mark.parametrize('name', ['uav_thor75', 'car_drive0708', 'quad_dot08.bag'])
