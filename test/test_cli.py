@@ -121,11 +121,13 @@ def test_part_without_messages(flight, tmp_path, capsys, part, where):
 
 
 def test_too_little_for_an_attitude(flight, tmp_path, capsys):
-    assert main(['replay', str(flight), '--start', '39.9', '--json', str(tmp_path / 'a.json'),
-                 '--csv', str(tmp_path / 'a.csv'), '--plot', str(tmp_path / 'a.png')]) == 1
+    assert main(['replay', str(flight), '--start', '39.9', '--set', 'lever_arm=[1,2,3]',
+                 '--json', str(tmp_path / 'a.json'), '--csv', str(tmp_path / 'a.csv'),
+                 '--plot', str(tmp_path / 'a.png')]) == 1
     result = json.loads((tmp_path / 'a.json').read_text())
     assert result['initial_attitude'] is None and result['final_attitude'] is None
     assert result['t0'] is None
+    assert result['gyro_bias_rad_s'] == [0.0, 0.0, 0.0] and result['lever_arm_m'] == [1, 2, 3]
     assert len((tmp_path / 'a.csv').read_text().splitlines()) == 1
 
 

@@ -135,6 +135,15 @@ def test_readme_names_no_file_that_is_not_there():
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
+def test_topics_are_listened_to_before_there_is_a_node():
+    """Of a topic that nobody publishes yet ``ros2 topic echo`` does not know the type."""
+    text = read('README.md').replace('\\\n', ' ')
+    commands = re.findall(r'^ros2 topic echo .*', text, re.MULTILINE)
+    assert len(commands) == 2
+    for command in commands:
+        assert re.search(r' /ins_align/\w+ \w+/msg/\w+$', command), command
+
+
 def test_api_page_has_every_module():
     """A module that was renamed makes the documentation fail, one that is new is not in it."""
     listed = re.findall(r'automodule:: ins_align\.(\w+)', read('docs/api.rst'))
