@@ -309,8 +309,8 @@ SIMULATE_OPTIONS = {
     ),
     'GNSS': (
         ('--gnss-rate', 0, 'HZ', 'default: 5'),
-        ('--gnss-latency', 0, 'S', 'messages arrive so long after their stamp'),
-        ('--gnss-delay', 0, 'S', 'measurements are older than their stamp by this'),
+        ('--gnss-latency', 0, 'S', 'messages arrive so long after their stamp (up to 59.5)'),
+        ('--gnss-delay', 0, 'S', 'measurements are older than their stamp by this (up to 10)'),
         ('--velocity-std', 0, 'M/S', 'default: 0.1'),
         ('--position-std', 0, 'M', 'default: 2.5'),
         ('--outlier-rate', 0, 'PART', 'part of the epochs that are spoilt'),

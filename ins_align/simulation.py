@@ -30,10 +30,11 @@ import tempfile
 from typing import Any
 
 from ins_align import scenarios
-from ins_align.config import ImuNoise, PRESETS
+from ins_align.config import Config, ImuNoise, PRESETS
 from ins_align.messages import ENU_FROM_NED, Fix, Velocity
 from ins_align.rotation import Array, matrix_from_rpy, quaternion_from_matrix
-from ins_align.simulation_arguments import checked_arguments, IMU_AXES, SimulationError
+from ins_align.simulation_arguments import (
+    checked_arguments, IMU_AXES, LATENESS_MARGIN, SimulationError)
 from ins_align.trajectory import displaced, START_NS, Trajectory, trajectory_of, wrapped
 import numpy as np
 
@@ -235,9 +236,9 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
     gnss_phase : float
         Stamp of the first epoch, s; by default no IMU sample is at a GNSS stamp.
     gnss_latency : float
-        Arrival after the stamp, s.
+        Arrival after the stamp, s, up to 59.5.
     gnss_delay : float
-        The measurement is older than its stamp by this, s.
+        The measurement is older than its stamp by this, s, up to 10.
     velocity_std, position_std : float
         Horizontal noise, m/s and m.
     velocity_std_vertical, position_std_vertical : float, optional
@@ -495,6 +496,9 @@ def _parameter_file(simulation: Simulation) -> str:
         'gnss_delay': float(meta['gnss_delay']),
         'velocity_frame': meta['velocity_frame'],
     }
+    lateness = float(meta['gnss_latency']) + LATENESS_MARGIN
+    if lateness > Config.gnss_lateness:
+        values['gnss_lateness'] = lateness
     preset = PRESETS.get(meta['imu_grade'])
     if preset is not None:
         values['imu_grade'] = meta['imu_grade']

@@ -25,6 +25,8 @@ VELOCITY_FRAMES = ('enu', 'ned')
 IMU_AXES = {'': (1.0, 1.0, 1.0), 'x': (-1.0, 1.0, 1.0), 'y': (1.0, -1.0, 1.0),
             'z': (1.0, 1.0, -1.0)}
 
+LATENESS_MARGIN = 0.5  # s, of gnss_lateness over the latency
+MAX_LATENCY = 59.5
 _MAX_SAMPLES = 20_000_000
 
 
@@ -54,9 +56,16 @@ def checked_arguments(arguments: dict[str, Any]) -> ImuNoise:
     check('duration', 'a number of seconds above 0',
           lambda value: value is None or number(value) and value > 0)
     check('velocity_std position_std position_drift_std outlier_velocity outlier_position '
-          'gyro_scale_std gyro_misalignment_std accel_scale_std accel_misalignment_std '
-          'rate_random_walk gnss_phase gnss_latency gnss_delay stand_still',
+          'gyro_misalignment_std accel_scale_std accel_misalignment_std '
+          'rate_random_walk gnss_phase stand_still',
           'a number, 0 or above', lambda value: number(value) and value >= 0)
+    # As far as the parameters go that make up for them.
+    check('gnss_latency', f'a number of seconds from 0 to {MAX_LATENCY:g}',
+          lambda value: number(value) and 0 <= value <= MAX_LATENCY)
+    check('gnss_delay', 'a number of seconds from 0 to 10',
+          lambda value: number(value) and 0 <= value <= 10)
+    check('gyro_scale_std', 'a number from 0 to 0.5',
+          lambda value: number(value) and 0 <= value <= 0.5)
     check('velocity_std_vertical position_std_vertical gyro_bias_std accel_bias_std',
           'a number, 0 or above', lambda value: value is None or number(value) and value >= 0)
     check('position_drift_time', 'a number of seconds above 0',
@@ -66,9 +75,14 @@ def checked_arguments(arguments: dict[str, Any]) -> ImuNoise:
     check('outlier_rate', 'a number from 0 to 1', lambda value: number(value) and 0 <= value <= 1)
     check('latitude_deg', 'a number of degrees between -89 and 89',
           lambda value: number(value) and -89 <= value <= 89)
-    check('longitude_deg altitude heading_deg crab_deg', 'a finite number', number)
-    check('lever_arm mount_rpy_deg', 'three finite numbers',
+    check('altitude', 'a number of metres from -1000 to 100000',
+          lambda value: number(value) and -1e3 <= value <= 1e5)
+    check('longitude_deg heading_deg crab_deg', 'a finite number', number)
+    check('mount_rpy_deg', 'three finite numbers',
           lambda value: np.shape(value) == (3,) and all(map(number, value)))
+    check('lever_arm', 'three numbers of metres from -1000 to 1000',
+          lambda value: np.shape(value) == (3,) and all(map(number, value))
+          and max(map(abs, value)) <= 1000)
     check('outages', 'pairs of a start and a later end in seconds',
           lambda value: all(np.shape(pair) == (2,) and pair[0] < pair[1] for pair in value))
     check('velocity_frame', 'enu or ned', lambda value: value in VELOCITY_FRAMES)

@@ -96,6 +96,17 @@ def test_parameter_file_covers_scale_factors(tmp_path, capsys):
     assert main(['replay', str(path), '--params', str(path / 'ins_align.yaml')]) == 0
 
 
+@pytest.mark.parametrize('latency, delay', [('2', '0'), ('2', '10'), ('1', '0.2'), ('59.5', '0')])
+def test_parameter_file_covers_latency(tmp_path, capsys, latency, delay):
+    path = tmp_path / 'car'
+    assert main(['simulate', str(path), '--scenario', 'car', '--seed', '1', '--duration', '80',
+                 '--gnss-latency', latency, '--gnss-delay', delay]) == 0
+    assert main(['replay', str(path), '--params', str(path / 'ins_align.yaml'),
+                 '--json', str(tmp_path / 'a.json')]) == 0
+    counts = json.loads((tmp_path / 'a.json').read_text())['counts']
+    assert not counts.get('fix_late') and not counts.get('velocity_late')
+
+
 def test_not_aligned(standing, tmp_path, capsys):
     assert main(['replay', str(standing), '--json', str(tmp_path / 'a.json')]) == 1
     result = json.loads((tmp_path / 'a.json').read_text())
