@@ -15,8 +15,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
+import heapq
+import itertools
+from operator import itemgetter
 import os
 from pathlib import Path, PurePath
 import re
@@ -44,6 +47,7 @@ REFERENCE_TOPIC = '/reference/imu'  # truth or the best that is known: to compar
 
 STORAGE_NAME = re.compile(r'\.(mcap|db3|bag)(\.zstd)?$')  # of the files of a recording
 LOOK_NS = 60_000_000_000  # of a recording in which topics that are left out are looked for
+MERGED_BLOCK = 1024  # messages
 MAX_METADATA_BYTES = 1 << 24
 _MAGICS = (mcap_file.MAGIC, rosbag1_file.MAGIC, sqlite_file.MAGIC, ZSTD_MAGIC)
 # A compressed file may unpack to this much, or to more at no more than this ratio.
@@ -134,29 +138,51 @@ class Bag:
         """
         start_ns = 0 if start_ns is None else start_ns
         stop_ns = INT64_MAX if stop_ns is None else stop_ns
-        for file in self._files:
-            wanted = {key: topics.index(topic) for key, topic in file.topics.items()
-                      if topic in topics}
-            if not wanted:
+        for group in self._overlapping():
+            streams = [self._blocks_of(file, topics, start_ns, stop_ns) for file in group]
+            if len(streams) == 1:
+                yield from streams[0]
                 continue
-            packed = None
-            for records in file.blocks(wanted, start_ns, stop_ns):
-                times_ns, keys, messages = zip(*records)
-                indices = list(map(wanted.__getitem__, keys))
-                if packed is None:  # rosbag2 compresses every message or none
-                    packed = (topics[indices[0]].encoding == 'cdr'
-                              and messages[0].startswith(ZSTD_MAGIC))
-                if packed:
-                    messages = tuple(decompress(message, 'zstd', MAX_MESSAGE_BYTES)
-                                     for message in messages)
-                yield Block(times_ns, indices, messages)
+            merged = heapq.merge(*(_one_by_one(stream) for stream in streams), key=itemgetter(0))
+            while records := list(itertools.islice(merged, MERGED_BLOCK)):
+                yield Block(*zip(*records))
+
+    def _overlapping(self) -> Iterator[list[ChunkedFile | sqlite_file.SqliteFile]]:
+        """Put together the files that hold messages of the same time."""
+        group: list[ChunkedFile | sqlite_file.SqliteFile] = []
+        end_ns = 0
+        for file in self._files:
+            if group and (file.start_ns or 0) >= end_ns:
+                yield group
+                group = []
+            group.append(file)
+            end_ns = max(end_ns, file.end_ns or 0)
+        yield group
+
+    @staticmethod
+    def _blocks_of(file: ChunkedFile | sqlite_file.SqliteFile, topics: Sequence[Topic],
+                   start_ns: int, stop_ns: int) -> Iterator[Block]:
+        wanted = {key: topics.index(topic) for key, topic in file.topics.items()
+                  if topic in topics}
+        if not wanted:
+            return
+        packed = None
+        for records in file.blocks(wanted, start_ns, stop_ns):
+            times_ns, keys, messages = zip(*records)
+            indices = list(map(wanted.__getitem__, keys))
+            if packed is None:  # rosbag2 compresses every message or none
+                packed = (topics[indices[0]].encoding == 'cdr'
+                          and messages[0].startswith(ZSTD_MAGIC))
+            if packed:
+                messages = tuple(decompress(message, 'zstd', MAX_MESSAGE_BYTES)
+                                 for message in messages)
+            yield Block(times_ns, indices, messages)
 
     def messages(self, topics: Sequence[Topic], start_ns: int | None = None,
                  stop_ns: int | None = None) -> Iterator[tuple[Topic, int, bytes]]:
         """Yield topic, recorded time and message one by one, otherwise like `blocks`."""
-        for block in self.blocks(topics, start_ns, stop_ns):
-            for time_ns, index, message in zip(*block):
-                yield topics[index], time_ns, message
+        for time_ns, index, message in _one_by_one(self.blocks(topics, start_ns, stop_ns)):
+            yield topics[index], time_ns, message
 
     def _open_files(self, stack: ExitStack) -> list[ChunkedFile | sqlite_file.SqliteFile]:
         """Open those files that can be; an error only if there is none."""
@@ -171,10 +197,10 @@ class Bag:
         if not files:
             raise errors[0]
         self._warnings += [str(error) for error in errors]
-        return files
+        return sorted(files, key=lambda file: file.start_ns or 0)
 
     def _storage_files(self) -> list[Path]:
-        """List the files in the order in which they were recorded."""
+        """List the files of the recording."""
         if not self.path.exists():
             raise BagError(f'{self.path} does not exist')
         if self.path.is_file():
@@ -182,14 +208,11 @@ class Bag:
         if not self.path.is_dir():
             raise BagError(f'{self.path} is a pipe or a device, from which no recording can be '
                            'read: give a file')
-        files = sorted((file for file in self.path.iterdir()
-                        if STORAGE_NAME.search(file.name)),
-                       key=lambda file: [part.zfill(20) for part in
-                                         re.findall(r'\d+|\D+', file.name)])
+        files = sorted(file for file in self.path.iterdir() if STORAGE_NAME.search(file.name))
         names = self._listed_names()
         if names is None:
             self._warnings.append(f'{self.path.name} has no readable metadata.yaml: '
-                                  'its files are read in the order of their names')
+                                  'all files in it are read')
         else:
             missing = [name for name in names if not (self.path / name).is_file()]
             files = [self.path / name for name in names if name not in missing]
@@ -328,6 +351,11 @@ class Bag:
         names = sorted(topic.name for topic in self.topics)
         more = f' and {len(names) - 20} more' if len(names) > 20 else ''
         return f'it has {", ".join(names[:20])}{more}' if names else 'it has no topics'
+
+
+def _one_by_one(blocks: Iterable[Block]) -> Iterator[tuple[int, int, bytes]]:
+    for block in blocks:
+        yield from zip(*block)
 
 
 def _with_type(topic: Topic) -> str:

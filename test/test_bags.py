@@ -26,8 +26,8 @@ from ins_align.decoding import decode_imu
 import numpy as np
 import pytest
 from recordings import (
-    FIX, FORMATS, IMU, make_twist, mcap_record, mcap_string, real_recording, START_NS, TWIST,
-    typestore, write_messages, write_recording)
+    FIX, FORMATS, IMU, make_imu, make_twist, mcap_record, mcap_string, real_recording, START_NS,
+    TWIST, typestore, write_messages, write_recording)
 from rosbags.highlevel import AnyReader
 
 ODOMETRY, STAMPED = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/TwistStamped'
@@ -307,6 +307,40 @@ def test_directory_of_several_files(tmp_path, recordings):
     records, warnings = by_bag(path)
     assert len(records) == 3 * (10 + 2)
     assert warnings == ['gone.mcap is missing from split']
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'mcap messages', 'sqlite3', 'ros1 bz2'])
+@pytest.mark.parametrize('parts', [
+    [(0, 30), (30, 70), (70, 100)], [(70, 100), (30, 70), (0, 30)],
+    [(0, 50, 2), (70, 100), (50, 70), (1, 50, 2)], [(0, 100, 3), (1, 100, 3), (2, 100, 3)]])
+def test_files_in_any_order_and_at_the_same_time(tmp_path, kind, parts):
+    """What is there is read once, in the order of time."""
+    store = typestore(kind.startswith('ros1'))
+    path = tmp_path / 'split'
+    path.mkdir()
+    names = []
+    stamps = []
+    for number, part in enumerate(parts):
+        times = [START_NS + k * 10_000_000 for k in range(*part)]
+        stamps += times
+        messages = [(topic, stamp + late, make_imu(store, stamp, (k, 0, 0), (0, 0, 9.8)))
+                    for k, stamp in enumerate(times) for topic, late in (('/a', 0), ('/b', 1))]
+        source = write_messages(tmp_path / f's{number}.bag', kind, messages,
+                                {'/b': IMU, '/a': IMU} if number else {'/a': IMU, '/b': IMU})
+        file = storage_file(source)
+        names.append(f'{number}{file.suffix}')
+        shutil.copy(file, path / names[-1])
+    for listed in (None, names, names[::-1]):
+        if listed:
+            (path / 'metadata.yaml').write_text(
+                f'rosbag2_bagfile_information: {{relative_file_paths: [{", ".join(listed)}]}}')
+        records, warnings = by_bag(path)
+        assert len(warnings) == (listed is None)
+        assert [record[:2] for record in records] == [
+            (topic, stamp + late) for stamp in sorted(stamps)
+            for topic, late in (('/a', 0), ('/b', 1))]
+        later, _ = by_bag(path, start_ns=START_NS + 400_000_000)
+        assert later == [record for record in records if record[1] >= START_NS + 400_000_000]
 
 
 def test_damaged_schema_is_refused_in_one_line(copy):
