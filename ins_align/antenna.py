@@ -31,7 +31,7 @@ MAX_FIX_JUMP = 300.0
 FIX_JUMPS_BELIEVED = 5
 # A place this old (s) is not carried on with the velocity.
 MAX_CARRIED = 60.0
-_UNKNOWN_VERTICAL_STD = 1e3
+_UNKNOWN_VERTICAL_STD, _UNKNOWN_ALTITUDE_STD = 1e3, 1e4
 # A variance this many times smaller than what the receiver usually states, the median of so many
 # epochs, is not believed: a receiver that is ten times better than it was will say so again. One
 # that was worse than the configuration expects need not. In the first epoch any is believed that a
@@ -87,6 +87,7 @@ class Antenna:
         self._config = config
         self._counts = counts
         self._place: Place | None = None
+        self._altitude_known = False
         self._place_ns = self._fix_ns = self._seen_ns = 0
         self._v_n: Array | None = None
         self._speed = 0.0
@@ -130,6 +131,8 @@ class Antenna:
         position_covariance = self._position_noise.believed(stated)
         if position_covariance is not stated and stated is not None:
             self._counts['fix_covariance'] += 1
+        if fix is not None and not fix.vertical:
+            position_covariance = _without_vertical(position_covariance, _UNKNOWN_ALTITUDE_STD)
         if v_n is not None or believed:
             self._seen_ns = message.stamp_ns
         if v_n is not None:
@@ -157,16 +160,20 @@ class Antenna:
     def _locate(self, stamp_ns: int, fix: Fix | None, v_n: Array | None) -> bool:
         """Bring the place to an epoch; return whether there is a fix that is believed."""
         dt = (stamp_ns - self._place_ns) * 1e-9
+        if (fix is not None and fix.vertical and self._place is not None
+                and not self._altitude_known):
+            self._place = (*self._place[:2], fix.altitude_m)
         predicted = self._place
         if predicted is not None and v_n is not None and dt < MAX_CARRIED:
             predicted = carried(predicted, v_n, dt)
         if fix is not None:
             place = (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg),
-                     fix.altitude_m)
+                     fix.altitude_m if fix.vertical or predicted is None else predicted[2])
             silent = (stamp_ns - self._fix_ns) * 1e-9
             if (predicted is None
                     or math.hypot(*way(predicted, place)) <= MAX_FIX_JUMP * (1 + silent)):
                 self._jumps = 0
+                self._altitude_known |= fix.vertical
                 if self._place is not None and v_n is None and dt > 0:
                     self._speed = math.hypot(*way(self._place, place)) / dt
                 self._place, self._place_ns, self._fix_ns = place, stamp_ns, stamp_ns
@@ -183,10 +190,15 @@ class Antenna:
         if covariance is not stated and stated is not None:
             self._counts['velocity_covariance'] += 1
         if not self._vertical or (velocity is not None and not velocity.vertical):
-            covariance = covariance.copy()
-            covariance[2, :2] = covariance[:2, 2] = 0.0
-            covariance[2, 2] = _UNKNOWN_VERTICAL_STD ** 2
+            return _without_vertical(covariance, _UNKNOWN_VERTICAL_STD)
         return covariance
+
+
+def _without_vertical(covariance: Array, std: float) -> Array:
+    covariance = covariance.copy()
+    covariance[2, :2] = covariance[:2, 2] = 0.0
+    covariance[2, 2] = std ** 2
+    return covariance
 
 
 class StatedNoise:

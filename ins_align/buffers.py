@@ -216,6 +216,11 @@ def fault_of_fix(fix: Fix) -> str:
                   and abs(fix.altitude_m) < MAX_ALTITUDE) else 'nan'
 
 
+def with_an_altitude(fix: Fix) -> Fix:
+    """Return a fix whose altitude is 0, and not measured, where it is nan: in a 2D fix."""
+    return fix._replace(altitude_m=0.0, vertical=False) if math.isnan(fix.altitude_m) else fix
+
+
 def usable_velocity(velocity: Velocity) -> Velocity | None:
     """Return what can be used of a velocity, without its vertical where that is nan."""
     east, north, up = velocity.velocity
@@ -284,11 +289,14 @@ class GnssBuffer:
     def add_fix(self, fix: Fix, imu_newest_ns: int | None) -> None:
         """Take a position, or count why not."""
         self._counts['fix'] += 1
+        fix = with_an_altitude(fix)
         if fault := fault_of_fix(fix):
             self._counts[f'fix_{fault}'] += 1
         else:
             if fix.status == STATUS_UNKNOWN:
                 self._counts['fix_status_unknown'] += 1
+            if not fix.vertical:
+                self._counts['fix_no_altitude'] += 1
             epoch = self._epoch(fix.stamp_ns, imu_newest_ns, 'fix')
             if epoch is not None and epoch.fix is None:
                 epoch.fix = fix

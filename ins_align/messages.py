@@ -50,6 +50,7 @@ class Fix(NamedTuple):
     altitude_m: float
     covariance: np.ndarray | None  # (3, 3), ENU, m^2; None: not known
     status: int  # NavSatStatus: -1 no fix, 0 and above a fix, -2 unknown
+    vertical: bool = True  # whether the altitude is measured
 
 
 class Velocity(NamedTuple):

@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 
 from ins_align.bag_files import BagError, Topic
 from ins_align.bags import Bag, FIX_TYPE, IMU_TYPE, REFERENCE_NAMESPACE, VELOCITY_TYPES
-from ins_align.buffers import fault_of_fix, MAX_ACCELERATION, MAX_RATE, usable_velocity
+from ins_align.buffers import (
+    fault_of_fix, MAX_ACCELERATION, MAX_RATE, usable_velocity, with_an_altitude)
 from ins_align.config import Config
 from ins_align.decoding import decode_imu, deserialize
 from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
@@ -191,6 +192,7 @@ class Recorded:
 
     def _add_gnss(self, time_ns: int, message: Fix | Velocity) -> None:
         if isinstance(message, Fix):
+            message = with_an_altitude(message)
             values = (message.latitude_deg, message.longitude_deg, message.altitude_m)
             fault = fault_of_fix(message)
             usable = not fault

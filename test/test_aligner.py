@@ -538,6 +538,26 @@ def test_velocity_without_its_vertical(flight, result):
     assert epochs[-1].current.sigma_deg[2] >= result[1][-1].current.sigma_deg[2]
 
 
+@pytest.mark.parametrize('known_from', [0.0, 8.0, math.inf])
+@pytest.mark.parametrize('settings', [{}, {'use_velocity': False}, {'use_position': True}])
+def test_positions_without_their_altitude(flight, settings, known_from):
+    aligner = Aligner(config_for(flight, **settings))
+    for k in range(len(flight.gnss_stamps_ns)):
+        fix = flight.fix(k)
+        if (fix.stamp_ns - flight.gnss_stamps_ns[0]) * 1e-9 < known_from:
+            fix = fix._replace(altitude_m=math.nan)
+        aligner.add_fix(fix)
+        aligner.add_velocity(flight.velocity_measurement(k))
+    aligner.add_imu(flight.imu_stamps_ns, flight.gyro, flight.accel)
+    epochs = aligner.flush()
+    counts = aligner.status().counts
+    assert counts.get('fix_nan', 0) == counts.get('fix_jump', 0) == 0
+    assert (counts.get('fix_no_altitude', 0) > 0) == (known_from > 0.0)
+    if settings.get('use_velocity') is not False:
+        assert epochs[-1].state is State.ALIGNED
+    assert normalised_error(epochs[-1].current, flight) < chi2.ppf(0.9999, 3)
+
+
 def test_silent_imu_starts_over_and_keeps_the_biases(flight):
     aligner = Aligner(config_for(flight))
     feed_part(aligner, flight, 0.0, 15.0)

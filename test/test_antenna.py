@@ -17,7 +17,7 @@ from collections import Counter
 import math
 
 from ins_align.antenna import Antenna, StatedNoise
-from ins_align.buffers import GnssEpoch
+from ins_align.buffers import GnssEpoch, with_an_altitude
 from ins_align.config import Config
 from ins_align.messages import Fix, Velocity
 import numpy as np
@@ -97,6 +97,25 @@ def test_an_antenna_counts_what_it_does_not_believe():
         assert np.allclose(epoch.velocity_covariance, CORRELATED)
         assert np.allclose(epoch.position_covariance, CORRELATED)
     assert (counts['velocity_covariance'], counts['fix_covariance']) == (3, 3)
+
+
+@pytest.mark.parametrize('velocity', (None, (0.0, 0.0, 0.0)))
+def test_altitude_that_comes_and_goes(velocity):
+    """What is not known is no jump, and what was known is kept."""
+    counts = Counter()
+    antenna = Antenna(Config(), counts)
+    altitudes = [math.nan] * 3 + [2500.0] * 3 + [math.nan] * 3 + [2501.0, 4000.0]
+    epochs = []
+    for k, altitude in enumerate(altitudes):
+        message = told(k * SECOND, 0.0, velocity)
+        message.fix = with_an_altitude(message.fix._replace(altitude_m=altitude))
+        epochs.append(antenna.epoch(message))
+    assert [epoch.altitude for epoch in epochs] == [0.0] * 3 + [2500.0] * 6 + [2501.0] * 2
+    assert counts['fix_jump'] == 1 and not epochs[-1].position_measured
+    for epoch, altitude in zip(epochs, altitudes):
+        up = epoch.position_covariance[2, 2]
+        assert up == (1e8 if math.isnan(altitude) else Config().position_std_vertical ** 2)
+        assert epoch.position_covariance[0, 0] == Config().position_std ** 2
 
 
 @pytest.mark.parametrize('vertical', (0.0, 1.0))

@@ -14,6 +14,7 @@
 """What arrives late, twice, out of order or broken is put in order or counted."""
 
 from collections import Counter
+import math
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -257,7 +258,7 @@ def test_epochs_are_released_in_order_up_to_a_stamp():
 
 @pytest.mark.parametrize('changes, reason', [
     ({'latitude_deg': np.nan}, 'fix_nan'), ({'longitude_deg': np.inf}, 'fix_nan'),
-    ({'altitude_m': np.nan}, 'fix_nan'), ({'latitude_deg': 91.0}, 'fix_nan'),
+    ({'altitude_m': np.inf}, 'fix_nan'), ({'latitude_deg': 91.0}, 'fix_nan'),
     ({'longitude_deg': 1e6}, 'fix_nan'), ({'altitude_m': -1e9}, 'fix_nan'),
     ({'status': -1}, 'fix_no_fix'), ({'latitude_deg': 0.0, 'longitude_deg': 0.0}, 'fix_no_fix')])
 def test_fixes_that_are_none_are_counted_by_reason(changes, reason):
@@ -271,6 +272,16 @@ def test_broken_velocities_are_counted():
     for v in ((np.nan, 0, 0), (0, np.inf, 0), (0, 0, 1e9)):
         buffer.add_velocity(velocity(5, v), None)
     assert buffer.release(10) == [] and counts['velocity_nan'] == 3
+
+
+def test_position_without_its_altitude_is_kept():
+    buffer, counts = gnss_buffer()
+    buffer.add_fix(fix(5, altitude_m=math.nan), None)
+    buffer.add_fix(fix(6, altitude_m=math.inf), None)
+    buffer.add_fix(fix(7, altitude_m=math.nan, latitude_deg=math.nan), None)
+    kept, = buffer.release(10, last=True)
+    assert kept.fix.latitude_deg == 48.0 and kept.fix.altitude_m == 0.0 and not kept.fix.vertical
+    assert counts['fix'] == 3 and counts['fix_nan'] == 2 and counts['fix_no_altitude'] == 1
 
 
 def test_velocity_without_its_vertical_is_kept():

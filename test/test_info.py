@@ -409,7 +409,7 @@ def test_values_that_are_no_numbers(changed):
         if name == '/imu/data_raw' and time % 3 == 0:
             message.angular_velocity.x = math.nan
         if name == '/fix':
-            message.altitude = math.nan
+            message.altitude = math.inf
         if name == '/fix_velocity':
             message.twist.twist.linear.z = math.inf
         return [(name, time, message)]
@@ -418,6 +418,18 @@ def test_values_that_are_no_numbers(changed):
     assert by_name(info, '/imu/data_raw').imu.grade == 'tactical'
     assert by_name(info, '/fix').usable_share == 0.0
     json.dumps(info.to_json(), allow_nan=False)
+
+
+def test_positions_without_an_altitude(changed):
+    def change(name, time, message):
+        if name == '/fix':
+            message.altitude = math.nan
+        return [(name, time, message)]
+
+    info = inspect(changed(change))
+    assert by_name(info, '/fix').usable_share == 1.0
+    assert info.command is not None and not info.obstacles
+    assert by_name(info, '/fix_velocity').frame.frame == 'enu'
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])

@@ -186,9 +186,12 @@ def broken_gnss(stream: Stream, random: np.random.Generator) -> None:
     """Send nan, inf and what is nowhere."""
     chosen = _some(random, stream.fix, 0.02, 0.5)
     worthless = np.array([np.nan, np.inf, -np.inf, 1e300, -1e7])
-    stream.fix['lla'][chosen, random.integers(0, 3, len(chosen))] = random.choice(
-        worthless, len(chosen))
-    stream.expected['fix_nan'] = len(chosen)
+    values = random.choice(worthless, len(chosen))
+    axes = random.integers(0, 3, len(chosen))
+    stream.fix['lla'][chosen, axes] = values
+    no_altitude = np.count_nonzero((axes == 2) & np.isnan(values))
+    stream.expected['fix_no_altitude'] = no_altitude
+    stream.expected['fix_nan'] = len(chosen) - no_altitude
     chosen = _some(random, stream.velocity, 0.02, 0.5)
     values = random.choice(worthless, len(chosen))
     axes = random.integers(0, 3, len(chosen))
