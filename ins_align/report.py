@@ -16,10 +16,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 import io
 import math
 import os
 from pathlib import Path
+import sys
 from typing import Any, IO, TYPE_CHECKING
 
 from ins_align.bag_files import one_line
@@ -72,7 +74,7 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any])
     if is_stream(path):
         content = io.BytesIO()
         write(content)
-        with open(os.open(path, os.O_WRONLY | os.O_APPEND), 'wb') as stream:
+        with open(_opened(path), 'wb') as stream:
             stream.write(content.getvalue())
         return
     path = Path(os.path.realpath(path))
@@ -85,6 +87,16 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any])
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def _opened(path: str | os.PathLike[str]) -> int:
+    """Open a pipe or a device; of our own output, go on where it is."""
+    for number, stream in ((1, sys.stdout), (2, sys.stderr)):
+        with suppress(OSError):  # that one is closed
+            if os.path.samestat(os.stat(path), os.fstat(number)):
+                stream.flush()
+                return os.dup(number)
+    return os.open(path, os.O_WRONLY | os.O_APPEND)
 
 
 def format_table(rows: Sequence[Sequence[Any]], header: Sequence[str] = (),

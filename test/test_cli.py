@@ -470,6 +470,20 @@ def test_streams_that_are_closed_from_the_start(flight, tmp_path, closed):
     assert json.loads(path.read_text())['aligned']
 
 
+def test_json_to_an_output_that_is_a_file(standing, tmp_path):
+    """As in ``(ins_align info a; ins_align info b) > file``: nothing is written over."""
+    with open(tmp_path / 'out', 'wb') as out:
+        for _ in range(2):
+            subprocess.run([*COMMAND, 'info', standing, '--json', '/dev/stdout'], check=True,
+                           stdout=out, cwd=Path(__file__).parents[1],
+                           env={**os.environ, 'PYTHONUNBUFFERED': ''})
+    text = (tmp_path / 'out').read_text()
+    tables = re.split(r'^\{$.*?^\}$', text, flags=re.DOTALL | re.MULTILINE)
+    objects = re.findall(r'^\{$.*?^\}$', text, re.DOTALL | re.MULTILINE)
+    assert [json.loads(part)['bag'] for part in objects] == [str(standing)] * 2
+    assert [part.strip().startswith(str(standing)) for part in tables] == [True, True, False]
+
+
 @pytest.mark.parametrize('command, encoding, name, shown', [
     ('replay', 'ascii', 'Übung', r'\xdcbung'), ('info', 'ascii', 'Übung', r'\xdcbung'),
     ('replay', 'latin-1', 'Übung 日', r'Übung \u65e5'),
