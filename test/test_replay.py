@@ -27,7 +27,7 @@ from ins_align.config import Config
 from ins_align.decoding import Attitudes, Orientations
 from ins_align.replay import CSV_HEADER, Reference, replay
 from ins_align.rotation import exp_so3, matrix_from_rpy, quaternion_from_matrix
-from ins_align.simulation import feed, simulate, write_bag
+from ins_align.simulation import feed, simulate, Simulation, write_bag
 import numpy as np
 import pytest
 from recordings import real_recording, write_recording
@@ -162,6 +162,21 @@ def test_window_is_by_recorded_time(flight, simulation):
     assert replay(flight, CONFIG, start=10.0).status.counts['imu'] == \
         len(simulation.imu_stamps_ns) - 1000
     assert replay(flight, CONFIG, duration=10.0).status.counts['imu'] == 1000
+
+
+def test_track_is_of_fixes_that_are_some(tmp_path, simulation):
+    """Receivers say 0, 0 while they look for satellites."""
+    class Cold(Simulation):
+
+        def fix(self, k):
+            fix = super().fix(k)
+            return fix if k >= 10 else fix._replace(latitude_deg=0.0, longitude_deg=0.0, status=-1)
+
+    write_bag(Cold(**vars(simulation)), tmp_path / 'cold')
+    result = replay(tmp_path / 'cold', CONFIG)
+    assert result.status.counts['fix_no_fix'] == 10
+    assert len(result.track) == len(simulation.gnss_stamps_ns) - 10
+    assert np.ptp(result.track[:, 1]) < 1.0
 
 
 def test_progress_goes_up_to_one(flight):
