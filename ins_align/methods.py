@@ -339,8 +339,8 @@ class NoteMethod:
     The note's velocity (``vif``) or position (``pif``) integration formula with lever arm.
 
     Errors of the IMU are not known to it: its sigma comes from the centred moments, the noise of
-    the receiver and the residuals. ``pif`` takes positions where no velocity comes; the start
-    velocity is then always free.
+    the receiver and the residuals; those of the gyros count where the GNSS is silent. ``pif``
+    takes positions where no velocity comes; the start velocity is then always free.
 
     Parameters
     ----------
@@ -382,6 +382,7 @@ class NoteMethod:
         self._start_variance = _mean_variance(epoch.position_covariance if self._from_positions
                                               else epoch.velocity_covariance)
         self._solution: tuple[Array, Array] | None = None
+        self._solved_s = 0.0
         self._residual = 0.0
         if self._free or self._from_positions:
             self._pair(epoch)
@@ -430,6 +431,7 @@ class NoteMethod:
         A_n = C @ A @ C.T
         information = np.trace(A_n) * np.eye(3) - A_n
         self._residual = residual
+        self._solved_s = time
         white, common = self._noise()
         # What is common to all pairs does not average out.
         self._solution = C, np.linalg.inv(information / (white + self._moments.count * common)
@@ -457,7 +459,11 @@ class NoteMethod:
             return None
         C, covariance = self._solution
         C_nn0 = self._track.C_n0n.T
-        return orthonormalized(C_nn0 @ C @ self._body.C_b0b), C_nn0 @ covariance @ C_nn0.T
+        # Where no measurement comes, the gyros alone carry it on.
+        noise, silent_s = self._config.imu_noise, float(self._track.time) - self._solved_s
+        drift = noise.angle_random_walk ** 2 * silent_s + (noise.gyro_bias_std * silent_s) ** 2
+        return (orthonormalized(C_nn0 @ C @ self._body.C_b0b),
+                C_nn0 @ covariance @ C_nn0.T + drift * np.eye(3))
 
     def fit(self) -> Fit:
         """Return how well the data fit."""

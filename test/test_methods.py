@@ -128,3 +128,17 @@ def test_what_is_handed_on_is_widened_where_a_misfit_is_no_chance(ratio, dof, sc
     fit = Fit(chi2=ratio * dof, dof=dof, innovation=NOTHING_NEW, converged=True,
               rejected_velocity=0, rejected_position=0, rejected=0, offered=40, delay=0.0)
     assert fit.significant_scale == pytest.approx(scale)
+
+
+@pytest.mark.parametrize('method', ('vif', 'map'))
+def test_without_gnss_the_gyros_errors_count(method):
+    """They alone carry the attitude on."""
+    s = simulated('car', imu_grade='tactical', seed=1, duration=400.0, imu_rate=50.0,
+                  outages=((60.0, 400.0),))
+    aligner, epochs = aligned(s, method=method)
+    status = aligner.status()
+    assert epochs[-1].t_s < 61.0 and 'no GNSS for' in status.reason
+    before = epochs[-1].current.sigma_deg
+    assert np.all(status.current.sigma_deg > before)
+    error = np.degrees(np.abs(error_of(status.current, s)))
+    assert np.all(error < 4.0 * np.array(status.current.sigma_deg))
