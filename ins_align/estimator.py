@@ -411,15 +411,21 @@ class MapEstimator:
         return solution, self._run(solution, self._rows(solution), None,
                                    self._refused[:self.count])
 
+    def _try(self, point: Unknowns, noise: NoiseLevels, alike: Rows | None) -> tuple[Rows, float]:
+        """Return the rows of the stored epochs with other noise, and their log likelihood."""
+        solution = self._start(point, noise=noise)
+        rows = self._rows(solution, alike)
+        present = self._gnss.present[:self.count, :solution.kinds]
+        refused = self._refused[:self.count, :solution.kinds]
+        return rows, solution.log_likelihood_with(rows, present & ~refused)
+
     def _judge_excess(self, s: Solution) -> None:
         """Have it judged what share of the excess of the IMU's noise is believed."""
         likelihoods = []
         rows: Rows | None = None
         for share in SHARES:
-            solution = self._start(s.estimate, noise=self.noise._replace(excess=share))
-            rows = self._rows(solution, rows)
-            self._run(solution, rows, None, self._refused[:self.count])
-            likelihoods.append(solution.log_likelihood)
+            rows, likelihood = self._try(s.estimate, self.noise._replace(excess=share), rows)
+            likelihoods.append(likelihood)
         self.noise = self.noise._replace(excess=self._excess_judge.share(np.array(likelihoods)))
 
     def _tune_imu(self, s: Solution, name: str, steps: Iterable[Sequence[float]], most: float,
@@ -438,13 +444,10 @@ class MapEstimator:
                 if not 0.99 * getattr(FIRST_NOISE, name) <= trial <= 1.01 * most:
                     break
                 noise = self.noise._replace(**{name: trial})
-                solution = self._start(s.estimate, noise=noise)
-                rows = self._rows(solution, rows)
-                self._run(solution, rows, None, self._refused[:self.count])
-                gained = solution.log_likelihood - cost * math.log(step)
-                if gained > likelihood:
-                    best, likelihood = noise, gained
-                if solution.log_likelihood < s.log_likelihood:
+                rows, tried = self._try(s.estimate, noise, rows)
+                if tried - cost * math.log(step) > likelihood:
+                    best, likelihood = noise, tried - cost * math.log(step)
+                if tried < s.log_likelihood:
                     break
         self.noise = best
 

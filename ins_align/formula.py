@@ -255,8 +255,8 @@ class InertialTrack:
             seen(gravity_here), gravitation, int_gravitation, int_int_gravitation,
             self.origin_r, self.origin_v)
 
-    def at(self, index: int) -> 'InertialTrack':
-        """Return one epoch of a track over many."""
+    def at(self, index: int | tuple[()]) -> 'InertialTrack':
+        """Return one epoch of a track over many; () of a track that is of one."""
         return replace(self, **{name: getattr(self, name)[index] for name in (
             'time', 'C_n0n', 'still_v', 's_p', 'gravity', 'gravitation', 'int_gravitation',
             'int_int_gravitation')})

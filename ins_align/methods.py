@@ -142,7 +142,8 @@ class MapMethod:
                noise: NoiseLevels = FIRST_NOISE) -> None:
         self.t0_ns = epoch.stamp_ns
         self._renewed = self._good = self._contradicted = False
-        self._track = InertialTrack.start(epoch.latitude, epoch.longitude, epoch.altitude)
+        self._reached: tuple[InertialTrack, int | tuple[()]] = InertialTrack.start(
+            epoch.latitude, epoch.longitude, epoch.altitude), ()
         self._estimator = MapEstimator(
             prior, use_position=self._use_position,
             estimate_lever_arm=self._config.lever_arm_std > 0,
@@ -150,6 +151,12 @@ class MapMethod:
             estimate_matrices=self._estimates_matrices, noise=noise,
             rate_random_walk=self._config.imu_noise.rate_random_walk,
             excess_judge=self._excess_judge)
+
+    @property
+    def _track(self) -> InertialTrack:
+        """Track at the last epoch."""
+        track, place = self._reached
+        return track.at(place)
 
     def _take_start(self, epoch: AntennaEpoch, imu: ImuSteps) -> None:
         """Take the epoch at t0."""
@@ -214,7 +221,7 @@ class MapMethod:
                             track.gravity, -track.still_v)
         intervals = preintegrate(imu.steps, self._estimator.sensor_errors, imu.noise, imu.recent)
         for k, self._innovation in enumerate(self._estimator.add(intervals, gnss)):
-            self._track, self._last_epoch = track.at(k), epochs[k]
+            self._reached, self._last_epoch = (track, k), epochs[k]
             self._last_steps = imu, k
             self._correlation.add(self._innovation.normalised)
             self._offered += bool(present[k].any())
@@ -270,7 +277,8 @@ class MapMethod:
         if self._estimator.solution is None:
             return None
         C_n0b, covariance = self._estimator.current()
-        C_nn0 = self._track.C_n0n.T
+        track, place = self._reached
+        C_nn0 = track.C_n0n[place].T
         return C_nn0 @ C_n0b, C_nn0 @ covariance @ C_nn0.T
 
     def fit(self) -> Fit:

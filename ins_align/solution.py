@@ -110,9 +110,6 @@ class Solution:
     ----------
     columns : ndarray of int, shape (n,)
         As told.
-    chain : Chain
-        At the last epoch, with the biases of `point`.
-    whitener : Whitener
     rejected : list of int
         Velocities and positions that were taken for outliers.
     rejected_epochs : int
@@ -153,8 +150,9 @@ class Solution:
         self._weak = np.diag(WEAK_INFORMATION[columns])
         self._known = int(np.count_nonzero(self.information.diagonal()))
         self._gyro = np.flatnonzero((columns >= GYRO.start) & (columns < GYRO.stop))
-        self.chain = Chain.start()
-        self.whitener = Whitener(columns, size, rate_random_walk > 0)
+        self._chain = Chain.start()
+        self._whitener = Whitener(columns, size, rate_random_walk > 0)
+        self._reached: tuple[Course, int] | None = None     # where these two are to go
         self.rejected, self.rejected_epochs = [0, 0], 0
         self.time = 0.0
         self.dx = np.zeros(columns.size)
@@ -230,8 +228,7 @@ class Solution:
 
     def move_to(self, course: Course, k: int) -> None:
         """Go to where the solution is after one of the epochs."""
-        self.chain = course.chain.at(k)
-        self.whitener.move_to(course.whitened, k)
+        self._reached = course, k
         self.time = float(course.time[k])
         self.dx, self.P, self.estimate = course.dx[k], course.P[k], course.estimate.at(k)
         self.chi2, self.dof = float(course.chi2[k]), int(course.dof[k])
@@ -239,6 +236,25 @@ class Solution:
         self.C, self.covariance = course.C[k], course.covariance[k]
         self.turned = course.turned[k]
         self.gyro_bias = course.gyro_bias[k]
+
+    @property
+    def chain(self) -> Chain:
+        """At the last epoch, with the biases of `point`."""
+        self._follow()
+        return self._chain
+
+    @property
+    def whitener(self) -> Whitener:
+        """At the last epoch."""
+        self._follow()
+        return self._whitener
+
+    def _follow(self) -> None:
+        """Bring chain and whitener to the last epoch, where few ask for them."""
+        if self._reached is not None:
+            course, k = self._reached
+            self._chain, self._reached = course.chain.at(k), None
+            self._whitener.move_to(course.whitened, k)
 
     def _course(self, rows: Rows, whitened: Whitened, index: slice) -> Course:
         """Solve the normal equations and judge the fit after each epoch of `index`."""
@@ -302,8 +318,21 @@ class Solution:
     @property
     def log_likelihood(self) -> float:
         """Log likelihood at the best overall scale of all covariances, but for a constant."""
-        scale = max(self.chi2 / max(self.dof, 1), 1.0)
-        return -0.5 * (self.whitener.log_det + self.dof * math.log(scale) + self.chi2 / scale)
+        return _log_likelihood(self.chi2, self.dof, self.whitener.log_det)
+
+    def log_likelihood_with(self, rows: Rows, wanted: np.ndarray) -> float:
+        """Return what `log_likelihood` would be if it took what is wanted of epochs."""
+        normal, count, log_det = self.whitener.sums(rows, wanted)
+        prior = self.information @ self._mean_step
+        right = normal[1:, 0] + prior
+        dx = inverse_spd(self.information + normal[1:, 1:] + self._weak) @ right
+        return _log_likelihood(float(normal[0, 0] + self._mean_step @ prior - right @ dx),
+                               count - self.columns.size + self._known, log_det)
+
+
+def _log_likelihood(chi2: float, dof: int, log_det: float) -> float:
+    scale = max(chi2 / max(dof, 1), 1.0)
+    return -0.5 * (log_det + dof * math.log(scale) + chi2 / scale)
 
 
 def _nonlinearity(step: Array, P: Array, time: Array) -> Array:
