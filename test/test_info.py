@@ -377,7 +377,7 @@ def test_an_imu_that_says_it_does_not_measure(changed):
 def test_fixes_without_numbers(changed):
     def change(name, time, message):
         if name == '/fix':
-            message.altitude = math.nan
+            message.latitude = math.nan
         return [(name, time, message)]
 
     info = inspect(changed(change))
