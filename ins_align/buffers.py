@@ -19,7 +19,7 @@ epoch is released once the IMU is far enough ahead of it, so that results depend
 and not on when somebody looked.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 import math
 
@@ -40,6 +40,9 @@ MAX_PENDING = 10_000
 # each message when it arrives (ns).
 PAIR_NS = 50_000_000
 NO_FIX, STATUS_UNKNOWN = -1, -2
+# A receiver without a fix does not know its velocity either, whatever it sends: none is taken
+# until the next fix, or for this long (ns).
+NO_FIX_NS = 2_000_000_000
 # IMU samples that are kept before those wanted: interpolation needs two, the checks the rest.
 KEPT_BEFORE = 2 + IMU_BEFORE
 # So many IMU samples in a row that go in order, behind the newest one, through a time that others
@@ -265,7 +268,8 @@ class GnssBuffer:
         How much later than newer IMU samples a message may arrive.
     counts : Counter
         Where messages are counted, and epochs that only repeat the one before
-        (``gnss_repeated``) or are behind the end of the IMU (``gnss_after_imu``).
+        (``gnss_repeated``) or are behind the end of the IMU (``gnss_after_imu``), and velocities
+        of a receiver that has no fix (``velocity_no_fix``).
     pair_ns : int
         A fix and a velocity that are no further apart are of one epoch; 0: where the stamp is one.
 
@@ -284,6 +288,8 @@ class GnssBuffer:
         self._pair_ns = pair_ns
         self._pending: dict[int, GnssEpoch] = {}
         self._said: tuple[float, ...] = ()          # position and velocity, released last
+        self._fix_ns = -(1 << 62)                   # the last fix that was released
+        self._no_fix_ns: deque[int] = deque(maxlen=MAX_PENDING)
         self.off_ns: dict[str, int] = {}
 
     def add_fix(self, fix: Fix, imu_newest_ns: int | None) -> None:
@@ -292,6 +298,8 @@ class GnssBuffer:
         fix = with_an_altitude(fix)
         if fault := fault_of_fix(fix):
             self._counts[f'fix_{fault}'] += 1
+            if fault == 'no_fix' and not self._off(fix.stamp_ns, imu_newest_ns):
+                self._no_fix_ns.append(fix.stamp_ns)
         else:
             if fix.status == STATUS_UNKNOWN:
                 self._counts['fix_status_unknown'] += 1
@@ -317,15 +325,22 @@ class GnssBuffer:
         elif epoch is not None:
             self._counts['velocity_duplicate'] += 1
 
+    def _off(self, stamp_ns: int, imu_newest_ns: int | None) -> str:
+        """Return how a stamp is too far from the IMU to be used: ``late``, ``ahead`` or ''."""
+        if imu_newest_ns is None:
+            return ''
+        if stamp_ns < imu_newest_ns - self._lateness_ns:
+            return 'late'
+        return 'ahead' if stamp_ns > imu_newest_ns + MAX_AHEAD_NS else ''
+
     def _epoch(self, stamp_ns: int, imu_newest_ns: int | None, kind: str) -> GnssEpoch | None:
         """Return the pending epoch of a stamp; None and a count when it cannot be used."""
-        if imu_newest_ns is not None:
-            late = stamp_ns < imu_newest_ns - self._lateness_ns
-            if late or stamp_ns > imu_newest_ns + MAX_AHEAD_NS:
-                reason = f'{kind}_late' if late else f'{kind}_ahead'
-                self._counts[reason] += 1
-                self.off_ns[reason] = abs(stamp_ns - imu_newest_ns)
-                return None
+        off = self._off(stamp_ns, imu_newest_ns)
+        if imu_newest_ns is not None and off:
+            reason = f'{kind}_{off}'
+            self._counts[reason] += 1
+            self.off_ns[reason] = abs(stamp_ns - imu_newest_ns)
+            return None
         if len(self._pending) >= MAX_PENDING:
             oldest = min(self._pending)
             del self._pending[oldest]
@@ -357,17 +372,31 @@ class GnssBuffer:
             if half_may_come or (joint is not None and joint.stamp_ns > upto_ns):
                 break
             parts = [epoch] if close is None or joint is None else [epoch, close]
+            place += len(parts)
+            if any(part.fix for part in parts):
+                self._fix_ns = epoch.stamp_ns
             if self._repeats(parts):
                 self._counts['gnss_repeated'] += 1
+            elif self._is_without_fix(joint or epoch):
+                self._counts['velocity_no_fix'] += 1
             else:
                 released.append(joint or epoch)
-            place += len(parts)
         for stamp in stamps[:place]:
             del self._pending[stamp]
+        self._no_fix_ns = deque((stamp for stamp in self._no_fix_ns
+                                 if stamp > upto_ns - NO_FIX_NS), MAX_PENDING)
         if last:
             self._counts['gnss_after_imu'] += len(self._pending)
             self._pending.clear()
         return released
+
+    def _is_without_fix(self, epoch: GnssEpoch) -> bool:
+        """Whether an epoch is a velocity of a receiver that said last that it has no fix."""
+        upto_ns = epoch.stamp_ns + self._pair_ns
+        said_ns = max((stamp for stamp in self._no_fix_ns if stamp <= upto_ns),
+                      default=self._fix_ns)
+        return (epoch.fix is None and said_ns > self._fix_ns
+                and epoch.stamp_ns - said_ns <= NO_FIX_NS)
 
     def _repeats(self, parts: list[GnssEpoch]) -> bool:
         """

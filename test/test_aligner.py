@@ -383,6 +383,29 @@ def test_without_gnss_what_was_declared_is_withdrawn_when_it_is_lost():
                       (Severity.WARNING, 'ALIGNING')]
 
 
+def test_zeros_in_a_tunnel_are_no_velocities():
+    """A driver that goes on without a fix is the same as one that is silent."""
+    s = simulated('car', imu_grade='mems', duration=60.0, seed=1)
+
+    def run(in_tunnel):
+        aligner = Aligner(config_for(s))
+        for k in range(len(s.gnss_stamps_ns)):
+            fix, velocity = s.fix(k), s.velocity_measurement(k)
+            if 150 <= k < 200:
+                if not in_tunnel:
+                    continue
+                fix, velocity = fix._replace(status=-1), velocity._replace(velocity=np.zeros(3))
+            aligner.add_fix(fix)
+            aligner.add_velocity(velocity)
+        aligner.add_imu(s.imu_stamps_ns, s.gyro, s.accel)
+        return aligner.flush(), aligner.status()
+
+    (silent, at_end), (zeros, with_zeros) = run(False), run(True)
+    assert with_zeros.counts['velocity_no_fix'] == 50 and with_zeros.state is State.ALIGNED
+    assert with_zeros.reason == at_end.reason and len(zeros) == len(silent)
+    assert np.array_equal(zeros[-1].current.C_nb, silent[-1].current.C_nb)
+
+
 @pytest.mark.parametrize('use_position', ('auto', False))
 def test_positions_take_over_where_velocities_stop(use_position):
     s = simulated('car', imu_grade='mems', duration=150.0, seed=1, position_std=1.0)

@@ -330,6 +330,32 @@ def test_a_receiver_that_stands_or_says_half_repeats_nothing():
     assert len(buffer.release(100 * MS)) == 9 and counts['gnss_repeated'] == 0
 
 
+@pytest.mark.parametrize('late', (0, 30 * MS))
+def test_velocities_of_a_receiver_without_a_fix_are_left_out(late):
+    """It sends zeros, or what it knew last, and some messages have no room to say so."""
+    counts = Counter()
+    buffer = GnssBuffer(LATENESS, counts, PAIR_NS)
+    epochs = []
+    for k in range(12):                                     # twice as many velocities as fixes
+        if k % 2 == 0:
+            buffer.add_fix(fix(k * 100 * MS, status=-1 if 4 <= k < 8 else 0), None)
+        buffer.add_velocity(velocity(k * 100 * MS + late), None)
+        epochs += buffer.release((k - 2) * 100 * MS)
+    epochs += buffer.release(2000 * MS)
+    assert [epoch.stamp_ns - late for epoch in epochs] == [
+        k * 100 * MS for k in range(12) if not 4 <= k < 8]
+    assert counts['velocity_no_fix'] == 4 and counts['fix_no_fix'] == 2
+    # Who says nothing of a fix any more may have one again.
+    buffer.add_fix(fix(3000 * MS, status=-1), 3000 * MS)
+    for stamp in (3000 * MS, 5000 * MS, 5100 * MS):
+        buffer.add_velocity(velocity(stamp), None)
+    assert [epoch.stamp_ns for epoch in buffer.release(6000 * MS)] == [5100 * MS]
+    # Too late to tell anything, as a fix would be.
+    buffer.add_fix(fix(7000 * MS, status=-1), 9000 * MS)
+    buffer.add_velocity(velocity(7500 * MS), 8000 * MS)
+    assert len(buffer.release(9000 * MS)) == 1
+
+
 def test_what_is_behind_the_end_is_left_out_and_counted():
     buffer = GnssBuffer(LATENESS, counts := Counter(), PAIR_NS)
     for k in range(4):
