@@ -130,7 +130,7 @@ class Alignment:
         if self._learnt is None:
             return None
         prior, learnt_ns = self._learnt
-        return aged(prior, self.config.imu_noise, (stamp_ns - learnt_ns) * 1e-9)
+        return aged(prior, self.config, (stamp_ns - learnt_ns) * 1e-9)
 
     def _advance(self, run: Run) -> list[Epoch]:
         method = self._method

@@ -16,39 +16,48 @@
 from dataclasses import replace
 import math
 
-from ins_align.config import ImuNoise
+from ins_align.config import Config
 from ins_align.earth import EARTH_RATE
 from ins_align.estimator import MapEstimator
 from ins_align.rotation import Array, exp_so3, Index, skew
-from ins_align.unknowns import (ACCEL, ACCEL_BIAS, ANTENNA, ATTITUDE, BODY_FIXED, GYRO, GYRO_BIAS,
-                                inverse_spd, Prior, prior_of, SIZE, START_POSITION, START_VELOCITY,
-                                Unknowns)
+from ins_align.unknowns import (ACCEL, ACCEL_BIAS, ANTENNA, ATTITUDE, BODY_FIXED, DELAY, GYRO,
+                                GYRO_BIAS, inverse_spd, Prior, prior_of, SIZE, START_POSITION,
+                                START_VELOCITY, Unknowns)
 from ins_align.whitening import HEADING_RESOLVED_STD, START
 import numpy as np
 
-# Biases wander by this share of their prior sigma in this time (s).
-WANDER, WANDER_TIME = 0.3, 100.0
+# Biases wander by this share of their prior sigma in this time (s), and so does the delay: clocks
+# of IMU and GNSS that nothing keeps together drift apart by up to 0.1 ms in a second.
+WANDER, DELAY_WANDER, WANDER_TIME = 0.3, 0.1, 100.0
 
 
-def wander(noise: ImuNoise) -> Array:
+def wander(config: Config) -> Array:
     """
     Return the variance by which the unknowns change in a second, shape (37,).
 
     Beside a rate random walk of the gyroscopes, which the estimator counts all the time.
     """
+    noise = config.imu_noise
     variance = np.zeros(SIZE)
+    variance[DELAY] = (DELAY_WANDER * config.gnss_delay_std) ** 2 / WANDER_TIME
     if noise.rate_random_walk == 0.0:
         variance[GYRO_BIAS] = (WANDER * noise.gyro_bias_std) ** 2 / WANDER_TIME
     variance[ACCEL_BIAS] = (WANDER * noise.accel_bias_std) ** 2 / WANDER_TIME
     return variance
 
 
-def aged(prior: Prior, noise: ImuNoise, seconds: float) -> Prior:
+def aged(prior: Prior, config: Config, seconds: float) -> Prior:
     """Return what is left of what was known, after a time in which nothing was measured."""
-    variance = wander(noise)
-    variance[GYRO_BIAS] += noise.rate_random_walk ** 2
-    for block in (GYRO_BIAS, ACCEL_BIAS):
-        prior = prior.loosened(block, math.sqrt(variance[block.start] * seconds))
+    variance = wander(config)
+    variance[GYRO_BIAS] += config.imu_noise.rate_random_walk ** 2
+    return _loosened(prior, seconds * variance, (GYRO_BIAS, ACCEL_BIAS, DELAY))
+
+
+def _loosened(prior: Prior, variance: Array, blocks: tuple[slice, ...]) -> Prior:
+    """Return what is known where blocks of unknowns have changed; variances, shape (37,)."""
+    for block in blocks:
+        if variance[block.start] > 0.0:
+            prior = prior.loosened(block, math.sqrt(variance[block.start]))
     return prior
 
 
@@ -107,7 +116,9 @@ def prior_from_now(estimator: MapEstimator, C_n0n: Array, shift_v: Array, shift_
     mean = replace(now, C=C_n0n.T @ now.C, start_velocity=C_n0n.T @ (now.start_velocity + shift_v),
                    start_position=C_n0n.T @ (now.start_position + shift_p))
     prior = prior_of(mean, joint[np.ix_(places, places)], unknowns, heading_free)
-    return prior.with_antenna_of(estimator.prior) if heading_free else prior
+    if heading_free:
+        prior = prior.with_antenna_of(_loosened(estimator.prior, wander, (DELAY,)))
+    return prior
 
 
 def prior_without_attitude(estimator: MapEstimator) -> Prior:

@@ -121,7 +121,7 @@ class MapMethod:
         self.moved = 0
         noise = config.imu_noise
         self._estimates_matrices = noise.gyro_scale_std > 0
-        self._wander = wander(noise)
+        self._wander = wander(config)
         self._first_prior = first_prior(
             noise.gyro_bias_std, noise.accel_bias_std, np.array(config.lever_arm),
             config.lever_arm_std, 0.0, config.gnss_delay_std, noise.gyro_scale_std,
@@ -245,7 +245,7 @@ class MapMethod:
         track = self._track
         fit = self.fit()
         if self._estimator.solution is None:                    # full of epochs without GNSS
-            prior = aged(self._estimator.prior, self._config.imu_noise, float(track.time))
+            prior = aged(self._estimator.prior, self._config, float(track.time))
         elif self._lost:
             prior, self._past = self._first_prior, (0.0, 0)
             self._correlation = Correlation()

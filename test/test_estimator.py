@@ -23,7 +23,7 @@ from ins_align import scenarios
 from ins_align.config import PRESETS
 from ins_align.estimator import MapEstimator
 from ins_align.experiments.dense import bound, dense_solution
-from ins_align.handover import prior_from_now
+from ins_align.handover import aged, prior_from_now, wander
 from ins_align.methods import MapMethod
 from ins_align.preintegration import Noise, preintegrate, SensorErrors, Steps
 from ins_align.results import State
@@ -159,6 +159,7 @@ def test_handover_gives_the_attitude_of_one_that_never_handed_over(changes, walk
     monkeypatch.setattr('ins_align.fit.Fit.factor', 1.0)
     monkeypatch.setattr('ins_align.fit.Fit.significant_scale', 1.0)
     monkeypatch.setattr('ins_align.handover.WANDER', 0.0)
+    monkeypatch.setattr('ins_align.handover.DELAY_WANDER', 0.0)
     monkeypatch.setattr(MapEstimator, 'NONLINEARITY', 0.01)
     s = simulated('flight', imu_grade='tactical', duration=30.0, seed=2, position_std=0.5,
                   rate_random_walk=walk * PRESETS['tactical'].gyro_bias_std)
@@ -186,19 +187,19 @@ def covariance_of(prior):
 def test_handover_widens_by_the_misfit_and_by_what_biases_may_have_wandered():
     s = simulated('flight', imu_grade='tactical', duration=30.0, seed=2)
     estimator = estimator_of(aligned(s)[0])
-    none, wander = np.zeros(3), np.zeros(SIZE)
-    still = covariance_of(prior_from_now(estimator, np.eye(3), none, none, 1.0, wander))
+    none, changed = np.zeros(3), np.zeros(SIZE)
+    still = covariance_of(prior_from_now(estimator, np.eye(3), none, none, 1.0, changed))
     assert np.allclose(np.diag(still)[:3], np.diag(estimator.current()[1]), rtol=1e-5)
-    wide = covariance_of(prior_from_now(estimator, np.eye(3), none, none, 4.0, wander))
+    wide = covariance_of(prior_from_now(estimator, np.eye(3), none, none, 4.0, changed))
     # What the data told counts a quarter, what was known before them as much as ever.
     ratio = np.diag(wide)[np.diag(still) > 0] / np.diag(still)[np.diag(still) > 0]
     assert np.all(ratio > 0.999) and np.all(ratio < 4.001)
     before = covariance_of(estimator.prior)
     assert np.all(np.diag(wide)[BODY_FIXED] <= 1.001 * np.diag(before)[BODY_FIXED])
     assert np.all(ratio[-3:] > 3.5)                             # velocity: of the data alone
-    wander[GYRO_BIAS], wander[ACCEL_BIAS] = 1e-10, 1e-4
-    moved = covariance_of(prior_from_now(estimator, np.eye(3), none, none, 1.0, wander))
-    assert np.allclose(np.diag(moved - still), wander, rtol=1e-3, atol=1e-14)
+    changed[GYRO_BIAS], changed[ACCEL_BIAS] = 1e-10, 1e-4
+    moved = covariance_of(prior_from_now(estimator, np.eye(3), none, none, 1.0, changed))
+    assert np.allclose(np.diag(moved - still), changed, rtol=1e-3, atol=1e-14)
 
 
 @pytest.mark.parametrize('scenario', ('reverse', 'flight', 'hover'))
@@ -254,6 +255,32 @@ def test_standing_in_vibration_shows_neither_lever_arm_nor_delay(monkeypatch, sc
     assert np.all(np.abs(status.lever_arm - s.lever_arm) < 4.0 * status.lever_arm_std)
     declared = [normalised_error(e.current, s) for e in epochs if e.state is State.ALIGNED]
     assert max(declared) < chi2.ppf(0.99999, 3)
+
+
+@pytest.mark.parametrize('scenario', ('car', 'flight'))
+def test_clocks_that_drift_apart_are_followed(monkeypatch, scenario):
+    """Nothing keeps the clocks of a microcontroller and of a receiver together."""
+    monkeypatch.setattr('ins_align.alignment.MapMethod', partial(MapMethod, capacity=100))
+    s = simulated(scenario, imu_grade='mems', duration=300.0, imu_rate=50.0, seed=1)
+    drifted_ns = np.rint(1e-4 * (s.gnss_stamps_ns - s.imu_stamps_ns[0])).astype(np.int64)
+    late = replace(s, gnss_stamps_ns=s.gnss_stamps_ns + drifted_ns)
+    status = aligned(late, lever_arm_std=1.0, gnss_delay_std=0.1)[0].status()
+    assert status.counts['rebases'] >= 12 and status.state is State.ALIGNED
+    assert abs(status.gnss_delay - 1e-9 * drifted_ns[-1]) < 4.0 * status.gnss_delay_std
+
+
+@pytest.mark.parametrize('scenario', ('static', 'flight'))
+def test_clocks_go_on_whether_anything_shows_the_delay_or_not(scenario):
+    s = simulated(scenario, imu_grade='mems', duration=30.0, seed=2)
+    config = config_for(s, gnss_delay_std=0.1)
+    estimator = estimator_of(aligned(s, gnss_delay_std=0.1)[0])
+    none = np.zeros(3)
+    for before, later in (
+            (estimator.prior, aged(estimator.prior, config, 100.0)),
+            (prior_from_now(estimator, np.eye(3), none, none, 1.0, change)
+             for change in (np.zeros(SIZE), 100.0 * wander(config)))):
+        grown = (covariance_of(later) - covariance_of(before))[DELAY, DELAY]
+        assert grown[0, 0] == pytest.approx(0.01 ** 2, rel=1e-3)
 
 
 def test_silence_after_a_handful_of_epochs_may_fill_the_store(monkeypatch):
