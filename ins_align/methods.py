@@ -38,7 +38,7 @@ from ins_align.signs import SignCheck
 from ins_align.solution import NoiseLevels
 from ins_align.told import ToldCheck
 from ins_align.unknowns import (ACCEL_BIAS, ATTITUDE, DELAY, first_prior, GYRO_BIAS, LEVER_ARM,
-                                Prior, UNIFORM_ANGLE_STD, Unknowns)
+                                Prior, START_POSITION, UNIFORM_ANGLE_STD, Unknowns)
 from ins_align.whitening import Measurements
 import numpy as np
 
@@ -47,6 +47,8 @@ PAST_DOF = 300
 # Beside velocities positions gain little and hurt when their errors wander: where a method may
 # choose, it takes them when no velocity came for this long (ns).
 VELOCITY_STOPPED_NS = 10_000_000_000
+# It leaves them out again when velocities have come for this long (ns).
+VELOCITY_BACK_NS = 2_000_000_000
 # Epochs that are integrated at one go: few right after the linearisation point has moved, because
 # then it will soon again.
 MAX_AHEAD = 64
@@ -117,6 +119,7 @@ class MapMethod:
         self._config = config
         self._use_position = use_position
         self._velocity_ns = epoch.stamp_ns      # the last one
+        self._velocities_since_ns: int | None = None
         self._capacity = capacity
         self.moved = 0
         noise = config.imu_noise
@@ -144,6 +147,8 @@ class MapMethod:
         self._renewed = self._good = self._contradicted = False
         self._reached: tuple[InertialTrack, int | tuple[()]] = InertialTrack.start(
             epoch.latitude, epoch.longitude, epoch.altitude), ()
+        if not self._use_position:
+            prior = prior.without(START_POSITION)
         self._estimator = MapEstimator(
             prior, use_position=self._use_position,
             estimate_lever_arm=self._config.lever_arm_std > 0,
@@ -228,14 +233,19 @@ class MapMethod:
             self._look_for_velocity(epochs[k])
             yield epochs[k]
             if self._use_position != use_position:
-                return                              # the next ones have positions too
+                return                              # the next ones have positions too, or none
 
     def _look_for_velocity(self, epoch: AntennaEpoch) -> None:
-        """Go on with positions from a later t0 where velocities have stopped."""
+        """Use positions, from a later t0, where velocities have stopped, until they are back."""
+        stopped = epoch.stamp_ns - self._velocity_ns > VELOCITY_STOPPED_NS
         if epoch.v_n is not None:
+            if self._velocities_since_ns is None or stopped:
+                self._velocities_since_ns = epoch.stamp_ns
             self._velocity_ns = epoch.stamp_ns
-        elif (self._config.use_position == 'auto' and epoch.position_measured
-              and epoch.stamp_ns - self._velocity_ns > VELOCITY_STOPPED_NS):
+            if (self._config.use_position == 'auto'
+                    and epoch.stamp_ns - self._velocities_since_ns >= VELOCITY_BACK_NS):
+                self._use_position = False
+        elif self._config.use_position == 'auto' and epoch.position_measured and stopped:
             self._use_position = True
             self._renewed |= self._estimator.size == 6 and self._estimator.solution is not None
 

@@ -146,6 +146,14 @@ class Prior:
         return prior_of(self.mean, covariance[np.ix_(unknowns, unknowns)], unknowns,
                         self.heading_free)
 
+    def without(self, block: slice) -> 'Prior':
+        """Return what is known of the other unknowns."""
+        if not self.information[block].any():
+            return self
+        known, covariance = self._known()
+        kept = ~np.isin(known, np.r_[block])
+        return prior_of(self.mean, covariance[np.ix_(kept, kept)], known[kept], self.heading_free)
+
     def with_antenna_of(self, other: 'Prior') -> 'Prior':
         """Return this, which knows nothing of lever arm and delay, with what another knows."""
         known, covariance = other._known()

@@ -14,13 +14,15 @@
 """The aligner as a whole: states, faults of messages, outputs, wrong set-ups."""
 
 from dataclasses import replace
+from functools import partial
 import math
 
-from alignment import (aligned, config_for, error_deg, error_of, LEVER, normalised_error,
-                       simulated)
+from alignment import (aligned, config_for, error_deg, error_of, estimator_of, LEVER,
+                       normalised_error, simulated)
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config, ConfigError, ImuNoise, PRESETS
 from ins_align.experiments.declare import largest, run_trial
+from ins_align.methods import MapMethod
 from ins_align.results import Severity
 from ins_align.rotation import exp_so3, matrix_from_quaternion, roll_pitch_yaw
 from ins_align.scenarios import Motion, Scenario, SCENARIOS
@@ -421,6 +423,38 @@ def test_positions_take_over_where_velocities_stop(use_position):
     assert error < chi2.ppf(0.9999, 3)
     assert (epochs[-1].state is State.ALIGNED) == (use_position == 'auto')
     assert (epochs[-1].current.sigma_deg[2] < 1.0) == (use_position == 'auto')
+
+
+@pytest.mark.parametrize('until_s', (5.0, 25.0))
+def test_velocities_that_come_late_are_used_without_positions(monkeypatch, until_s):
+    """Positions that wander are better than nothing, and worse than velocities alone."""
+    monkeypatch.setattr('ins_align.alignment.MapMethod', partial(MapMethod, capacity=150))
+    s = simulated('hover', imu_grade='mems', duration=90.0, seed=1, position_std=0.5,
+                  position_drift_std=1.5)
+
+    first_ns = int(s.gnss_stamps_ns[0] + until_s * SECOND)
+
+    def run(block):
+        aligner, epochs = Aligner(config_for(s)), []
+        for count, (kind, payload) in enumerate(s.messages()):
+            if kind == 'imu':
+                aligner.add_imu(*payload)
+            elif kind == 'fix':
+                aligner.add_fix(payload)
+            elif payload.stamp_ns >= first_ns:
+                aligner.add_velocity(payload)
+            if count % block == 0:
+                epochs += aligner.update()
+        return aligner, epochs + aligner.flush()
+
+    aligner, epochs = run(500)
+    assert estimator_of(aligner).size == 6 and aligner.status().state is State.ALIGNED
+    assert next(e.t_s for e in epochs if e.state is State.ALIGNED) < until_s + 55.0
+    declared = [normalised_error(e.current, s) for e in epochs if e.state is State.ALIGNED]
+    assert max(declared) < chi2.ppf(0.99999, 3)
+    _, in_blocks = run(7)
+    assert np.array_equal([e.current.C_nb for e in epochs if e.current],
+                          [e.current.C_nb for e in in_blocks if e.current])
 
 
 def test_velocities_that_stop_at_once_are_the_same_in_any_split():

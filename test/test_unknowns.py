@@ -113,6 +113,19 @@ def test_a_loosened_prior_forgets_one_block_alone(block, told_std):
     assert np.array_equal(loose.mean.vector(), prior.mean.vector())
 
 
+def test_a_prior_without_a_block_knows_as_much_of_the_others():
+    """Not more, as it would if the block were known."""
+    A = np.random.default_rng(5).standard_normal((SIZE, SIZE))
+    covariance, known = A @ A.T, np.delete(np.arange(SIZE), np.r_[LEVER_ARM])
+    prior = prior_of(some_unknowns(), covariance[np.ix_(known, known)], known, False)
+    rest = np.delete(np.arange(SIZE), np.r_[LEVER_ARM, START_POSITION])
+    left = prior.without(START_POSITION)
+    assert np.allclose(np.linalg.inv(left.information[np.ix_(rest, rest)]),
+                       covariance[np.ix_(rest, rest)], rtol=1e-6, atol=1e-6)
+    assert not left.information[START_POSITION].any() and left.mean is prior.mean
+    assert left.without(START_POSITION) is left
+
+
 def test_inverse_of_rows_of_any_scale():
     root = np.random.default_rng(0).standard_normal((6, 6))
     scale = np.diag(10.0 ** np.array([-8, -4, 0, 3, 6, 8]))
