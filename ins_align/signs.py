@@ -108,13 +108,14 @@ class SignCheck:
         if self._gyros_right.all():
             return ''
         evidence, harm = one_gyro_evidence(estimator)
-        # What was refused as outliers may be what spoke for it: that it did counts until t0 moves.
+        # What was refused as outliers may be what spoke for it, and a fit that goes astray speaks
+        # against it for a moment: that anything spoke for it counts until t0 moves.
         self._least = np.minimum(self._least, evidence)
         reversed_ = ~self._gyros_right & (self._least < -GAIN)
         if reversed_.any():
             axis = 'xyz'[int(np.argmin(np.where(reversed_, self._least, 0.0)))]
             return BETTER.format(f'the angular rate about {axis} reversed')
-        self._gyros_right |= evidence > GAIN
+        self._gyros_right |= evidence + self._least > GAIN
         return UNCONFIRMED if np.any(~self._gyros_right & (harm > HARMLESS)) else ''
 
 

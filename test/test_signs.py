@@ -89,6 +89,16 @@ def test_a_launch_with_one_gyro_reversed_is_never_aligned(axis, seed):
     assert State.ALIGNED not in {epoch.state for epoch in epochs}
 
 
+def test_a_car_that_backs_out_with_one_gyro_reversed_is_never_aligned():
+    """A fit that goes astray after 85 s speaks for the right sign, for four epochs."""
+    s = simulated('reverse', imu_grade='mems', duration=88.0, seed=427, flip_gyro='z',
+                  heading_deg=40.514933, latitude_deg=-13.211179,
+                  lever_arm=(1.117373, -0.364103, -0.715554),
+                  mount_rpy_deg=(8.827634, -4.522443, 9.2002397))
+    states = {epoch.state for epoch in feed(Aligner(config_for(s)), s)}
+    assert State.LEVELLED in states and State.ALIGNED not in states
+
+
 def test_what_speaks_for_a_reversed_gyro_counts_until_t0_moves():
     """Then the fit may have refused as outliers what spoke for it."""
     s = simulated('car', imu_grade='mems', duration=17.0, seed=3)
