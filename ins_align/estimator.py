@@ -302,8 +302,12 @@ class MapEstimator:
     def _run(self, s: Solution, rows: Rows, gate: Gate | None, refused: np.ndarray) -> Whitened:
         """Take all stored epochs into an empty solution; without a gate those not refused."""
         present = self._gnss.present[:self.count, :s.kinds]
-        wanted = present if gate is not None else present & ~refused[:, :s.kinds]
+        wanted = present if gate is not None else self._unrefused(s, refused)
         return s.run(rows, present, wanted, gate, self._gate_scale)
+
+    def _unrefused(self, s: Solution, refused: np.ndarray) -> np.ndarray:
+        """Return which measurements of all stored epochs are there and not refused."""
+        return self._gnss.present[:self.count, :s.kinds] & ~refused[:, :s.kinds]
 
     def _corrected(self, epochs: slice, sensors: SensorErrors) -> Intervals:
         """Return stored intervals as they would be with other sensor errors."""
@@ -415,9 +419,8 @@ class MapEstimator:
         """Return the rows of the stored epochs with other noise, and their log likelihood."""
         solution = self._start(point, noise=noise)
         rows = self._rows(solution, alike)
-        present = self._gnss.present[:self.count, :solution.kinds]
-        refused = self._refused[:self.count, :solution.kinds]
-        return rows, solution.log_likelihood_with(rows, present & ~refused)
+        wanted = self._unrefused(solution, self._refused[:self.count])
+        return rows, solution.log_likelihood_with(rows, wanted)
 
     def _judge_excess(self, s: Solution) -> None:
         """Have it judged what share of the excess of the IMU's noise is believed."""
@@ -553,11 +556,14 @@ class MapEstimator:
         prior, columns = self.prior, self.columns
         for block, std in free:
             prior, columns = prior.loosened(block, std), np.union1d(columns, np.r_[block])
-        solution, _ = self._rerun(self._solved.point, prior, columns)
-        if reconsider and self._refused[:self.count].any():
+        refused = self._refused[:self.count]
+        solution = self._start(self._solved.point, prior, columns)
+        rows = self._rows(solution)
+        self._run(solution, rows, None, refused)
+        if reconsider and refused.any():
             gate = Gate(solution.dx, solution.P)
             solution = self._start(solution.point, prior, columns)
-            self._run(solution, self._rows(solution), gate, self._refused[:self.count])
+            self._run(solution, rows, gate, refused)
         return solution
 
     def gnss_share(self, of_prior: float) -> float:

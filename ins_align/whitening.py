@@ -23,6 +23,7 @@ first, then position; both in n0.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from ins_align.preintegration import Intervals
 from ins_align.recent import AGES, exact, smooth
@@ -391,6 +392,22 @@ class Whitened:
     S: Array
 
 
+class _Factors(NamedTuple):
+    """What factoring K epochs yields: the state after the last one, and their innovations."""
+
+    P: Array
+    X: Array
+    normal: Array
+    white: Array            # innovations, whitened, (K, 3 * kinds, 1 + n)
+    roots: Array            # Cholesky factors of their covariances, (K, kinds, 3, 3)
+    covariance: Array       # of the measurements; unit matrices where none is taken, as roots
+
+    @property
+    def log_det(self) -> float:
+        """Of the covariance of all innovations."""
+        return 2.0 * float(np.sum(np.log(np.diagonal(self.roots, axis1=-2, axis2=-1))))
+
+
 class Whitener:
     """
     The small Kalman filter over the chain's errors, and the normal equations that it feeds.
@@ -503,47 +520,34 @@ class Whitener:
 
     def whitened_at_once(self, rows: Rows, wanted: np.ndarray) -> Whitened:
         """Filter epochs like `whitened`, several times faster, for the state after the last."""
-        factored = self._factored(rows, wanted)
-        if factored is None:
+        factors = self._factored(rows, wanted)
+        if factors is None:
             return self.whitened(rows, wanted)
-        P, X, normal, white, roots = factored
+        roots = factors.roots
         S_of = roots @ roots.swapaxes(-1, -2)
-        covariance = np.where(wanted[:, :, None, None], rows.covariance, np.eye(3))
-        feigned = _feigned(inverse_spd(S_of), S_of - covariance)
-        return Whitened(P[None], X[None], normal[None],
+        feigned = _feigned(inverse_spd(S_of), S_of - factors.covariance)
+        return Whitened(factors.P[None], factors.X[None], factors.normal[None],
                         np.array([self.rows + 3 * np.count_nonzero(wanted)]),
                         np.array([self.spurious + np.sum(feigned)]),
-                        np.array([self.log_det + _log_det(roots)]), wanted,
-                        roots @ white.reshape(rows.Y.shape), S_of)
+                        np.array([self.log_det + factors.log_det]), wanted,
+                        roots @ factors.white.reshape(rows.Y.shape), S_of)
 
     def sums(self, rows: Rows, wanted: np.ndarray) -> tuple[Array, int, float]:
         """Return what `normal`, `rows` and `log_det` would be after epochs, and nothing else."""
-        factored = self._factored(rows, wanted)
-        if factored is None:
+        factors = self._factored(rows, wanted)
+        if factors is None:
             after = self.whitened(rows, wanted)
             return after.normal[-1], int(after.rows[-1]), float(after.log_det[-1])
-        _, _, normal, _, roots = factored
-        count = self.rows + 3 * int(np.count_nonzero(wanted))
-        return normal, count, self.log_det + _log_det(roots)
+        return (factors.normal, self.rows + 3 * int(np.count_nonzero(wanted)),
+                self.log_det + factors.log_det)
 
-    def _factored(self, rows: Rows, wanted: np.ndarray,
-                  ) -> tuple[Array, Array, Array, Array, Array] | None:
+    def _factored(self, rows: Rows, wanted: np.ndarray) -> '_Factors | None':
         """
         Factor the covariance of the measurements of epochs, block by block; None if that fails.
 
         The errors of the chain are a random walk: the covariance of the measurements of a block
         of epochs can be written down. Its Cholesky factor makes of them, row after row, the same
         innovations as a filter does.
-
-        Returns
-        -------
-        P, X, normal : ndarray
-            After the last epoch.
-        white : ndarray, shape (K, 3 * kinds, 1 + n)
-            Innovations, whitened.
-        roots : ndarray, shape (K, kinds, 3, 3)
-            Cholesky factors of their covariances.
-
         """
         K, kinds = wanted.shape
         there = wanted[:, :, None, None]
@@ -576,11 +580,7 @@ class Whitener:
             normal = normal + new.T @ new
             white[block] = new.reshape(count, 3 * kinds, -1)
             roots[block] = root.reshape(shape)[own]
-        return P, X, normal, white, roots
-
-
-def _log_det(roots: Array) -> float:
-    return 2.0 * float(np.sum(np.log(np.diagonal(roots, axis1=-2, axis2=-1))))
+        return _Factors(P, X, normal, white, roots, covariance)
 
 
 def _feigned(inverse: Array, own: Array) -> Array:
