@@ -211,6 +211,7 @@ class ImuBuffer:
 
 def fault_of_fix(fix: Fix) -> str:
     """Return what a fix that cannot be used is counted as: ``no_fix``, ``nan``, or ''."""
+    fix = with_an_altitude(fix)
     position = fix.latitude_deg, fix.longitude_deg, fix.altitude_m
     if fix.status == NO_FIX or position[:2] == (0.0, 0.0):
         return 'no_fix'
@@ -383,8 +384,9 @@ class GnssBuffer:
                 released.append(joint or epoch)
         for stamp in stamps[:place]:
             del self._pending[stamp]
-        self._no_fix_ns = deque((stamp for stamp in self._no_fix_ns
-                                 if stamp > upto_ns - NO_FIX_NS), MAX_PENDING)
+        if self._no_fix_ns:
+            self._no_fix_ns = deque((stamp for stamp in self._no_fix_ns
+                                     if stamp > upto_ns - NO_FIX_NS), MAX_PENDING)
         if last:
             self._counts['gnss_after_imu'] += len(self._pending)
             self._pending.clear()

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 from ins_align.ahead import run_ahead
 from ins_align.alignment import Alignment
 from ins_align.bags import Topics
-from ins_align.buffers import fault_of_fix, with_an_altitude
+from ins_align.buffers import fault_of_fix
 from ins_align.config import Config
 from ins_align.decoding import Attitudes, Refused
 from ins_align.intake import Intake, Step
@@ -234,7 +234,7 @@ def _prepared(request: Request) -> Generator[_Prepared, None, None]:
         _feed(intake, part)
         fixes = [(message.stamp_ns, message.latitude_deg, message.longitude_deg)
                  for _, message in part.gnss
-                 if isinstance(message, Fix) and not fault_of_fix(with_an_altitude(message))]
+                 if isinstance(message, Fix) and not fault_of_fix(message)]
         intake.prepare()
         prepared = _Prepared(part.topics, part.config, intake.take_steps(), fixes,
                              part.orientations.known(), Counter(intake.counts), part.done,
