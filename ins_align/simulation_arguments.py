@@ -17,7 +17,7 @@ from collections.abc import Callable
 import math
 from typing import Any
 
-from ins_align.config import ImuNoise, PRESETS
+from ins_align.config import ImuNoise, parameters, PRESETS
 from ins_align.scenarios import SCENARIOS
 import numpy as np
 
@@ -26,7 +26,6 @@ IMU_AXES = {'': (1.0, 1.0, 1.0), 'x': (-1.0, 1.0, 1.0), 'y': (1.0, -1.0, 1.0),
             'z': (1.0, 1.0, -1.0)}
 
 LATENESS_MARGIN = 0.5  # s, of gnss_lateness over the latency
-MAX_LATENCY = 59.5
 _MAX_SAMPLES = 20_000_000
 
 
@@ -60,12 +59,15 @@ def checked_arguments(arguments: dict[str, Any]) -> ImuNoise:
           'rate_random_walk gnss_phase stand_still',
           'a number, 0 or above', lambda value: number(value) and value >= 0)
     # As far as the parameters go that make up for them.
-    check('gnss_latency', f'a number of seconds from 0 to {MAX_LATENCY:g}',
-          lambda value: number(value) and 0 <= value <= MAX_LATENCY)
-    check('gnss_delay', 'a number of seconds from 0 to 10',
-          lambda value: number(value) and 0 <= value <= 10)
-    check('gyro_scale_std', 'a number from 0 to 0.5',
-          lambda value: number(value) and 0 <= value <= 0.5)
+    most = {parameter.name: parameter.maximum for parameter in parameters()
+            if parameter.maximum is not None}
+    latency = most['gnss_lateness'] - LATENESS_MARGIN
+    check('gnss_latency', f'a number of seconds from 0 to {latency:g}',
+          lambda value: number(value) and 0 <= value <= latency)
+    check('gnss_delay', f'a number of seconds from 0 to {most["gnss_delay"]:g}',
+          lambda value: number(value) and 0 <= value <= most['gnss_delay'])
+    check('gyro_scale_std', f'a number from 0 to {most["gyro_scale_std"]:g}',
+          lambda value: number(value) and 0 <= value <= most['gyro_scale_std'])
     check('velocity_std_vertical position_std_vertical gyro_bias_std accel_bias_std',
           'a number, 0 or above', lambda value: value is None or number(value) and value >= 0)
     check('position_drift_time', 'a number of seconds above 0',
@@ -80,9 +82,9 @@ def checked_arguments(arguments: dict[str, Any]) -> ImuNoise:
     check('longitude_deg heading_deg crab_deg', 'a finite number', number)
     check('mount_rpy_deg', 'three finite numbers',
           lambda value: np.shape(value) == (3,) and all(map(number, value)))
-    check('lever_arm', 'three numbers of metres from -1000 to 1000',
+    check('lever_arm', 'three numbers of metres from -{0:g} to {0:g}'.format(most['lever_arm']),
           lambda value: np.shape(value) == (3,) and all(map(number, value))
-          and max(map(abs, value)) <= 1000)
+          and max(map(abs, value)) <= most['lever_arm'])
     check('outages', 'pairs of a start and a later end in seconds',
           lambda value: all(np.shape(pair) == (2,) and pair[0] < pair[1] for pair in value))
     check('velocity_frame', 'enu or ned', lambda value: value in VELOCITY_FRAMES)
