@@ -17,7 +17,7 @@ from dataclasses import replace
 from functools import partial
 import math
 
-from alignment import (aligned, config_for, error_deg, error_of, estimator_of, LEVER,
+from alignment import (aligned, config_for, error_deg, error_of, estimator_of, give, LEVER,
                        normalised_error, simulated)
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config, ConfigError, ImuNoise, PRESETS
@@ -437,12 +437,8 @@ def test_velocities_that_come_late_are_used_without_positions(monkeypatch, until
     def run(block):
         aligner, epochs = Aligner(config_for(s)), []
         for count, (kind, payload) in enumerate(s.messages()):
-            if kind == 'imu':
-                aligner.add_imu(*payload)
-            elif kind == 'fix':
-                aligner.add_fix(payload)
-            elif payload.stamp_ns >= first_ns:
-                aligner.add_velocity(payload)
+            if kind != 'velocity' or payload.stamp_ns >= first_ns:
+                give(aligner, kind, payload)
             if count % block == 0:
                 epochs += aligner.update()
         return aligner, epochs + aligner.flush()

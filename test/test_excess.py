@@ -15,7 +15,7 @@
 
 from dataclasses import replace
 
-from alignment import aligned, config_for, error_of, estimator_of, simulated
+from alignment import aligned, config_for, error_of, estimator_of, give, simulated
 from ins_align.aligner import Aligner
 from ins_align.excess import ExcessJudge, SHARES
 from ins_align.results import State
@@ -115,12 +115,7 @@ def test_vibration_that_averages_out_is_not_believed_for_long(scenario):
     aligner = Aligner(config_for(s))
     shares = {}
     for kind, payload in s.messages():
-        if kind == 'imu':
-            aligner.add_imu(*payload)
-        elif kind == 'fix':
-            aligner.add_fix(payload)
-        else:
-            aligner.add_velocity(payload)
+        give(aligner, kind, payload)
         for epoch in aligner.update():
             shares[epoch.t_s] = estimator_of(aligner).noise.excess
     assert max(share for t_s, share in shares.items() if t_s < 25.0) <= 1 / 3

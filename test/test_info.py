@@ -72,6 +72,15 @@ def velocity_changed(function):
     return change
 
 
+def fix_changed(name, value):
+    """Return a change of one field of each fix."""
+    def change(topic, time, message):
+        if topic == '/fix':
+            setattr(message, name, value)
+        return [(topic, time, message)]
+    return change
+
+
 def command_of(info):
     assert info.command is not None, info.obstacles
     arguments = shlex.split(info.command)
@@ -375,12 +384,7 @@ def test_an_imu_that_says_it_does_not_measure(changed):
 
 
 def test_fixes_without_numbers(changed):
-    def change(name, time, message):
-        if name == '/fix':
-            message.latitude = math.nan
-        return [(name, time, message)]
-
-    info = inspect(changed(change))
+    info = inspect(changed(fix_changed('latitude', math.nan)))
     assert info.command is None and 'numbers that can be used' in info.obstacles[0]
 
 
@@ -421,12 +425,7 @@ def test_values_that_are_no_numbers(changed):
 
 
 def test_positions_without_an_altitude(changed):
-    def change(name, time, message):
-        if name == '/fix':
-            message.altitude = math.nan
-        return [(name, time, message)]
-
-    info = inspect(changed(change))
+    info = inspect(changed(fix_changed('altitude', math.nan)))
     assert by_name(info, '/fix').usable_share == 1.0
     assert info.command is not None and not info.obstacles
     assert by_name(info, '/fix_velocity').frame.frame == 'enu'

@@ -13,7 +13,7 @@
 # limitations under the License.
 """What must not matter: frames, clocks, callbacks, order of arrival."""
 
-from alignment import aligned, config_for, error_of, LEVER, simulated
+from alignment import aligned, config_for, error_of, give, LEVER, simulated
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from ins_align.aligner import Aligner
@@ -71,12 +71,7 @@ def test_any_callbacks_and_any_order_within_lateness_give_the_same_epochs(refere
     epochs = []
     share = data.draw(st.sampled_from([0.0, 0.02, 0.5]))
     for _, kind, payload in events:
-        if kind == 'imu':
-            aligner.add_imu(*payload)
-        elif kind == 'fix':
-            aligner.add_fix(payload)
-        else:
-            aligner.add_velocity(payload)
+        give(aligner, kind, payload)
         if random.random() < share:
             epochs += aligner.update()
     epochs += aligner.flush()
