@@ -140,6 +140,8 @@ class MapEstimator:
         self.noise = noise
         self._excess_judge = excess_judge or ExcessJudge()
         self._rate_random_walk = rate_random_walk
+        # What other noise would have made of the epochs up to one, at this linearisation point.
+        self._trials: dict[NoiseLevels, tuple[Solution, int]] = {}
         self.gated = True
         self._recent: deque[float] = deque(maxlen=self.GATE_WINDOW)
         self._gate_scale = 1.0
@@ -302,12 +304,12 @@ class MapEstimator:
     def _run(self, s: Solution, rows: Rows, gate: Gate | None, refused: np.ndarray) -> Whitened:
         """Take all stored epochs into an empty solution; without a gate those not refused."""
         present = self._gnss.present[:self.count, :s.kinds]
-        wanted = present if gate is not None else self._unrefused(s, refused)
+        wanted = present if gate is not None else self._unrefused(s, refused, slice(0, self.count))
         return s.run(rows, present, wanted, gate, self._gate_scale)
 
-    def _unrefused(self, s: Solution, refused: np.ndarray) -> np.ndarray:
-        """Return which measurements of all stored epochs are there and not refused."""
-        return self._gnss.present[:self.count, :s.kinds] & ~refused[:, :s.kinds]
+    def _unrefused(self, s: Solution, refused: np.ndarray, epochs: slice) -> np.ndarray:
+        """Return which measurements of stored epochs are there and not refused."""
+        return self._gnss.present[epochs, :s.kinds] & ~refused[epochs, :s.kinds]
 
     def _corrected(self, epochs: slice, sensors: SensorErrors) -> Intervals:
         """Return stored intervals as they would be with other sensor errors."""
@@ -367,6 +369,7 @@ class MapEstimator:
     def _fit(self) -> None:
         """Move the linearisation point from where it is; while that is doubtful, from others."""
         self._last_fit = self.count
+        self._trials.clear()
         old = self.solution
         resolved = old is not None and self.heading_std < HEADING_RESOLVED_STD
         gate = old.P if old is not None and resolved and self.gated else None
@@ -415,20 +418,27 @@ class MapEstimator:
         return solution, self._run(solution, self._rows(solution), None,
                                    self._refused[:self.count])
 
-    def _try(self, point: Unknowns, noise: NoiseLevels, alike: Rows | None) -> tuple[Rows, float]:
-        """Return the rows of the stored epochs with other noise, and their log likelihood."""
-        solution = self._start(point, noise=noise)
-        rows = self._rows(solution, alike)
-        wanted = self._unrefused(solution, self._refused[:self.count])
-        return rows, solution.log_likelihood_with(rows, wanted)
+    def _likelihood_with(self, s: Solution, noise: NoiseLevels, alike: dict[int, Rows]) -> float:
+        """
+        Return the log likelihood of the stored epochs with other noise, linearised where `s` is.
+
+        A trial goes on from the epoch that it had reached when it was asked last. `alike`: rows
+        of other trials at this epoch, by where they begin.
+        """
+        trial, done = self._trials.get(noise) or (self._start(s.point, noise=noise), 0)
+        epochs = slice(done, self.count)
+        rows = alike[done] = trial.rows(self._gnss.take(epochs),
+                                        self._corrected(epochs, s.point.sensors), alike.get(done))
+        wanted = self._unrefused(trial, self._refused, epochs)
+        trial.run(rows, wanted, wanted, None, 1.0)
+        self._trials[noise] = trial, self.count
+        return trial.log_likelihood
 
     def _judge_excess(self, s: Solution) -> None:
         """Have it judged what share of the excess of the IMU's noise is believed."""
-        likelihoods = []
-        rows: Rows | None = None
-        for share in SHARES:
-            rows, likelihood = self._try(s.estimate, self.noise._replace(excess=share), rows)
-            likelihoods.append(likelihood)
+        alike: dict[int, Rows] = {}
+        likelihoods = [self._likelihood_with(s, self.noise._replace(excess=share), alike)
+                       for share in SHARES]
         self.noise = self.noise._replace(excess=self._excess_judge.share(np.array(likelihoods)))
 
     def _tune_imu(self, s: Solution, name: str, steps: Iterable[Sequence[float]], most: float,
@@ -440,14 +450,14 @@ class MapEstimator:
         larger one that way is not tried.
         """
         best, likelihood = self.noise, s.log_likelihood + gain
-        rows: Rows | None = None
+        alike: dict[int, Rows] = {}
         for one_way in steps:
             for step in one_way:
                 trial = step * getattr(self.noise, name)
                 if not 0.99 * getattr(FIRST_NOISE, name) <= trial <= 1.01 * most:
                     break
                 noise = self.noise._replace(**{name: trial})
-                rows, tried = self._try(s.estimate, noise, rows)
+                tried = self._likelihood_with(s, noise, alike)
                 if tried - cost * math.log(step) > likelihood:
                     best, likelihood = noise, tried - cost * math.log(step)
                 if tried < s.log_likelihood:

@@ -320,15 +320,6 @@ class Solution:
         """Log likelihood at the best overall scale of all covariances, but for a constant."""
         return _log_likelihood(self.chi2, self.dof, self.whitener.log_det)
 
-    def log_likelihood_with(self, rows: Rows, wanted: np.ndarray) -> float:
-        """Return what `log_likelihood` would be if it took what is wanted of epochs."""
-        normal, count, log_det = self.whitener.sums(rows, wanted)
-        prior = self.information @ self._mean_step
-        right = normal[1:, 0] + prior
-        dx = inverse_spd(self.information + normal[1:, 1:] + self._weak) @ right
-        return _log_likelihood(float(normal[0, 0] + self._mean_step @ prior - right @ dx),
-                               count - self.columns.size + self._known, log_det)
-
 
 def _log_likelihood(chi2: float, dof: int, log_det: float) -> float:
     scale = max(chi2 / max(dof, 1), 1.0)

@@ -532,15 +532,6 @@ class Whitener:
                         np.array([self.log_det + factors.log_det]), wanted,
                         roots @ factors.white.reshape(rows.Y.shape), S_of)
 
-    def sums(self, rows: Rows, wanted: np.ndarray) -> tuple[Array, int, float]:
-        """Return what `normal`, `rows` and `log_det` would be after epochs, and nothing else."""
-        factors = self._factored(rows, wanted)
-        if factors is None:
-            after = self.whitened(rows, wanted)
-            return after.normal[-1], int(after.rows[-1]), float(after.log_det[-1])
-        return (factors.normal, self.rows + 3 * int(np.count_nonzero(wanted)),
-                self.log_det + factors.log_det)
-
     def _factored(self, rows: Rows, wanted: np.ndarray) -> '_Factors | None':
         """
         Factor the covariance of the measurements of epochs, block by block; None if that fails.
