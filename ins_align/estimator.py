@@ -129,8 +129,6 @@ class MapEstimator:
         self.prior = prior
         self._capacity = capacity
         self._intervals = Intervals.empty(capacity)
-        # With which the intervals were integrated.
-        self._sensor_errors = np.zeros((capacity, 24))
         self._gnss = Measurements.empty(capacity)
         # Outliers when they came.
         self._refused = np.zeros((capacity, 2), bool)
@@ -148,22 +146,17 @@ class MapEstimator:
 
     # Input
 
-    @property
-    def sensor_errors(self) -> SensorErrors:
-        """Those of the linearisation point: integrate the next intervals with them."""
-        return (self.prior.mean if self.solution is None else self.solution.point).sensors
-
     def add(self, intervals: Intervals, gnss: Measurements) -> Iterator[Innovation]:
         """
         Append epochs one after the other; the very first one is t0, its interval has no length.
 
-        Stops early, after an epoch at which the linearisation point has moved: the intervals
-        behind it want to be integrated anew. Whoever iterates may call `settle` in between.
+        Stops early, after an epoch at which the linearisation point has moved: what was made of
+        those behind it is of no use. Whoever iterates may call `settle` in between.
 
         Parameters
         ----------
         intervals : Intervals
-            K of them, integrated with `sensor_errors`.
+            K of them, integrated with sensor errors of zero.
         gnss : Measurements
             The K epochs at their ends.
 
@@ -183,14 +176,13 @@ class MapEstimator:
         count = min(gnss.time.size, self._capacity - self.count)
         places = slice(self.count, self.count + count)
         self._intervals.put(places, intervals.take(slice(0, count)))
-        self._sensor_errors[places] = self.sensor_errors.vector()
         self._gnss.put(places, gnss.take(slice(0, count)))
         measured: list[bool] = np.any(gnss.present[:count], axis=1).tolist()
         s = self.solution
         if s is None:
             yield from self._first(measured)
             return
-        rows = s.rows(self._gnss.take(places), self._intervals.take(places))
+        rows = s.rows(self._gnss.take(places), self._corrected(places, s.point.sensors))
         wanted = gnss.present[:count, :s.kinds].copy()
         done, ahead = 0, count
         refused: Tests = {}                       # of the next epoch
@@ -312,10 +304,8 @@ class MapEstimator:
         return self._gnss.present[epochs, :s.kinds] & ~refused[epochs, :s.kinds]
 
     def _corrected(self, epochs: slice, sensors: SensorErrors) -> Intervals:
-        """Return stored intervals as they would be with other sensor errors."""
-        change = sensors.vector() - self._sensor_errors[epochs]
-        intervals = self._intervals.take(epochs)
-        return intervals.corrected(change) if np.any(change) else intervals
+        """Return stored intervals as they are with these sensor errors."""
+        return self._intervals.take(epochs).corrected(sensors.vector())
 
     # Solution
 
@@ -604,8 +594,8 @@ class MapEstimator:
         return float(np.clip(np.max(more) - 1.0, 0.0, 1.0))
 
     def raw_intervals(self) -> Intervals:
-        """Return the stored intervals as they would be with sensor errors of zero."""
-        return self._corrected(slice(0, self.count), SensorErrors.none())
+        """Return the stored intervals, as they are with sensor errors of zero."""
+        return self._intervals.take(slice(0, self.count))
 
     # Results
 

@@ -28,7 +28,8 @@ from ins_align.buffers import ImuBuffer
 from ins_align.config import ImuNoise
 from ins_align.g_sensitivity import GSensitivity
 from ins_align.plausibility import IMU_BEFORE, RangeCheck, without_spikes
-from ins_align.preintegration import Noise, split_at_epochs, Steps, white_noise
+from ins_align.preintegration import (Intervals, Noise, preintegrate, SensorErrors,
+                                      split_at_epochs, Steps, white_noise)
 from ins_align.recent import Recent, recent_motion
 from ins_align.rotation import Array, Index
 import numpy as np
@@ -54,19 +55,11 @@ class ImuSteps:
 
     steps: Steps
     noise: Noise
-    recent: Recent | None = None
+    recent: Recent
 
-    def take(self, index: slice) -> 'ImuSteps':
-        """Return those of some epochs."""
-        return ImuSteps(self.steps.take(index), self.noise.take(index),
-                        None if self.recent is None else self.recent.take(index))
-
-    def end(self) -> 'ImuSteps':
-        """Return the end of a single epoch's steps, of no length and without noise."""
-        steps, none = self.steps, np.zeros((1, 1))
-        instant = (np.repeat(array[:, -1:], 2, axis=1)
-                   for array in (steps.omega, steps.f, steps.omega_dot, steps.f_dot))
-        return ImuSteps(Steps(none, *instant), Noise(none, none, none, none))
+    def integrated(self) -> Intervals:
+        """Return the intervals that they make, integrated as if the sensors had no errors."""
+        return preintegrate(self.steps, SensorErrors.none(), self.noise, self.recent)
 
 
 class ImuCutter:

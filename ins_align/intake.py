@@ -25,9 +25,10 @@ from typing import NamedTuple, Union
 from ins_align.antenna import Antenna, AntennaEpoch
 from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer, MAX_GAP_NS, PAIR_NS
 from ins_align.config import Config
-from ins_align.imu_steps import ImuCutter, ImuSteps
+from ins_align.imu_steps import ImuCutter
 from ins_align.messages import Fix, Velocity
 from ins_align.plausibility import stuck
+from ins_align.preintegration import Intervals
 from ins_align.results import State, Verdict
 from ins_align.rotation import Array
 import numpy as np
@@ -70,7 +71,7 @@ class Start:
     Attributes
     ----------
     first : Located
-    imu : ImuSteps
+    imu : Intervals
         Of no length, at the epoch.
     use_position : bool
         Whether positions are measurements to align with.
@@ -80,7 +81,7 @@ class Start:
     """
 
     first: Located
-    imu: ImuSteps
+    imu: Intervals
     use_position: bool
     without_velocity: str = ''
 
@@ -93,7 +94,7 @@ class Run:
     Attributes
     ----------
     located : list of Located
-    imu : ImuSteps
+    imu : Intervals
         Before each.
     forces : list of (float, int, float)
         Sum and number of the magnitudes of the specific force before each epoch, and seconds.
@@ -101,7 +102,7 @@ class Run:
     """
 
     located: list[Located]
-    imu: ImuSteps
+    imu: Intervals
     forces: list[tuple[float, int, float]]
 
 
@@ -363,9 +364,9 @@ class Intake:
         cuts = np.flatnonzero(np.diff(size // MAX_RUN_SAMPLES)) + 1
         for part in np.split(np.arange(len(run)), cuts):
             located = run[part[0]:part[-1] + 1]
-            self.steps.append(Run(located, *self._cutter.cut(
-                [each.epoch.stamp_ns for each in located],
-                [each.gravity_drift for each in located])))
+            imu, forces = self._cutter.cut([each.epoch.stamp_ns for each in located],
+                                           [each.gravity_drift for each in located])
+            self.steps.append(Run(located, imu.integrated(), forces))
 
     def _start(self, located: Located) -> None:
         """Make an epoch t0 if it can be one."""
@@ -397,7 +398,7 @@ class Intake:
             self._wait(State.WAITING_FOR_IMU, silence.why)
             return
         self._last_ns = epoch.stamp_ns
-        imu = self._cutter.start(epoch.stamp_ns)
+        imu = self._cutter.start(epoch.stamp_ns).integrated()
         self.steps.append(Start(located, imu, bool(use_position),
                                 no_velocity if wanted and epoch.v_n is None else ''))
 

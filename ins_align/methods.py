@@ -14,8 +14,8 @@
 """
 The alignment methods behind one face: the note's (``vif``, ``pif``) and ``map``.
 
-A method takes GNSS epochs with the IMU steps before them and tells the initial attitude (at its
-t0), the current one, and how well its model fits.
+A method takes GNSS epochs with the IMU intervals before them and tells the initial attitude (at
+its t0), the current one, and how well its model fits.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,8 +30,7 @@ from ins_align.excess import ExcessJudge
 from ins_align.fit import Fit, no_fit, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, BodyIntegrals, InertialTrack, NavigationIntegrals
 from ins_align.handover import aged, prior_from_now, prior_without_attitude, wander
-from ins_align.imu_steps import ImuSteps
-from ins_align.preintegration import Noise, preintegrate, SensorErrors
+from ins_align.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance, State
 from ins_align.rotation import Array, orthonormalized
 from ins_align.signs import SignCheck
@@ -60,8 +59,8 @@ class Method(Protocol):
     t0_ns: int
     moved: int                          # how often t0 was moved forward
 
-    def advance(self, epochs: Sequence[AntennaEpoch], imu: ImuSteps) -> Iterator[AntennaEpoch]:
-        """Take epochs and the IMU steps before each; yield each when the results are its."""
+    def advance(self, epochs: Sequence[AntennaEpoch], imu: Intervals) -> Iterator[AntennaEpoch]:
+        """Take epochs and the IMU intervals before each; yield each when the results are its."""
 
     def initial(self) -> tuple[Array, Array] | None:
         """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
@@ -103,7 +102,7 @@ class MapMethod:
     config : Config
     epoch : AntennaEpoch
         t0.
-    imu : ImuSteps
+    imu : Intervals
         Of no length, at t0.
     use_position : bool
     prior : Prior, optional
@@ -113,7 +112,7 @@ class MapMethod:
 
     """
 
-    def __init__(self, config: Config, epoch: AntennaEpoch, imu: ImuSteps, use_position: bool,
+    def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals, use_position: bool,
                  prior: Prior | None = None, capacity: int = 1000) -> None:
         """Start at t0."""
         self._config = config
@@ -163,13 +162,13 @@ class MapMethod:
         track, place = self._reached
         return track.at(place)
 
-    def _take_start(self, epoch: AntennaEpoch, imu: ImuSteps) -> None:
+    def _take_start(self, epoch: AntennaEpoch, imu: Intervals) -> None:
         """Take the epoch at t0."""
         for _ in self._take([epoch], imu):
             pass
 
-    def advance(self, epochs: Sequence[AntennaEpoch], imu: ImuSteps) -> Iterator[AntennaEpoch]:
-        """Take epochs and the IMU steps before each; yield each when the results are its."""
+    def advance(self, epochs: Sequence[AntennaEpoch], imu: Intervals) -> Iterator[AntennaEpoch]:
+        """Take epochs and the IMU intervals before each; yield each when the results are its."""
         done = 0
         while done < len(epochs):
             if self._due():
@@ -208,7 +207,7 @@ class MapMethod:
         """
         return self._contradicted and not self._good and not self._estimator.idle
 
-    def _take(self, epochs: Sequence[AntennaEpoch], imu: ImuSteps) -> Iterator[AntennaEpoch]:
+    def _take(self, epochs: Sequence[AntennaEpoch], imu: Intervals) -> Iterator[AntennaEpoch]:
         """Take epochs as long as the estimator stays where it is."""
         track = self._track.extended(
             np.array([epoch.stamp_ns - self.t0_ns for epoch in epochs]) * 1e-9,
@@ -224,10 +223,9 @@ class MapMethod:
         gnss = Measurements(track.time, np.hstack([track.s_v(v_n), track.s_p]),
                             C_n0n @ covariance @ C_n0n.transpose(0, 1, 3, 2), present,
                             track.gravity, -track.still_v)
-        intervals = preintegrate(imu.steps, self._estimator.sensor_errors, imu.noise, imu.recent)
-        for k, self._innovation in enumerate(self._estimator.add(intervals, gnss)):
+        for k, self._innovation in enumerate(self._estimator.add(imu, gnss)):
             self._reached, self._last_epoch = (track, k), epochs[k]
-            self._last_steps = imu, k
+            self._last_interval = imu, k
             self._correlation.add(self._innovation.normalised)
             self._offered += bool(present[k].any())
             self._look_for_velocity(epochs[k])
@@ -272,7 +270,7 @@ class MapMethod:
         self.moved += 1
         start = replace(self._last_epoch, v_n=None, position_measured=False)
         self._start(start, prior, self._estimator.noise)
-        imu, k = self._last_steps
+        imu, k = self._last_interval
         self._take_start(start, imu.take(slice(k, k + 1)).end())
 
     def initial(self) -> tuple[Array, Array] | None:
@@ -346,9 +344,9 @@ def _mean_variance(covariance: Array) -> float:
     return float(np.trace(covariance)) / 3
 
 
-def _force_at_rest(imu: ImuSteps) -> Array:
+def _force_at_rest(imu: Intervals) -> Array:
     """Specific force of a vehicle that stands as it did at t0, about, shape (3,)."""
-    force = imu.steps.f[0, -1] if imu.recent is None else imu.recent.gained[0, -1]
+    force = imu.gained[0, -1]
     return np.asarray(STANDARD_GRAVITY * force / max(float(np.linalg.norm(force)), 1e-3))
 
 
@@ -365,14 +363,14 @@ class NoteMethod:
     config : Config
     epoch : AntennaEpoch
         t0.
-    imu : ImuSteps
+    imu : Intervals
         Of no length, at t0.
     use_position : bool
         For ``pif``: integrate positions, not velocities.
 
     """
 
-    def __init__(self, config: Config, epoch: AntennaEpoch, imu: ImuSteps,
+    def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals,
                  use_position: bool) -> None:
         """Start at t0."""
         self.t0_ns = epoch.stamp_ns
@@ -382,7 +380,7 @@ class NoteMethod:
         self._free = config.free_start
         self._position_form = config.method == 'pif'
         self._from_positions = self._position_form and use_position
-        self._body = BodyIntegrals(self._lever_b, imu.steps.omega[0, -1])
+        self._body = BodyIntegrals(self._lever_b, imu.omega[0])
         place = epoch.latitude, epoch.longitude, epoch.altitude
         self._track = InertialTrack.start(*place)
         self._navigation: NavigationIntegrals | None = None
@@ -405,11 +403,10 @@ class NoteMethod:
         if self._free or self._from_positions:
             self._pair(epoch)
 
-    def advance(self, epochs: Sequence[AntennaEpoch], imu: ImuSteps) -> Iterator[AntennaEpoch]:
-        """Take epochs and the IMU steps before each; yield each when the results are its."""
-        intervals = preintegrate(imu.steps, SensorErrors.none(), Noise())
+    def advance(self, epochs: Sequence[AntennaEpoch], imu: Intervals) -> Iterator[AntennaEpoch]:
+        """Take epochs and the IMU intervals before each; yield each when the results are its."""
         for k, epoch in enumerate(epochs):
-            self._body.advance(intervals, k)
+            self._body.advance(imu, k)
             time = (epoch.stamp_ns - self.t0_ns) * 1e-9
             place = epoch.latitude, epoch.longitude, epoch.altitude
             self._track = self._track.extended(*np.array([time, *place])[:, None]).at(0)

@@ -19,7 +19,7 @@ samples both are taken as cubics in time; a GNSS stamp inside a step splits it t
 of an interval, and all intervals of a batch, are handled as arrays.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 from ins_align.recent import Recent, RUNGS
@@ -138,6 +138,12 @@ class Intervals:
     def take(self, index: 'slice | Array') -> 'Intervals':
         """Return the intervals of `index`."""
         return Intervals(**{name: array[index] for name, array in vars(self).items()})
+
+    def end(self) -> 'Intervals':
+        """Return the interval of no length, and without noise, at the end of a single one."""
+        none = Intervals.empty(1)
+        none.R[:] = np.eye(3)
+        return replace(none, omega=self.omega, gained=self.gained, turned=self.turned)
 
     def mirrored(self, gyro_sign: float, accel_sign: float) -> 'Intervals':
         """
