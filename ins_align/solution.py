@@ -173,8 +173,7 @@ class Solution:
         kinds = self.kinds
         if alike is None:
             chain = self.chain.extended(interval)
-            Y = sensitivities(self.point, chain, gnss, interval)[:, :, self.whitener.columns]
-            Y = Y.reshape(Y.shape[0], 2, 3, -1)[:, :kinds]
+            Y = sensitivities(self.point, chain, gnss, interval, kinds)[..., self.whitener.columns]
         else:
             chain, Y = alike.chain, alike.Y
         noise = chain_noise(self.point.C, gnss.time, chain, interval, self._size,

@@ -206,8 +206,8 @@ def bias_seen_at_start(C: Array, time: Array, chain: Chain, size: int) -> Array:
     return np.concatenate([R_g, v, p], axis=1)[:, :size]
 
 
-def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
-                  interval: Intervals) -> Array:
+def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements, interval: Intervals,
+                  kinds: int = 2) -> Array:
     """
     Residuals of K epochs and their derivatives, at a linearisation point.
 
@@ -221,10 +221,12 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
         The same K epochs.
     interval : Intervals
         Those that end at the epochs, corrected for the sensors' errors of the point.
+    kinds : int
+        2: of velocities and positions; 1: of velocities alone.
 
     Returns
     -------
-    ndarray, shape (K, 6, 38)
+    ndarray, shape (K, kinds, 3, 38)
         The residual ``s - model`` in the first column, then the derivative of the model to each
         unknown.
 
@@ -235,12 +237,10 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     delay = min(max(float(point.delay), MIN_DELAY), MAX_DELAY)
     beyond = point.delay - delay
     CR = C @ chain.R
-    moved_v, moved_p = apply(C, chain.v), apply(C, chain.p)         # in n0
+    moved_v = apply(C, chain.v)                                     # in n0
     # What the receiver saw happened a delay before: there the motion before the epoch leads back.
     sensors = point.sensors
     _, measured_v, measured_p = exact(interval.gained, delay)
-    gained_v = sensors.force(measured_v, delay)
-    gained_p = sensors.force(measured_p, delay ** 2 / 2)
     measured_rate, measured_turn, _ = exact(interval.turned, delay)
     rate, turn = sensors.rate(measured_rate), sensors.rate(measured_turn, delay)
     rate += 0.5 * cross(turn, rate)
@@ -248,52 +248,56 @@ def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements,
     vibration = interval.omega - exact(interval.turned, 0.0)[0]
     omega = rate + sensors.rate(vibration, 0.0)
     CR_seen = CR @ exp_so3(-turn)
-    swing = CR_seen @ skew(omega)
     swung = apply(CR_seen, cross(omega, lever))
-    seen_v = moved_v - apply(CR, gained_v) + swung
-    seen_p = moved_p - delay * moved_v + apply(CR, gained_p) + CR_seen @ lever
+    seen_v = moved_v - apply(CR, sensors.force(measured_v, delay)) + swung
     start_velocity = point.start_velocity + gnss.offset                 # over ground
-    ground_velocity = start_velocity + seen_v - delay * gnss.gravity
-    Y = np.zeros((K, 6, 1 + SIZE))
-    Y[:, VELOCITY, 0] = (gnss.s[:, VELOCITY] - point.start_velocity - seen_v
-                         + delay * gnss.gravity)
-    Y[:, POSITION, 0] = (gnss.s[:, POSITION] - point.start_position
-                         - gnss.time[:, None] * point.start_velocity - seen_p
-                         + delay * (start_velocity - delay / 2 * gnss.gravity))
-    H = Y[:, :, 1:]
+    Y = np.zeros((K, kinds, 3, 1 + SIZE))
+    H = Y[..., 1:]
     eye = np.eye(3)
-    H[:, VELOCITY, ATTITUDE] = -skew(seen_v)
-    H[:, POSITION, ATTITUDE] = -skew(seen_p)
     C_R_g, C_v_g, C_v_a = C @ chain.R_g, C @ chain.v_g, C @ chain.v_a
-    # What is told in the body frame of now turns with the gyros' errors since t0.
-    H[:, VELOCITY, GYRO] = C_v_g - skew(seen_v - moved_v) @ C_R_g
-    H[:, POSITION, GYRO] = (C @ chain.p_g - delay * C_v_g
-                            - skew(seen_p - moved_p + delay * moved_v) @ C_R_g)
-    # And they are in the rates with which the lever arm swings, and turned since.
+    # What is told in the body frame of now turns with the gyros' errors since t0. And they are in
+    # the rates with which the lever arm swings, and turned since.
     arm, turned_arm = CR_seen @ skew(lever), CR_seen @ skew(cross(omega, lever))
-    H[:, VELOCITY, GYRO_BIAS] += arm - delay * turned_arm
-    H[:, POSITION, GYRO_BIAS] -= delay * arm
-    measured_rate += vibration
-    H[:, VELOCITY, GYRO_MATRIX] += by_row(arm, measured_rate) - by_row(turned_arm, measured_turn)
-    H[:, POSITION, GYRO_MATRIX] -= by_row(arm, measured_turn)
-    H[:, VELOCITY, ACCEL] = C_v_a
-    H[:, POSITION, ACCEL] = C @ chain.p_a - delay * C_v_a
-    H[:, VELOCITY, ACCEL_BIAS] += delay * CR
-    H[:, POSITION, ACCEL_BIAS] -= delay ** 2 / 2 * CR
-    H[:, VELOCITY, ACCEL_MATRIX] += by_row(CR, measured_v)
-    H[:, POSITION, ACCEL_MATRIX] -= by_row(CR, measured_p)
-    H[:, VELOCITY, START_VELOCITY] = eye
-    H[:, POSITION, START_VELOCITY] = (gnss.time - delay)[:, None, None] * eye
-    H[:, POSITION, START_POSITION] = eye
-    H[:, VELOCITY, LEVER_ARM] = swing
-    H[:, POSITION, LEVER_ARM] = CR_seen
     # Vibration is no use in a derivative. The rate changes with time as it does not with age.
     force = sensors.force(smooth(interval.gained, delay)[0])
     rate_change = sensors.rate(smooth(interval.turned, delay)[1], 0.0)
     whirled = cross(rate, cross(omega, lever)) - cross(rate_change, lever)
-    H[:, VELOCITY, DELAY.start] = -(apply(CR, force) + apply(CR_seen, whirled) + gnss.gravity)
-    H[:, POSITION, DELAY.start] = -ground_velocity
-    Y[:, :, 0] -= beyond * H[:, :, DELAY.start]
+
+    Y[:, 0, :, 0] = (gnss.s[:, VELOCITY] - point.start_velocity - seen_v + delay * gnss.gravity)
+    v = H[:, 0]
+    v[:, :, ATTITUDE] = -skew(seen_v)
+    v[:, :, GYRO] = C_v_g - skew(seen_v - moved_v) @ C_R_g
+    v[:, :, GYRO_BIAS] += arm - delay * turned_arm
+    v[:, :, GYRO_MATRIX] += (by_row(arm, measured_rate + vibration)
+                             - by_row(turned_arm, measured_turn))
+    v[:, :, ACCEL] = C_v_a
+    v[:, :, ACCEL_BIAS] += delay * CR
+    v[:, :, ACCEL_MATRIX] += by_row(CR, measured_v)
+    v[:, :, START_VELOCITY] = eye
+    v[:, :, LEVER_ARM] = CR_seen @ skew(omega)
+    v[:, :, DELAY.start] = -(apply(CR, force) + apply(CR_seen, whirled) + gnss.gravity)
+
+    if kinds == 2:
+        moved_p = apply(C, chain.p)
+        gained_p = sensors.force(measured_p, delay ** 2 / 2)
+        seen_p = moved_p - delay * moved_v + apply(CR, gained_p) + CR_seen @ lever
+        Y[:, 1, :, 0] = (gnss.s[:, POSITION] - point.start_position
+                         - gnss.time[:, None] * point.start_velocity - seen_p
+                         + delay * (start_velocity - delay / 2 * gnss.gravity))
+        p = H[:, 1]
+        p[:, :, ATTITUDE] = -skew(seen_p)
+        p[:, :, GYRO] = (C @ chain.p_g - delay * C_v_g
+                         - skew(seen_p - moved_p + delay * moved_v) @ C_R_g)
+        p[:, :, GYRO_BIAS] -= delay * arm
+        p[:, :, GYRO_MATRIX] -= by_row(arm, measured_turn)
+        p[:, :, ACCEL] = C @ chain.p_a - delay * C_v_a
+        p[:, :, ACCEL_BIAS] -= delay ** 2 / 2 * CR
+        p[:, :, ACCEL_MATRIX] -= by_row(CR, measured_p)
+        p[:, :, START_VELOCITY] = (gnss.time - delay)[:, None, None] * eye
+        p[:, :, START_POSITION] = eye
+        p[:, :, LEVER_ARM] = CR_seen
+        p[:, :, DELAY.start] = -(start_velocity + seen_v - delay * gnss.gravity)
+    Y[..., 0] -= beyond * H[..., DELAY.start]
     return Y
 
 

@@ -50,10 +50,23 @@ def some_measurements(count=5, seed=0):
                         np.tile([0.0, 0.0, -9.8], (count, 1)), r.standard_normal((count, 3)))
 
 
+def six_rows(*arguments):
+    """Velocity's and position's rows one behind the other."""
+    Y = sensitivities(*arguments)
+    return Y.reshape(len(Y), 6, -1)
+
+
 def residuals(x, intervals, gnss):
     """Residuals at x and their derivatives, from scratch: intervals corrected, chained."""
     corrected = intervals.corrected(x.sensors.vector())
-    return sensitivities(x, Chain.start().extended(corrected), gnss, corrected)
+    return six_rows(x, Chain.start().extended(corrected), gnss, corrected)
+
+
+def test_velocities_alone_have_the_rows_that_they_have_beside_positions():
+    x, intervals, gnss = some_unknowns(), some_intervals(), some_measurements()
+    chain = Chain.start().extended(intervals)
+    both, alone = (sensitivities(x, chain, gnss, intervals, kinds) for kinds in (2, 1))
+    assert alone.shape == (5, 1, 3, 1 + SIZE) and np.array_equal(alone, both[:, :1])
 
 
 @pytest.mark.parametrize('column, delay', [
@@ -112,7 +125,7 @@ def test_residuals_of_the_truth_are_nothing(delay):
     gnss = replace(some_measurements(4), time=time, gravity=np.tile(gravity, (4, 1)),
                    offset=t * gravity,
                    s=np.concatenate([velocity - t * gravity, position - t * t / 2 * gravity], 1))
-    residual = sensitivities(x, Chain.start().extended(interval), gnss, interval)[:, :, 0]
+    residual = six_rows(x, Chain.start().extended(interval), gnss, interval)[:, :, 0]
     # The motion since what was seen is told to the second order of the angle, a bias in it to
     # the first.
     assert np.max(np.abs(residual[:, :3])) < 7e-3 and np.max(np.abs(residual[:, 3:])) < 7e-4
@@ -141,8 +154,8 @@ def test_noise_of_an_interval_looks_like_an_error_of_the_start(row):
     def spoilt(e):
         start = replace(chain, R=chain.R @ exp_so3(e[:3]), v=chain.v + before_R @ e[3:6],
                         p=chain.p + before_R @ e[6:])
-        return sensitivities(x, start.extended(corrected.take(later)), gnss.take(later),
-                             corrected.take(later))[:, :, 0]
+        return six_rows(x, start.extended(corrected.take(later)), gnss.take(later),
+                        corrected.take(later))[:, :, 0]
 
     # Noise of an interval is told in the axes at its start, the rotation too.
     before_R = before.at(0).R
