@@ -200,10 +200,12 @@ def bias_seen_at_start(C: Array, time: Array, chain: Chain, size: int) -> Array:
     ndarray, shape (K, size, 3)
 
     """
-    R_g, v_g, p_g = (C @ derivative[:, :, :3] for derivative in (chain.R_g, chain.v_g, chain.p_g))
-    v = v_g + skew(apply(C, chain.v)) @ R_g
-    p = p_g + skew(apply(C, chain.p)) @ R_g - time[:, None, None] * v
-    return np.concatenate([R_g, v, p], axis=1)[:, :size]
+    R_g = C @ chain.R_g[:, :, :3]
+    v = C @ chain.v_g[:, :, :3] + skew(apply(C, chain.v)) @ R_g
+    if size == 6:
+        return np.concatenate([R_g, v], axis=1)
+    p = C @ chain.p_g[:, :, :3] + skew(apply(C, chain.p)) @ R_g - time[:, None, None] * v
+    return np.concatenate([R_g, v, p], axis=1)
 
 
 def sensitivities(point: Unknowns, chain: Chain, gnss: Measurements, interval: Intervals,
