@@ -137,9 +137,9 @@ class Alignment:
         assert method is not None
         done = []
         taken = method.advance([located.epoch for located in run.located], run.imu)
-        for epoch, located, forces in zip(taken, run.located, run.forces):
+        for _, located, forces in zip(taken, run.located, run.forces):
             self._force_check.add(*forces)
-            done.append(self._judge(method, located._replace(epoch=epoch)))
+            done.append(self._judge(method, located))
         return done
 
     def _lose(self, why: str) -> None:
