@@ -23,8 +23,8 @@ from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 from ins_align.recent import Recent, RUNGS
-from ins_align.rotation import (apply, Array, by_row, cross, cumulative_rotations,
-                                exp_and_left_jacobian, exp_so3, Index, orthonormalized, skew)
+from ins_align.rotation import (apply, Array, cross, cumulative_rotations, exp_and_left_jacobian,
+                                exp_so3, Index, orthonormalized, product, skew)
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -372,36 +372,41 @@ def preintegrate(steps: Steps, sensors: SensorErrors, noise: Noise,
     .. [2] P. G. Savage, part 2: velocity and position algorithms, 21(2), 1998.
 
     """
-    dt = steps.dt
-    omega, f = sensors.rate(steps.omega), sensors.force(steps.f)
+    # In Fortran order, so that the components of vectors and matrices, which all that follows is
+    # made of, are contiguous in memory.
+    dt, *measured, omega_dot, f_dot = map(np.asfortranarray, vars(steps).values())
+    omega, f = (values - _applied(matrix, values) - bias for values, matrix, bias in zip(
+        measured, (sensors.gyro_matrix, sensors.accel_matrix),
+        (sensors.gyro_bias, sensors.accel_bias)))
     omega0, omega1 = omega[:, :-1], omega[:, 1:]
     f0, f1 = f[:, :-1], f[:, 1:]
     h = dt[..., None]
     h2_12 = h * h / 12
-    theta = h / 2 * (omega0 + omega1) - h2_12 * np.diff(steps.omega_dot, axis=1)
-    force = h / 2 * (f0 + f1) - h2_12 * np.diff(steps.f_dot, axis=1)
+    theta = h / 2 * (omega0 + omega1) - h2_12 * np.diff(omega_dot, axis=1)
+    both = f0 + f1
+    force = h / 2 * both - h2_12 * np.diff(f_dot, axis=1)
     coning = h2_12 * cross(omega0, omega1)
     sculling = h2_12 * (cross(omega0, f1) + cross(f0, omega1))
     turn, jacobian = exp_and_left_jacobian(theta + coning)
-    step_v = apply(jacobian, force) + sculling
-    step_p = h * h / 6 * (2 * f0 + f1) + h ** 3 / 6 * cross(omega0, 0.5 * (f0 + f1))
+    step_v = _applied(jacobian, force) + sculling
+    step_p = 2 * h2_12 * (f0 + both) + h * h2_12 * cross(omega0, both)
 
     turned = cumulative_rotations(turn)
-    A = np.empty_like(turned)                     # from the start of each step to the interval's
+    A = np.empty_like(turn)                       # from the start of each step to the interval's
     A[:, 0] = np.eye(3)
     A[:, 1:] = turned[:, :-1]
-    u = apply(A, step_v)
+    u = _applied(A, step_v)
     v_end = np.cumsum(u, axis=1)
     v_start = v_end - u
     v_mid = 0.5 * (v_start + v_end)
-    p_step = h * v_start + apply(A, step_p)
+    p_step = h * v_start + _applied(A, step_p)
     p_end = np.cumsum(p_step, axis=1)
 
     passed = np.cumsum(dt, axis=1)
     duration = passed[:, -1]
     remaining = duration[:, None] - passed + 0.5 * dt       # from the middle of each step on
-    derivatives = _derivatives(dt, A @ jacobian * h[..., None], u, *(
-        0.5 * (measured[:, :-1] + measured[:, 1:]) for measured in (steps.omega, steps.f)))
+    derivatives = _derivatives(dt, product(A, h[..., None] * jacobian), u, *(
+        0.5 * (values[:, :-1] + values[:, 1:]) for values in measured))
 
     v, p = v_end[:, -1], p_end[:, -1]
     v_rest = v[:, None] - v_mid
@@ -428,8 +433,22 @@ def preintegrate(steps: Steps, sensors: SensorErrors, noise: Noise,
     R = orthonormalized(turned[:, -1])
     if recent is None:
         recent = Recent.steady(steps.f[:, -1], steps.omega[:, -1])
-    return Intervals(duration, R, v, p, *derivatives, Q, Q_excess, steps.omega[:, -1],
-                     recent.gained, recent.turned)
+    # Others take them one by one.
+    return Intervals(*map(np.ascontiguousarray, (
+        duration, R, v, p, *derivatives, Q, Q_excess, steps.omega[:, -1], recent.gained,
+        recent.turned)))
+
+
+def _applied(matrix: Array, vectors: Array) -> Array:
+    """Return products of matrices and vectors, in Fortran order."""
+    return product(matrix, vectors[..., None])[..., 0]
+
+
+def _total(values: Array) -> Array:
+    """Sum over steps, shape (K, n, ...), one by one: K and steps of no length change no bit."""
+    if len(values) == 1:                          # numpy sums in pairs what is contiguous
+        return np.cumsum(values, axis=1)[:, -1]
+    return np.sum(np.asfortranarray(values), axis=1)
 
 
 def _derivatives(dt: Array, turns: Array, u: Array, rate: Array,
@@ -459,21 +478,30 @@ def _derivatives(dt: Array, turns: Array, u: Array, rate: Array,
 
     """
     def together(values: Array) -> Array:
-        return np.add.reduceat(values, np.arange(0, dt.shape[1], DERIVATIVE_STEPS), axis=1)
+        sums = values[:, ::DERIVATIVE_STEPS].copy(order='K')
+        for k in range(1, DERIVATIVE_STEPS):
+            more = values[:, k::DERIVATIVE_STEPS]
+            sums[:, :more.shape[1]] += more
+        return sums
 
     seconds = together(dt)
     turns, u = together(turns), together(u)
     per_second = 1 / np.maximum(seconds, 1e-9)[..., None]
-    by_gyros, by_accelerometers = (
-        np.concatenate([turns, by_row(turns, per_second * together(dt[..., None] * measured))],
-                       axis=-1) for measured in (rate, force))
+    by_gyros, by_accelerometers = (np.empty(seconds.shape + (3, 12), order='F')
+                                   for _ in range(2))
+    for by, measured in (by_gyros, rate), (by_accelerometers, force):
+        mean = per_second * together(dt[..., None] * measured)
+        by[..., :3] = turns
+        for k in range(3):
+            np.multiply(turns[..., k, None], mean[..., None, :],
+                        out=by[..., 3 + 3 * k:6 + 3 * k])
     turned_by = np.cumsum(by_gyros, axis=1)
-    pushes = skew(u) @ (turned_by - 0.5 * by_gyros)
+    pushes = cross(u[..., None, :], (turned_by - 0.5 * by_gyros).swapaxes(2, 3)).swapaxes(2, 3)
     # What a step adds to the velocity moves the body for the time that remains.
     passed = np.cumsum(seconds, axis=1)
     remaining = (passed[:, -1:] - passed + 0.5 * seconds)[..., None, None]
-    return (-turned_by[:, -1], np.sum(pushes, axis=1), np.sum(remaining * pushes, axis=1),
-            -np.sum(by_accelerometers, axis=1), -np.sum(remaining * by_accelerometers, axis=1))
+    return (-turned_by[:, -1], _total(pushes), _total(remaining * pushes),
+            -_total(by_accelerometers), -_total(remaining * by_accelerometers))
 
 
 def _least_and_more(density: ArrayLike, dt: Array) -> tuple[Array, Array]:
@@ -482,8 +510,8 @@ def _least_and_more(density: ArrayLike, dt: Array) -> tuple[Array, Array]:
 
     Steps that only fill up an interval have no say: there are as many as the longest one needs.
     """
-    squares = np.broadcast_to(np.square(density), dt.shape)
-    least = squares.min(axis=1, keepdims=True, where=dt > 0, initial=squares.max(initial=0.0))
+    squares = np.square(density)
+    least = np.where(dt > 0, squares, squares.max(initial=0.0)).min(axis=1, keepdims=True)
     return least[..., None], squares - least
 
 
@@ -495,23 +523,23 @@ def _of_gyros(variance: Array, v_rest: Array, p_rest: Array) -> Array:
     distance still to come after each step matter (v_rest, p_rest): an error of a step's angle
     turns them. The variance is that of each step's angle increment, shape (K, n).
     """
-    Q = np.zeros((variance.shape[0], 9, 9))
     # Sums of the products of [1, v_rest, p_rest], from which those of
     # [I, -[v_rest x], -[p_rest x]] follow.
-    rest = np.concatenate([np.ones(variance.shape + (1,)), v_rest, p_rest], axis=-1)
-    moment = np.sum((variance[..., None] * rest)[..., None] * rest[..., None, :], axis=1)
+    variance = np.asfortranarray(variance)
+    rest = np.empty(variance.shape + (7,), order='F')
+    rest[..., 0], rest[..., 1:4], rest[..., 4:] = 1.0, v_rest, p_rest
+    moment = _total((variance[..., None] * rest)[..., None] * rest[..., None, :])
     eye = np.eye(3)
-    angle, v, p = slice(0, 3), slice(3, 6), slice(6, 9)
-    Q[:, angle, angle] = moment[:, :1, :1] * eye
-    for block, place in ((v, slice(1, 4)), (p, slice(4, 7))):
-        Q[:, block, angle] = -skew(moment[:, 0, place])
-        Q[:, angle, block] = -Q[:, block, angle]
-    for row, i in ((v, slice(1, 4)), (p, slice(4, 7))):
-        for column, j in ((v, slice(1, 4)), (p, slice(4, 7))):
-            product = moment[:, i, j]             # [a x] [b x]^T = (a . b) I - b a^T
-            Q[:, row, column] = (np.trace(product, axis1=1, axis2=2)[:, None, None] * eye
-                                 - product.transpose(0, 2, 1))
-    return Q
+    # Of blocks of 3 x 3.
+    Q = np.zeros((variance.shape[0], 3, 3, 3, 3))
+    Q[:, 0, :, 0] = moment[:, :1, :1] * eye
+    turned = skew(moment[:, 0, 1:].reshape(-1, 2, 3))
+    Q[:, 1:, :, 0], Q[:, 0, :, 1:] = -turned, turned.transpose(0, 2, 1, 3)
+    # [a x] [b x]^T = (a . b) I - b a^T
+    products = moment[:, 1:, 1:].reshape(-1, 2, 3, 2, 3)
+    dot = np.trace(products, axis1=2, axis2=4)
+    Q[:, 1:, :, 1:] = (dot[:, :, None, :, None] * eye[:, None] - products.transpose(0, 1, 4, 3, 2))
+    return Q.reshape(-1, 9, 9)
 
 
 def _of_accelerometers(variance: Array, dt: Array, remaining: Array) -> Array:
@@ -521,10 +549,10 @@ def _of_accelerometers(variance: Array, dt: Array, remaining: Array) -> Array:
     The variance is that of each step's velocity increment; `remaining` is the time still to come
     after the middle of the step, in which it becomes distance; both have shape (K, n).
     """
-    Q = np.zeros((variance.shape[0], 9, 9))
-    v, p = slice(3, 6), slice(6, 9)
-    for row, column, weight in ((v, v, 1.0), (v, p, remaining), (p, v, remaining),
-                                # dt^2 / 12 is the variance within the step itself
-                                (p, p, remaining ** 2 + dt ** 2 / 12)):
-        Q[:, row, column] = np.cumsum(variance * weight, axis=1)[:, -1, None, None] * np.eye(3)
-    return Q
+    Q = np.zeros((variance.shape[0], 3, 3, 3, 3))
+    # dt^2 / 12 is the variance within the step itself
+    v, vp, p = (np.cumsum(variance * weight, axis=1)[:, -1]
+                for weight in (1.0, remaining, remaining ** 2 + dt ** 2 / 12))
+    blocks = np.array([[v, vp], [vp, p]]).transpose(2, 0, 1)
+    Q[:, 1:, :, 1:] = blocks[:, :, None, :, None] * np.eye(3)[:, None]
+    return Q.reshape(-1, 9, 9)

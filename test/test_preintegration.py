@@ -409,3 +409,25 @@ def test_storage_gives_back_what_was_put():
     store.put(slice(2, 3), interval.take(slice(1, 2)))
     for name, array in vars(store.take(slice(2, 3))).items():
         assert np.array_equal(array[0], getattr(interval, name)[1]), name
+
+
+@pytest.mark.parametrize('layout', ('C', 'F'))
+def test_an_interval_is_the_same_with_others_to_the_bit(layout):
+    """Of samples with noise of its own in each step, however they lie in memory."""
+    stamps, gyro, accel = samples(2.0, jitter=0.3)
+    steps = split_at_epochs(stamps, gyro, accel, np.linspace(0.0, 2.0, 11))
+    random = np.random.default_rng(5)
+    noise = random.uniform(1e-3, 2e-3, (4,) + steps.dt.shape)
+    sensors = SensorErrors.of(1e-2 * random.standard_normal(24))
+
+    def integrated_of(index):
+        return vars(preintegrate(
+            Steps(*(np.array(values[index], order=layout) for values in vars(steps).values())),
+            sensors, Noise(*noise[:, index])))
+
+    together = integrated_of(slice(0, 10))
+    for size in (1, 2, 3):
+        for first in range(0, 10 - size, size):
+            index = slice(first, first + size)
+            for name, array in integrated_of(index).items():
+                assert np.array_equal(array, together[name][index]), name
