@@ -260,39 +260,41 @@ def split_at_epochs(stamps: 'Array | Index', gyro: Array, accel: Array,
     Steps
 
     """
-    # Sample numbers inside each open interval (start, end).
-    first = np.searchsorted(stamps, epochs[:-1], side='right')
-    last = np.searchsorted(stamps, epochs[1:], side='left')
-    width = max(int(np.max(last - first)), 0) + 2
-    inner = np.minimum(first[:, None] + np.arange(-1, width - 1), last[:, None])
-    knots = np.clip(stamps[np.clip(inner, 0, stamps.size - 1)],
-                    epochs[:-1, None], epochs[1:, None])
-    knots[:, -1] = epochs[1:]
-
-    samples = np.hstack([gyro, accel])
+    samples = np.concatenate([gyro.T, accel.T])
     slopes = _slopes(samples, np.diff(stamps) * unit)
-    right = np.clip(np.searchsorted(stamps, knots, side='left'), 1, stamps.size - 1)
+    # Of the epochs. Values, then slopes; samples and epochs side by side to be picked from.
+    right = np.clip(np.searchsorted(stamps, epochs), 1, stamps.size - 1)
     left = right - 1
-    h = ((stamps[right] - stamps[left]) * unit)[..., None]
-    t = ((knots - stamps[left]) * unit)[..., None] / h
-    rise = samples[right] - samples[left]
-    bend0, bend1 = h * slopes[left] - rise, rise - h * slopes[right]
-    value = samples[left] + t * rise + t * (1 - t) * ((1 - t) * bend0 + t * bend1)
+    h = (stamps[right] - stamps[left]) * unit
+    t = (epochs - stamps[left]) * unit / h
+    rise = samples[:, right] - samples[:, left]
+    bend0, bend1 = h * slopes[:, left] - rise, rise - h * slopes[:, right]
+    value = samples[:, left] + t * rise + t * (1 - t) * ((1 - t) * bend0 + t * bend1)
     slope = (rise + (1 - 2 * t) * ((1 - t) * bend0 + t * bend1)
              + t * (1 - t) * (bend1 - bend0)) / h
-    return Steps(np.diff(knots, axis=1) * unit, value[..., :3], value[..., 3:],
-                 slope[..., :3], slope[..., 3:])
+    known = np.concatenate([np.concatenate([samples, value], axis=1),
+                            np.concatenate([slopes, slope], axis=1)])
+    # Knots are the start of an interval, the samples inside it, and its end as often as it takes.
+    first = np.searchsorted(stamps, epochs[:-1], side='right')
+    last = np.searchsorted(stamps, epochs[1:], side='left')
+    inner = first + np.arange(-1, max(int(np.max(last - first)), 0) + 1)[:, None]
+    end = stamps.size + np.arange(1, epochs.size)
+    knots = np.where(inner < last, inner, end)
+    knots[0] = end - 1
+    omega, f, omega_dot, f_dot = known[:, knots].reshape(4, 3, *knots.shape)
+    return Steps(np.diff(np.concatenate([stamps, epochs])[knots], axis=0).T * unit,
+                 omega.T, f.T, omega_dot.T, f_dot.T)
 
 
 def _slopes(samples: Array, spacing: Array) -> Array:
-    """Central differences at uneven spacing, one-sided at both ends."""
-    rise = np.diff(samples, axis=0) / spacing[:, None]
-    before, after = spacing[:-1, None], spacing[1:, None]
+    """Central differences at uneven spacing, one-sided at both ends; samples of shape (6, N)."""
+    rise = np.diff(samples) / spacing
+    before, after = spacing[:-1], spacing[1:]
     # Where one of two steps is much the shorter, its noise would make the slope.
     uneven = np.minimum(before, after) < UNEVEN * np.maximum(before, after)
     near, far = np.where(uneven, before, after), np.where(uneven, after, before)
-    inner = (near * rise[:-1] + far * rise[1:]) / (before + after)
-    return np.concatenate([rise[:1], inner, rise[-1:]])
+    inner = (near * rise[:, :-1] + far * rise[:, 1:]) / (before + after)
+    return np.concatenate([rise[:, :1], inner, rise[:, -1:]], axis=1)
 
 
 def white_noise(stamps: 'Array | Index', samples: Array, first: Index, last: Index,
