@@ -70,10 +70,11 @@ class ImuBuffer:
         self._reach_ns = max(lateness_ns, MAX_GAP_NS)
         self._counts = counts
         self.stamps = np.zeros(0, np.int64)
-        self.samples = np.zeros((0, 6))
+        # In Fortran order, so that each axis of a sensor is contiguous in memory.
+        self.samples = np.zeros((0, 6), order='F')
         self._new_stamps: list[int] = []
         self._new_samples: list[tuple[float, ...]] = []
-        self._new_arrays: list[tuple[np.ndarray, Array]] = []
+        self._new_arrays: list[tuple[np.ndarray, Array, Array]] = []
         self.newest_ns: int | None = None
         self.used_ns = -(1 << 62)
         self._suspect_ns: int | None = None
@@ -136,7 +137,7 @@ class ImuBuffer:
             return int(stamps_ns.size)
         self._suspect_ns = None
         self._flatten()
-        self._new_arrays.append((np.asarray(stamps_ns, np.int64), np.hstack([gyro, accel])))
+        self._new_arrays.append((np.asarray(stamps_ns, np.int64), gyro, accel))
         self.newest_ns = int(stamps_ns[-1])
         return int(stamps_ns.size)
 
@@ -166,8 +167,9 @@ class ImuBuffer:
     def _flatten(self) -> None:
         """Turn single samples into an array."""
         if self._new_stamps:
-            self._new_arrays.append((np.array(self._new_stamps, np.int64),
-                                     np.array(self._new_samples, float)))
+            samples = np.array(self._new_samples, float)
+            self._new_arrays.append((np.array(self._new_stamps, np.int64), samples[:, :3],
+                                     samples[:, 3:]))
             self._new_stamps, self._new_samples = [], []
 
     def consolidate(self, last: bool = False) -> None:
@@ -182,8 +184,8 @@ class ImuBuffer:
         self._flatten()
         if not self._new_arrays:
             return
-        stamps = np.concatenate([s for s, _ in self._new_arrays])
-        samples = np.concatenate([x for _, x in self._new_arrays])
+        stamps, gyro, accel = map(np.concatenate, zip(*self._new_arrays))
+        samples = np.concatenate([gyro.T, accel.T]).T
         self._new_arrays = []
         self._counts['imu'] += stamps.size
         with np.errstate(invalid='ignore'):
@@ -201,7 +203,7 @@ class ImuBuffer:
             first = np.concatenate([[True], stamps[1:] > stamps[:-1]])
             self._counts['imu_duplicate'] += int(np.count_nonzero(~first))
             stamps, samples = stamps[first], samples[first]
-        self.stamps, self.samples = stamps, samples
+        self.stamps, self.samples = stamps, np.asfortranarray(samples)
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop samples before `stamp_ns`, but for those that are still looked at."""

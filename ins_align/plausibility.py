@@ -93,7 +93,7 @@ def without_spikes(stamps: Index, samples: Array) -> tuple[Array, np.ndarray]:
         return samples, spikes[:, 0]
     k, sensor = np.nonzero(spikes)
     share = (stamps[k] - stamps[k - 1]) / (stamps[k + 1] - stamps[k - 1])
-    cleaned = x.copy()
+    cleaned = x.copy(order='K')
     cleaned[k, sensor] = x[k - 1, sensor] + share[:, None] * (x[k + 1, sensor] - x[k - 1, sensor])
     return cleaned.reshape(-1, 6), spikes[:, 0] | spikes[:, 1]
 

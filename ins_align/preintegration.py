@@ -327,18 +327,20 @@ def white_noise(stamps: 'Array | Index', samples: Array, first: Index, last: Ind
     if not np.any(enough):
         return np.zeros((first.size, 2))
     n = stamps.size - 3
-    t = np.stack([stamps[i:i + n] for i in range(4)])
-    apart = (t[:, None] - t[None]) * unit
-    apart[range(4), range(4)] = 1.0
-    weights = 1 / np.prod(apart, axis=1)
+    # From each of four samples to the next ones.
+    one, two, three = ((stamps[k:] - stamps[:-k]) * unit for k in (1, 2, 3))
+    (a, b, c), (ab, bc) = ([spacing[i:i + n] for i in range(count)]
+                           for spacing, count in ((one, 3), (two, 2)))
+    weights = 1 / np.stack([-(a * ab * three), a * b * bc, -(ab * b * c), three * bc * c])
     weights /= np.sqrt(np.sum(weights ** 2, axis=0))
-    left = np.zeros((n + 1, 6))
+    left = np.zeros((6, n + 1))
     for i in range(4):
-        left[:-1] += weights[i, :, None] * samples[i:i + n]
+        left[:, :-1] += weights[i] * samples.T[:, i:i + n]
     first, last, count = (np.where(enough, x, y) for x, y in ((first, 0), (last, n), (count, 1)))
-    sums = np.add.reduceat(np.square(left), np.stack([first, last - 3], axis=1).ravel())[::2]
+    sums = np.add.reduceat(np.square(left), np.stack([first, last - 3], axis=1).ravel(),
+                           axis=1)[:, ::2]
     spacing = (stamps[last - 1] - stamps[first]) * unit / (last - first - 1)
-    density = np.sqrt(sums.reshape(-1, 2, 3).mean(axis=2) * (spacing / count)[:, None])
+    density = np.sqrt(sums.T.reshape(-1, 2, 3).mean(axis=2) * (spacing / count)[:, None])
     return np.where(enough[:, None], density, 0.0)
 
 

@@ -22,7 +22,7 @@ the epoch back to that moment. They are kept at a ladder of ages that follows a 
 from dataclasses import dataclass
 import math
 
-from ins_align.rotation import apply, Array, cross, exp_so3, Index
+from ins_align.rotation import Array, cross, Index, rotated
 import numpy as np
 
 # Seconds between the ages, and how many there are: all of them as long as delays are.
@@ -100,15 +100,17 @@ def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'A
                   for half in (epochs[:middle], epochs[middle:])]
         return Recent(*(np.concatenate(arrays) for arrays in zip(
             *(vars(half).values() for half in halves))))
-    step = first[:, None] + np.arange(most)
+    # In Fortran order, so that the components of vectors are contiguous in memory.
+    step = (first + np.arange(most)[:, None]).T
     inside = step < last[:, None]
     step = np.minimum(step, last[:, None] - 1)
-    begin, end = ((stamps[step + k] - epochs[:, None]) * unit for k in (0, 1))
+    begin, end = ((stamps[step.T + k] - epochs).T * unit for k in (0, 1))
     # Nothing is known of a silence and what was before it.
     heard = np.logical_and.accumulate((end - begin < AGES[-1])[:, ::-1], axis=1)[:, ::-1]
     dt = np.where(inside & heard, np.minimum(end, 0.0) - begin, 0.0)[..., None]
-    both = _seen_from_epoch(dt, *(0.5 * (samples[step] + samples[step + 1])
-                                  for samples in (gyro, accel)))
+    samples = np.concatenate([gyro.T, accel.T])
+    middle = (0.5 * (samples[:, :-1] + samples[:, 1:])).take(step.T, axis=1).T
+    both = _seen_from_epoch(dt, middle[..., :3], middle[..., 3:])
     sums = np.cumsum(dt * both, axis=1)
     # Up to a rung: the steps before its own, and of that what lies before.
     own = np.clip(rungs - first[:, None], 0, step.shape[1] - 1)
@@ -148,7 +150,7 @@ def _seen_from_epoch(dt: Array, rate: Array, force: Array) -> Array:
     rate = rate - 0.5 * cross(to_come, rate)
     turn = dt * rate
     turned = np.cumsum(turn, axis=1)
-    force = apply(exp_so3(turned - 0.5 * turn - turned[:, -1:]), force)
+    force = rotated(turned - 0.5 * turn - turned[:, -1:], force)
     return np.concatenate([force, rate], axis=-1)
 
 

@@ -224,6 +224,25 @@ def exp_so3(vector: ArrayLike) -> Array:
                      [b * x * z - a * y, b * y * z + a * x, d + b * z * z]])
 
 
+def rotated(rotation: Array, vectors: Array) -> Array:
+    """
+    Return ``exp_so3(rotation) @ vectors`` without the matrices.
+
+    Parameters
+    ----------
+    rotation, vectors : ndarray, shape (..., 3)
+        Rotation vectors, radians, and what is turned by them.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+
+    """
+    a, b, _ = _trigonometric_factors(_squared_norm(rotation))
+    sideways = cross(rotation, vectors)
+    return vectors + a[..., None] * sideways + b[..., None] * cross(rotation, sideways)
+
+
 def log_so3(matrix: ArrayLike) -> Array:
     """
     Rotation vector of a rotation matrix, angle in [0, pi].
