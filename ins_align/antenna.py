@@ -235,7 +235,9 @@ class StatedNoise:
         for variance, recent, default in zip(variances, self._recent, self._variances):
             recent.append(variance)
             usual = default
-            if len(recent) > 1 or variance >= BEST_VARIANCE:
+            # The most that is usual is the default.
+            if (default > BETTER_THAN_USUAL * variance
+                    and (len(recent) > 1 or variance >= BEST_VARIANCE)):
                 usual = min(sorted(recent)[len(recent) // 2], default)
             factors.append(usual / variance if usual > BETTER_THAN_USUAL * variance else 1.0)
         if max(factors) == 1.0:

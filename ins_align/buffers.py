@@ -126,7 +126,7 @@ class ImuBuffer:
         if stamps_ns.size == 0:
             return 0
         before_ns = self.newest_ns if stamps_ns.size == 1 else stamps_ns[-2]
-        ordered = (self._ahead is None and np.all(stamps_ns[1:] > stamps_ns[:-1])
+        ordered = (self._ahead is None and (stamps_ns[1:] > stamps_ns[:-1]).all()
                    and (self.newest_ns is None or stamps_ns[0] > self.newest_ns)
                    and (before_ns is None or stamps_ns[-1] <= before_ns + self._reach_ns))
         if not ordered:
@@ -229,10 +229,11 @@ def with_an_altitude(fix: Fix) -> Fix:
 
 def usable_velocity(velocity: Velocity) -> Velocity | None:
     """Return what can be used of a velocity, without its vertical where that is nan."""
-    east, north, up = velocity.velocity
+    east, north, up = velocity.velocity.tolist()
     if math.isnan(up):
-        velocity = velocity._replace(velocity=np.array([east, north, 0.0]), vertical=False)
-    return velocity if np.all(np.abs(velocity.velocity) < MAX_SPEED) else None
+        up = 0.0
+        velocity = velocity._replace(velocity=np.array([east, north, up]), vertical=False)
+    return velocity if all(abs(value) < MAX_SPEED for value in (east, north, up)) else None
 
 
 @dataclass
@@ -411,7 +412,8 @@ class GnssBuffer:
         fix = next((part.fix for part in parts if part.fix), None)
         velocity = next((part.velocity for part in parts if part.velocity), None)
         before, self._said = self._said, ()
-        if fix is not None and velocity is not None and np.any(velocity.velocity):
-            self._said = (fix.latitude_deg, fix.longitude_deg, fix.altitude_m,
-                          *velocity.velocity.tolist())
+        if fix is not None and velocity is not None:
+            v_n = velocity.velocity.tolist()
+            if any(v_n):
+                self._said = fix.latitude_deg, fix.longitude_deg, fix.altitude_m, *v_n
         return bool(self._said) and self._said == before

@@ -70,21 +70,22 @@ class GSensitivity:
         """
         unsteady = np.zeros((spacing.size, 3))
         if self._scale_std > 0:
-            forces = recent.gained[:, -1] / AGES[-1]
-            unsteady[:] = [self._step(*step) for step in zip(spacing.tolist(), forces)]
+            self._follow(spacing, recent.gained[:, -1] / AGES[-1], unsteady)
         # A push that is soon over leaves the spread that such gyros give its end.
         size = np.sqrt(np.sum(np.square(unsteady), axis=1, keepdims=True))
         return G_SENSITIVITY * self._scale_std * math.sqrt(2 * CALM_TIME) * size
 
-    def _step(self, seconds: float, force: Array) -> Array:
-        """Take the force at the end of an interval; return how far it is from steady."""
+    def _follow(self, spacing: Array, forces: Array, unsteady: Array) -> None:
+        """Take the force at the end of each interval; put how far it is from steady."""
         if self._means is None:
-            self._means = np.stack([force, force])
-        else:
-            self._age += seconds
-            # Means since the start, then such as forget.
-            share = np.maximum(seconds / (self._age + seconds),
-                               1 - np.exp(-seconds / np.array([[CALM_TIME], [STEADY_TIME]])))
+            self._means = np.stack([forces[0], forces[0]])
+            spacing, forces, unsteady = spacing[1:], forces[1:], unsteady[1:]
+        ages = np.cumsum(np.append(self._age, spacing))
+        self._age = ages[-1]
+        # Means since the start, then such as forget.
+        seconds = spacing[:, None]
+        shares = np.maximum(seconds / (ages[1:, None] + seconds),
+                            1 - np.exp(-seconds / np.array([CALM_TIME, STEADY_TIME])))
+        for share, force, away in zip(shares[..., None], forces, unsteady):
             self._means = self._means + share * (force - self._means)
-        calm, steady = self._means
-        return calm - steady
+            np.subtract(*self._means, out=away)

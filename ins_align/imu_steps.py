@@ -182,8 +182,7 @@ class ImuCutter:
         it does to a sample whose stamp jitters: its change per second. Densities then.
         """
         between = np.diff(stamps) * 1e-9
-        usual, jitter = np.array([_usual_step(between[i:j - 1]) for i, j in zip(first, last)]).T
-        usual, jitter = usual[:, None], jitter[:, None]
+        usual, jitter = _usual_steps(between, first, last - 1)
         gap = np.where(dt > GAP_STEPS * usual, dt, 0.0)
         self._counts['imu_gap'] += int(np.count_nonzero(gap))
         # An error of acceleration * dt^2 over the step, as a density: squared, over dt.
@@ -213,11 +212,22 @@ def _rms(slope: Array) -> Array:
     return np.sqrt(np.mean(np.square(slope[:, 1:]), axis=2))
 
 
-def _usual_step(steps: Array) -> tuple[float, float]:
-    """Return the usual step, of bunches their pause, and the median of what steps deviate."""
-    half, rare = steps.size // 2, int(PAUSES * steps.size)
-    ordered = np.partition(steps, (half, rare))
-    usual, pause = float(ordered[half]), float(ordered[rare])
-    if usual < BUNCHED * pause:
-        return pause, 0.3 * pause                # as much as evenly spread over it
-    return usual, float(np.partition(np.abs(steps - usual), half)[half])
+def _usual_steps(steps: Array, first: Index, last: Index) -> tuple[Array, Array]:
+    """
+    Return the usual step, of bunches their pause, and the median of what steps deviate.
+
+    Both in K windows of the steps, shape (K, 1); `first`, `last`: as in `white_noise`.
+    """
+    count = (last - first)[:, None]
+    place = np.arange(np.max(count))
+    windows = np.where(place < count, steps[first[:, None] + np.minimum(place, count - 1)], np.inf)
+
+    def ranked(values: Array, rank: Index) -> Array:
+        return np.take_along_axis(np.sort(values, axis=1), rank, axis=1)
+
+    half = count // 2
+    usual, pause = ranked(windows, np.hstack([half, (PAUSES * count).astype(int)])).T[..., None]
+    bunched = usual < BUNCHED * pause
+    # Those of bunches as much as evenly spread over it.
+    return (np.where(bunched, pause, usual),
+            np.where(bunched, 0.3 * pause, ranked(np.abs(windows - usual), half)))

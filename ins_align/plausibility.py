@@ -79,7 +79,7 @@ def without_spikes(stamps: Index, samples: Array) -> tuple[Array, np.ndarray]:
     if stamps.size < IMU_BEFORE + 1:
         return samples, spikes[:, 0]
     x = samples.reshape(-1, 2, 3)
-    away = np.linalg.norm(x[1:-1] - 0.5 * (x[:-2] + x[2:]), axis=2)
+    away = np.sqrt(np.sum(np.square(x[1:-1] - 0.5 * (x[:-2] + x[2:])), axis=2))
     k, sensor = np.nonzero(away[SPIKE_BEFORE:] > [SPIKE_RATE, SPIKE_FORCE])
     if not k.size:
         return samples, spikes[:, 0]
