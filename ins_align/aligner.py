@@ -90,8 +90,8 @@ class Aligner:
 
         """
         if isinstance(stamp_ns, np.ndarray):
-            self._intake.add_imu_array(stamp_ns, np.asarray(gyro, float),
-                                       np.asarray(accel, float))
+            self._intake.add_imu_array(stamp_ns, np.array(gyro, float),
+                                       np.array(accel, float))
         else:
             self._intake.add_imu(stamp_ns, gyro, accel)
         if self._intake.steps:                      # the clock has jumped

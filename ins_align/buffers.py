@@ -31,6 +31,7 @@ import numpy as np
 
 # Beyond these no sensor measures; such values would overflow the integrals (rad/s, m/s^2, m/s, m).
 MAX_RATE, MAX_ACCELERATION, MAX_SPEED, MAX_ALTITUDE = 200.0, 2000.0, 2000.0, 1e6
+_LIMITS = np.repeat([MAX_RATE, MAX_ACCELERATION], 3)[:, None]
 # The IMU may be silent for this long; then the attitude is lost and alignment starts over (ns).
 MAX_GAP_NS = 500_000_000
 # A GNSS stamp this far ahead of the IMU comes from another clock (ns).
@@ -185,25 +186,24 @@ class ImuBuffer:
         if not self._new_arrays:
             return
         stamps, gyro, accel = map(np.concatenate, zip(*self._new_arrays))
-        samples = np.concatenate([gyro.T, accel.T]).T
+        samples = np.concatenate([gyro.T, accel.T])
         self._new_arrays = []
         self._counts['imu'] += stamps.size
         with np.errstate(invalid='ignore'):
-            good = np.all(np.abs(samples[:, :3]) < MAX_RATE, axis=1) & np.all(
-                np.abs(samples[:, 3:]) < MAX_ACCELERATION, axis=1)
+            good = np.all(np.abs(samples) < _LIMITS, axis=0)
         self._counts['imu_nan'] += int(np.count_nonzero(~good))
         late = stamps <= self.used_ns
         self._counts['imu_late'] += int(np.count_nonzero(good & late))
         good &= ~late
         stamps = np.concatenate([self.stamps, stamps[good]])
-        samples = np.concatenate([self.samples, samples[good]])
+        samples = np.concatenate([self.samples.T, samples[:, good]], axis=1)
         if np.any(stamps[1:] <= stamps[:-1]):
             order = np.argsort(stamps, kind='stable')
-            stamps, samples = stamps[order], samples[order]
+            stamps, samples = stamps[order], samples[:, order]
             first = np.concatenate([[True], stamps[1:] > stamps[:-1]])
             self._counts['imu_duplicate'] += int(np.count_nonzero(~first))
-            stamps, samples = stamps[first], samples[first]
-        self.stamps, self.samples = stamps, np.asfortranarray(samples)
+            stamps, samples = stamps[first], samples[:, first]
+        self.stamps, self.samples = stamps, samples.T
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop samples before `stamp_ns`, but for those that are still looked at."""

@@ -88,4 +88,4 @@ class GSensitivity:
                             1 - np.exp(-seconds / np.array([CALM_TIME, STEADY_TIME])))
         for share, force, away in zip(shares[..., None], forces, unsteady):
             self._means = self._means + share * (force - self._means)
-            np.subtract(*self._means, out=away)
+            away[:] = self._means[0] - self._means[1]

@@ -21,7 +21,6 @@ that is not known.
 
 from collections import Counter
 from dataclasses import dataclass
-from functools import reduce
 import math
 
 from ins_align.buffers import ImuBuffer
@@ -204,7 +203,7 @@ class ImuCutter:
 
 def _together(*densities: 'Array | float') -> Array:
     """Density of noises that are independent of each other."""
-    return reduce(np.hypot, map(np.asarray, densities))
+    return np.asarray(np.sqrt(sum(map(np.square, densities))))
 
 
 def _rms(slope: Array) -> Array:

@@ -168,12 +168,13 @@ class RangeCheck:
             return
         at_end = self._at_end(samples).reshape(-1, 2, 3)
         self._last = samples[-1]
+        if not at_end.any():
+            self._within_ns[:] = stamps[-1]
+            return
         beyond = np.any(at_end, axis=2)
         within = np.maximum.accumulate(np.where(beyond, self._within_ns, stamps[:, None]))
         self._within_ns = within[-1]
         k = np.flatnonzero(np.any(beyond, axis=1))
-        if not k.size:
-            return
         missed = BEYOND_END * np.max(np.abs(samples[k].reshape(-1, 2, 3)) * at_end[k], axis=2)
         seconds = (stamps[k, None] - within[k]) * 1e-9
         self.stamps = np.concatenate([self.stamps, stamps[k]])
@@ -193,13 +194,12 @@ class RangeCheck:
     def _at_end(self, samples: Array) -> np.ndarray:
         """Which values are at the end of the range, shape (N, 6)."""
         at_end = np.zeros(samples.shape, bool)
-        signed = np.stack([samples, -samples])
-        reached = np.argwhere(signed.max(axis=1) >= self._ends)
+        reached = np.argwhere([samples.max(axis=0), -samples.min(axis=0)] >= self._ends)
         if reached.size:
             changed = np.diff(np.vstack([self._last, samples]), axis=0) != 0.0
             changing = np.count_nonzero(changed, axis=1)
         for sign, axis in reached.tolist():
-            values = signed[sign, :, axis]
+            values = -samples[:, axis] if sign else samples[:, axis]
             so_far = np.maximum(np.maximum.accumulate(values), self._ends[sign, axis])
             for k in np.flatnonzero(values == so_far).tolist():
                 if values[k] > self._ends[sign, axis]:

@@ -281,7 +281,7 @@ def split_at_epochs(stamps: 'Array | Index', gyro: Array, accel: Array,
     end = stamps.size + np.arange(1, epochs.size)
     knots = np.where(inner < last, inner, end)
     knots[0] = end - 1
-    omega, f, omega_dot, f_dot = known[:, knots].reshape(4, 3, *knots.shape)
+    omega, f, omega_dot, f_dot = known.take(knots, axis=1).reshape(4, 3, *knots.shape)
     return Steps(np.diff(np.concatenate([stamps, epochs])[knots], axis=0).T * unit,
                  omega.T, f.T, omega_dot.T, f_dot.T)
 
