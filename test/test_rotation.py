@@ -44,6 +44,26 @@ def test_skew_and_cross_are_the_cross_product():
     assert np.allclose(rotation.cross(a, b[0, 0]), np.cross(a, b[0, 0]), atol=1e-15)
 
 
+def test_products_written_out_are_products():
+    random = np.random.default_rng(0)
+    left, right = random.standard_normal((5, 4, 3, 3)), random.standard_normal((5, 4, 3, 2))
+    for order in 'CF':
+        left, right = (np.array(each, order=order) for each in (left, right))
+        for one in (left, left[0, 0]):
+            product = rotation.product(one, right)
+            assert np.allclose(product, one @ right, atol=1e-14) and product.flags.f_contiguous
+        assert np.array_equal(rotation.product(left[1:2], right[1:2]),
+                              rotation.product(left, right)[1:2])
+
+
+@pytest.mark.parametrize('angle', SMALL + LARGE + (5.0, 20.0))
+def test_vectors_are_rotated_as_by_the_matrix(angle):
+    rotations = angle * directions()
+    vectors = np.random.default_rng(1).standard_normal(rotations.shape)
+    expected = rotation.apply(rotation.exp_so3(rotations), vectors)
+    assert np.allclose(rotation.rotated(rotations, vectors), expected, rtol=0, atol=1e-14)
+
+
 @pytest.mark.parametrize('angle', SMALL + LARGE + (5.0, 20.0))
 def test_exp_is_the_matrix_exponential(angle):
     vectors = angle * directions()
