@@ -21,14 +21,14 @@ checked before memory is spent on them.
 
 from __future__ import annotations
 
-import bisect
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Mapping, Sequence
 import itertools
-from operator import itemgetter
 import os
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 import zlib
+
+import numpy as np
 
 MAX_CHUNK_BYTES = 1 << 28  # of a chunk, unpacked
 MAX_MESSAGE_BYTES = 1 << 16  # of an IMU or GNSS message, which has some hundred bytes
@@ -60,7 +60,102 @@ class Topic(NamedTuple):
     encoding: str  # of its messages: cdr or ros1
 
 
-Records = list[tuple[int, int, bytes]]  # recorded time, topic's id, message
+class Messages:
+    """
+    Serialised messages that lie in one buffer, so that many are decoded at once.
+
+    Parameters
+    ----------
+    buffer : bytes
+        What they lie in.
+    starts, lengths : ndarray, shape (N,)
+        Where each one lies.
+
+    """
+
+    def __init__(self, buffer: bytes, starts: np.ndarray, lengths: np.ndarray) -> None:
+        self._buffer = buffer
+        self._starts = starts
+        self.lengths = lengths
+
+    @classmethod
+    def of(cls, messages: Sequence[bytes]) -> Messages:
+        """Put messages one behind the other."""
+        lengths = np.fromiter(map(len, messages), np.int64, len(messages))
+        return cls(b''.join(messages), np.cumsum(lengths) - lengths, lengths)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Messages]) -> Messages:
+        """Make one of several."""
+        ends = itertools.accumulate((len(part._buffer) for part in parts), initial=0)
+        return cls(b''.join(part._buffer for part in parts),
+                   np.concatenate([part._starts + end for part, end in zip(parts, ends)]),
+                   np.concatenate([part.lengths for part in parts]))
+
+    def __len__(self) -> int:
+        return self.lengths.size
+
+    def __getitem__(self, index: int) -> bytes:
+        start = int(self._starts[index])
+        return self._buffer[start:start + int(self.lengths[index])]
+
+    def __iter__(self) -> Iterator[bytes]:
+        for start, length in zip(self._starts.tolist(), self.lengths.tolist()):
+            yield self._buffer[start:start + length]
+
+    def take(self, places: np.ndarray | slice) -> Messages:
+        """Return some of them."""
+        return Messages(self._buffer, self._starts[places], self.lengths[places])
+
+    def alone(self) -> Messages:
+        """Return them in a buffer that holds little else, which images may have filled."""
+        return self if 2 * self.lengths.sum() > len(self._buffer) else Messages.of([*self])
+
+    def rows(self, start: int, size: int) -> np.ndarray:
+        """Return so many bytes from this place of each message on, which they all must have."""
+        return bytes_at(self._buffer, self._starts + start, size)
+
+
+def bytes_at(buffer: bytes, places: np.ndarray, size: int) -> np.ndarray:
+    """Return the bytes that lie at some places of a buffer, shape (N, size)."""
+    if not places.size:
+        return np.zeros((0, size), np.uint8)
+    # An item at every byte: taking some is a plain copy of each.
+    items = np.ndarray((len(buffer) - size + 1,), f'V{size}', buffer, 0, (1,))
+    return items[places].view(np.uint8).reshape(-1, size)
+
+
+class Block(NamedTuple):
+    """Consecutive messages, in columns."""
+
+    times_ns: np.ndarray  # (N,) int64, recorded time
+    topics: np.ndarray  # (N,) int64, index into the topics that were asked for
+    messages: Messages
+
+    @classmethod
+    def of(cls, times_ns: Sequence[int], topics: Sequence[int],
+           messages: Sequence[bytes]) -> Block:
+        """Make columns of sequences."""
+        return cls(np.array(times_ns, np.int64), np.array(topics, np.int64),
+                   Messages.of(messages))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Block]) -> Block:
+        """Make one of several."""
+        times_ns, topics, messages = zip(*parts)
+        return cls(np.concatenate(times_ns), np.concatenate(topics), Messages.joined(messages))
+
+    def take(self, places: np.ndarray | slice) -> Block:
+        """Return some of the messages."""
+        return Block(self.times_ns[places], self.topics[places], self.messages.take(places))
+
+
+class Records(NamedTuple):
+    """The messages of a stretch of a file, in columns, in the order in which they lie there."""
+
+    times_ns: np.ndarray  # (N,) uint64, recorded time
+    topics: np.ndarray  # (N,) the file's keys of their topics
+    messages: Messages
 
 
 class Segment(NamedTuple):
@@ -168,31 +263,52 @@ class ChunkedFile:
         """Close the file."""
         self._file.close()
 
-    def blocks(self, ids: Collection[int], start_ns: int, stop_ns: int) -> Iterator[Records]:
-        """Yield records many at a time, in the order of recorded time."""
-        by_time = itemgetter(0)
+    def blocks(self, wanted: Mapping[int, int], start_ns: int, stop_ns: int) -> Iterator[Block]:
+        """Yield messages many at a time, in the order of recorded time."""
         segments = [segment for segment in self._segments
                     if segment.end_ns >= start_ns and segment.start_ns < stop_ns]
         starts = [segment.start_ns for segment in segments[1:]] + [INT64_MAX]
         horizons = list(itertools.accumulate(reversed(starts), min))[::-1]
-        pending: Records = []
+        pending = Block.of((), (), ())
         for segment, horizon in zip(segments, horizons):
-            pending += self._records(self._load(segment), ids, start_ns, stop_ns)
-            pending.sort(key=by_time)
-            ready = bisect.bisect_left(pending, horizon, key=by_time)
-            held_back = sum(len(record[2]) for record in pending[ready:])
-            if held_back > MAX_PENDING_BYTES or horizon == INT64_MAX:
-                ready = len(pending)
+            block = self._block(self._records(self._load(segment)), wanted, start_ns, stop_ns)
+            if len(pending.messages):
+                block = Block.joined([pending, block])
+            if (np.diff(block.times_ns) < 0).any():
+                block = block.take(np.argsort(block.times_ns, kind='stable'))
+            ready = int(np.searchsorted(block.times_ns, horizon))
+            if block.messages.lengths[ready:].sum() > MAX_PENDING_BYTES:
+                ready = len(block.messages)
             if ready:
-                yield pending[:ready]
-            del pending[:ready]
+                yield block.take(slice(ready))
+            later = block.take(slice(ready, None))
+            pending = later._replace(messages=later.messages.alone())
+
+    def _block(self, records: Records, wanted: Mapping[int, int], start_ns: int, stop_ns: int,
+               ) -> Block:
+        """Choose messages; one that is too long is an error."""
+        keys = np.array(sorted(wanted))
+        nearest = np.minimum(np.searchsorted(keys, records.topics), keys.size - 1)
+        first, end = (np.uint64(max(time_ns, 0)) for time_ns in (start_ns, stop_ns))
+        chosen = np.flatnonzero((keys[nearest] == records.topics)
+                                & (first <= records.times_ns) & (records.times_ns < end))
+        messages = records.messages.take(chosen)
+        too_long = messages.lengths > MAX_MESSAGE_BYTES
+        if too_long.any():
+            index = int(np.argmax(too_long))
+            raise BagError(f'{self._path.name} has a message of {messages.lengths[index]} bytes '
+                           f'on {self.topics[int(records.topics[chosen[index]])].name}, where '
+                           f'{MAX_MESSAGE_BYTES} are allowed')
+        messages = messages.alone()
+        indices = np.array([wanted[key] for key in keys.tolist()])
+        return Block(records.times_ns[chosen].astype(np.int64), indices[nearest[chosen]], messages)
 
     def _walk(self) -> None:
         """Find segments and topics."""
         raise NotImplementedError
 
-    def _records(self, data: bytes, ids: Collection[int], start_ns: int, stop_ns: int) -> Records:
-        """Return the wanted records of a segment."""
+    def _records(self, data: bytes) -> Records:
+        """Return the messages of a segment."""
         raise NotImplementedError
 
     def _warn(self, text: str) -> None:
@@ -217,7 +333,3 @@ class ChunkedFile:
     def _warn_of_damage(self) -> None:
         if self._complete:  # otherwise it has been said that the recording ends early
             self._warn('has a damaged chunk: what could be read of it is used')
-
-    def _refuse_message(self, size: int, topic: int) -> NoReturn:
-        raise BagError(f'{self._path.name} has a message of {size} bytes on '
-                       f'{self.topics[topic].name}, where {MAX_MESSAGE_BYTES} are allowed')

@@ -29,8 +29,8 @@ from typing import Any, NamedTuple
 
 from ins_align import mcap_file, rosbag1_file, sqlite_file
 from ins_align.bag_files import (
-    BagError, ChunkedFile, decompress, decompressor, INT64_MAX, MAX_MESSAGE_BYTES, one_line,
-    PIECE_BYTES, Topic, ZSTD_MAGIC)
+    BagError, Block, ChunkedFile, decompress, decompressor, INT64_MAX, MAX_MESSAGE_BYTES, Messages,
+    one_line, PIECE_BYTES, Topic, ZSTD_MAGIC)
 from ins_align.config import Config
 from ins_align.decoding import deserialize
 from ins_align.messages import MessageError, velocity_from_msg
@@ -63,14 +63,6 @@ class Topics(NamedTuple):
     velocity: Topic | None
     velocity_type: str | None  # as the parameter of that name has it
     reference: Topic | None
-
-
-class Block(NamedTuple):
-    """Consecutive messages, in columns."""
-
-    times_ns: Sequence[int]  # recorded time
-    topics: Sequence[int]  # index into the topics that were asked for
-    messages: Sequence[bytes]  # serialised
 
 
 class Bag:
@@ -136,8 +128,8 @@ class Bag:
             First recorded time and the one to stop before.
 
         """
-        start_ns = 0 if start_ns is None else start_ns
-        stop_ns = INT64_MAX if stop_ns is None else stop_ns
+        start_ns = 0 if start_ns is None else min(start_ns, INT64_MAX)
+        stop_ns = INT64_MAX if stop_ns is None else min(stop_ns, INT64_MAX)
         for group in self._overlapping():
             streams = [self._blocks_of(file, topics, start_ns, stop_ns) for file in group]
             if len(streams) == 1:
@@ -145,7 +137,7 @@ class Bag:
                 continue
             merged = heapq.merge(*(_one_by_one(stream) for stream in streams), key=itemgetter(0))
             while records := list(itertools.islice(merged, MERGED_BLOCK)):
-                yield Block(*zip(*records))
+                yield Block.of(*zip(*records))
 
     def _overlapping(self) -> Iterator[list[ChunkedFile | sqlite_file.SqliteFile]]:
         """Put together the files that hold messages of the same time."""
@@ -167,16 +159,17 @@ class Bag:
         if not wanted:
             return
         packed = None
-        for records in file.blocks(wanted, start_ns, stop_ns):
-            times_ns, keys, messages = zip(*records)
-            indices = list(map(wanted.__getitem__, keys))
+        for block in file.blocks(wanted, start_ns, stop_ns):
+            if not len(block.messages):
+                continue
             if packed is None:  # rosbag2 compresses every message or none
-                packed = (topics[indices[0]].encoding == 'cdr'
-                          and messages[0].startswith(ZSTD_MAGIC))
+                packed = (topics[block.topics[0]].encoding == 'cdr'
+                          and block.messages[0].startswith(ZSTD_MAGIC))
             if packed:
-                messages = tuple(decompress(message, 'zstd', MAX_MESSAGE_BYTES)
-                                 for message in messages)
-            yield Block(times_ns, indices, messages)
+                block = block._replace(messages=Messages.of(
+                    [decompress(message, 'zstd', MAX_MESSAGE_BYTES)
+                     for message in block.messages]))
+            yield block
 
     def messages(self, topics: Sequence[Topic], start_ns: int | None = None,
                  stop_ns: int | None = None) -> Iterator[tuple[Topic, int, bytes]]:
@@ -355,7 +348,7 @@ class Bag:
 
 def _one_by_one(blocks: Iterable[Block]) -> Iterator[tuple[int, int, bytes]]:
     for block in blocks:
-        yield from zip(*block)
+        yield from zip(block.times_ns.tolist(), block.topics.tolist(), block.messages)
 
 
 def _with_type(topic: Topic) -> str:

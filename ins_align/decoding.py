@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar
 
-from ins_align.bag_files import Topic
+from ins_align.bag_files import Messages, Topic
 from ins_align.config import Config
 from ins_align.messages import (
     Fix, fix_from_msg, fixes, imu_from_msg, MessageError, stamp_from_msg, velocities, Velocity,
@@ -33,6 +33,7 @@ _RATE_OFFSET = 8 * (4 + 9)
 _FORCE_OFFSET = _RATE_OFFSET + 8 * (3 + 9)
 _CDR_LITTLE_ENDIAN = b'\x00\x01'  # OMG DDSI-RTPS 2.3, 10.2: encapsulation of plain CDR
 _FRAME_LENGTH = slice(12, 16)  # of the frame_id, in both serialisations
+_UNKNOWN = -1  # where the numbers of another layout start
 # Velocity messages: strings at the front, then float64 alone; of these the place of the velocity
 # (3), that of the covariance of the twist (36) and how many there are.
 _VELOCITIES = {'TwistStamped': (1, 0, None, 6),
@@ -78,6 +79,7 @@ class Refused(NamedTuple):
     why: str = ''
 
 
+Position = TypeVar('Position', int, np.ndarray)
 Columns = TypeVar('Columns', ImuSamples, Orientations)
 
 
@@ -112,7 +114,7 @@ def deserialize(data: bytes, topic: Topic) -> Any:
                            f'{topic.msgtype}') from None
 
 
-def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
+def decode_imu(messages: Messages, topic: Topic) -> ImuSamples:
     """
     Decode serialised sensor_msgs/Imu; messages that cannot be decoded are left out.
 
@@ -123,7 +125,7 @@ def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
                                imu_from_msg))
 
 
-def decode_orientations(messages: Sequence[bytes], topic: Topic) -> Orientations:
+def decode_orientations(messages: Messages, topic: Topic) -> Orientations:
     """Decode the orientations of serialised sensor_msgs/Imu like `decode_imu`."""
     return Orientations(*_decode(messages, topic, ((0, 4), (8 * 4, 9)), _orientation_from_msg)[:3])
 
@@ -134,7 +136,7 @@ def _orientation_from_msg(msg: Any) -> tuple[int, list[float], np.ndarray]:
             msg.orientation_covariance)
 
 
-def _decode(messages: Sequence[bytes], topic: Topic, fields: tuple[tuple[int, int], ...],
+def _decode(messages: Messages, topic: Topic, fields: tuple[tuple[int, int], ...],
             convert: Callable[[Any], tuple[Any, ...]]) -> list[np.ndarray]:
     """
     Return stamps, the fields and which messages could be decoded.
@@ -149,36 +151,25 @@ def _decode(messages: Sequence[bytes], topic: Topic, fields: tuple[tuple[int, in
         Makes the same of a message of the library.
 
     """
-    start = body_start(messages[0], topic.encoding) if messages else None
-    raw = None if start is None else _stacked(messages, topic.encoding)
-    if start is not None and raw is not None:
-        return _columns(raw, start, fields) + [np.ones(len(messages), bool)]
-    count = len(messages)
-    columns = [np.zeros(count, np.int64)] + [np.zeros((count, width)) for _, width in fields]
-    decoded = np.ones(count, bool)
-    for index, message in enumerate(messages):
-        start = body_start(message, topic.encoding)
+    starts = _body_starts(messages, topic.encoding)
+    if starts.size and starts[0] != _UNKNOWN and (starts == starts[0]).all():
+        return _columns(messages, int(starts[0]), fields) + [np.ones(starts.size, bool)]
+    columns = [np.zeros(starts.size, np.int64)] + [np.zeros((starts.size, width))
+                                                   for _, width in fields]
+    decoded = np.ones(starts.size, bool)
+    for start in np.unique(starts[starts != _UNKNOWN]).tolist():
+        places = np.flatnonzero(starts == start)
+        for column, values in zip(columns, _columns(messages.take(places), start, fields)):
+            column[places] = values
+    for index in np.flatnonzero(starts == _UNKNOWN).tolist():
         try:
-            values = (convert(deserialize(message, topic)) if start is None
-                      else [column[0] for column in _columns(
-                          np.frombuffer(message, np.uint8)[None, :], start, fields)])
+            converted = convert(deserialize(messages[index], topic))
         except MessageError:
             decoded[index] = False
             continue
-        for column, value in zip(columns, values):
+        for column, value in zip(columns, converted):
             column[index] = value
     return [column if decoded.all() else column[decoded] for column in columns] + [decoded]
-
-
-def _stacked(messages: Sequence[bytes], encoding: str) -> np.ndarray | None:
-    """Return the bytes of messages in rows; None if their lengths or encapsulations differ."""
-    length = len(messages[0])
-    if length < _FRAME_LENGTH.stop or len(set(map(len, messages))) > 1:
-        return None
-    raw = np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), length)
-    alike = ((encoding != 'cdr' or (raw[:, :2] == raw[0, :2]).all())
-             and (raw[:, _FRAME_LENGTH] == raw[0, _FRAME_LENGTH]).all())
-    return raw if alike else None
 
 
 def body_start(message: bytes, encoding: str) -> int | None:
@@ -188,56 +179,66 @@ def body_start(message: bytes, encoding: str) -> int | None:
     None: this is not the known layout, by its encapsulation or because header and numbers do not
     add up to its length.
     """
-    if len(message) < 16:
+    if len(message) < _FRAME_LENGTH.stop:
         return None
     frame_length = int.from_bytes(message[_FRAME_LENGTH], 'little')
     if encoding == 'cdr' and message[:2] != _CDR_LITTLE_ENDIAN:
         return None
-    start = _aligned(16 + frame_length, 8, encoding)
+    start = _aligned(_FRAME_LENGTH.stop + frame_length, 8, encoding)
     return start if len(message) == start + _BODY_BYTES else None
 
 
-def _columns(raw: np.ndarray, start: int, fields: tuple[tuple[int, int], ...],
+def _body_starts(messages: Messages, encoding: str) -> np.ndarray:
+    """Return what `body_start` does for each message, shape (N,), _UNKNOWN for None."""
+    starts = np.full(len(messages), _UNKNOWN)
+    long = np.flatnonzero(messages.lengths >= _FRAME_LENGTH.stop)
+    heads = messages.take(long).rows(0, _FRAME_LENGTH.stop)
+    start = _aligned(_FRAME_LENGTH.stop + heads.view('<u4')[:, 3].astype(np.int64), 8, encoding)
+    known = messages.lengths[long] == start + _BODY_BYTES
+    if encoding == 'cdr':
+        known &= (heads[:, :2] == np.frombuffer(_CDR_LITTLE_ENDIAN, np.uint8)).all(axis=1)
+    starts[long[known]] = start[known]
+    return starts
+
+
+def _columns(messages: Messages, start: int, fields: tuple[tuple[int, int], ...],
              ) -> list[np.ndarray]:
-    """Decode messages in rows of bytes, whose numbers start at one place."""
+    """Decode messages whose numbers start at one place."""
     # Both begin with four other bytes: the encapsulation, or the sequence number of ROS 1.
-    seconds = _column(raw, 4, '<i4')[:, 0].astype(np.int64)
-    nanoseconds = _column(raw, 8, '<u4')[:, 0]
+    stamps = messages.rows(4, 8)
+    seconds = stamps.view('<i4')[:, 0].astype(np.int64)
+    nanoseconds = stamps.view('<u4')[:, 1]
     return [seconds * 1_000_000_000 + nanoseconds,
-            *(_column(raw, start + offset, '<f8', width) for offset, width in fields)]
+            *(messages.rows(start + offset, 8 * width).view('<f8') for offset, width in fields)]
 
 
-def _column(raw: np.ndarray, start: int, kind: str, width: int = 1) -> np.ndarray:
-    size = width * np.dtype(kind).itemsize
-    return np.ascontiguousarray(raw[:, start:start + size]).view(kind)
-
-
-def decode_fixes(messages: Sequence[bytes], topic: Topic) -> list[Fix | Refused]:
+def decode_fixes(messages: Messages, topic: Topic) -> list[Fix | Refused]:
     """Decode serialised sensor_msgs/NavSatFix, or say why not."""
     same = _same_layout(messages, topic.encoding, 1)
     if same is not None:
-        raw, _, status = same
+        _, status = same
         # Behind the header an int8 and a uint16, 12 numbers and a byte.
         start = _aligned(_aligned(status + 1, 2, topic.encoding) + 2, 8, topic.encoding)
         kind = start + 8 * 12
-        if _ends(raw, kind + 1, topic.encoding):
-            stamps, places, covariances = _columns(raw, start, ((0, 3), (8 * 3, 9)))
-            return [*fixes(stamps, places, covariances.reshape(-1, 3, 3), raw[:, kind],
-                           raw[:, status].view(np.int8))]
+        if _ends(messages, kind + 1, topic.encoding):
+            stamps, places, covariances = _columns(messages, start, ((0, 3), (8 * 3, 9)))
+            return [*fixes(stamps, places, covariances.reshape(-1, 3, 3),
+                           messages.rows(kind, 1)[:, 0],
+                           messages.rows(status, 1)[:, 0].view(np.int8))]
     return [_by_library(message, topic, fix_from_msg, 'fix') for message in messages]
 
 
-def decode_velocities(messages: Sequence[bytes], topic: Topic,
+def decode_velocities(messages: Messages, topic: Topic,
                       config: Config) -> list[Velocity | Refused]:
     """Decode the messages that ``config.velocity_type`` names like `decode_fixes`."""
     strings, place, covariance, count = _VELOCITIES[config.velocity_type]
     same = _same_layout(messages, topic.encoding, strings)
     if same is not None:
-        raw, names, end = same
+        names, end = same
         start = _aligned(end, 8, topic.encoding)
-        if _ends(raw, start + 8 * count, topic.encoding):
+        if _ends(messages, start + 8 * count, topic.encoding):
             fields = [(8 * place, 3)] + ([] if covariance is None else [(8 * covariance, 36)])
-            stamps, linear, *twist = _columns(raw, start, tuple(fields))
+            stamps, linear, *twist = _columns(messages, start, tuple(fields))
             try:
                 return [*velocities(stamps, names[-1], linear,
                                     twist[0].reshape(-1, 6, 6) if twist else None, config)]
@@ -258,23 +259,26 @@ def _by_library(message: bytes, topic: Topic, convert: Callable[[Any], Any], nam
         return Refused('velocity_body_frame', str(error))
 
 
-def _same_layout(messages: Sequence[bytes], encoding: str, strings: int,
-                 ) -> tuple[np.ndarray, list[str], int] | None:
+def _same_layout(messages: Messages, encoding: str, strings: int,
+                 ) -> tuple[list[str], int] | None:
     """
-    Return messages in rows of bytes, the strings at their front and where these end.
+    Return the strings at the front of the messages and where these end.
 
-    None if they are not all alike in this, or are serialised in a way that this module does not
-    know.
+    None if they are not all alike in this and in their lengths, or are serialised in a way that
+    this module does not know.
     """
-    raw = _stacked(messages, encoding) if messages else None
-    if raw is None or (encoding == 'cdr' and messages[0][:2] != _CDR_LITTLE_ENDIAN):
+    lengths = messages.lengths
+    if not lengths.size or lengths[0] < _FRAME_LENGTH.stop or (lengths != lengths[0]).any():
+        return None
+    first = messages[0]
+    if encoding == 'cdr' and first[:2] != _CDR_LITTLE_ENDIAN:
         return None
     names = []
     end = _FRAME_LENGTH.start
     for _ in range(strings):
         start = _aligned(end, 4, encoding) + 4
-        end = start + int.from_bytes(messages[0][start - 4:start], 'little')
-        name = messages[0][start:end]
+        end = start + int.from_bytes(first[start - 4:start], 'little')
+        name = first[start:end]
         if encoding == 'cdr':  # where a string ends with a zero, which its length counts
             if not name.endswith(b'\0'):
                 return None
@@ -283,15 +287,20 @@ def _same_layout(messages: Sequence[bytes], encoding: str, strings: int,
             names.append(name.decode())
         except UnicodeDecodeError:
             return None
-    front = raw[:, _FRAME_LENGTH.start:end]
-    return (raw, names, end) if (front == front[0]).all() else None
+    if end > len(first):
+        return None
+    front = messages.rows(0, end)
+    alike = (front == front[0])[:, _FRAME_LENGTH.start:].all()
+    if encoding == 'cdr':
+        alike &= (front[:, :2] == front[0, :2]).all()
+    return (names, end) if alike else None
 
 
-def _aligned(position: int, size: int, encoding: str) -> int:
+def _aligned(position: Position, size: int, encoding: str) -> Position:
     """Return where the next value of a size lies, in CDR as counted behind the encapsulation."""
     return position + (-(position - 4) % size if encoding == 'cdr' else 0)
 
 
-def _ends(raw: np.ndarray, end: int, encoding: str) -> bool:
-    """Whether messages are so long; some serialisations of CDR fill the last four bytes."""
-    return end <= raw.shape[1] <= (end + 3 if encoding == 'cdr' else end)
+def _ends(messages: Messages, end: int, encoding: str) -> bool:
+    """Whether messages of one length end here; some serialisations of CDR fill four bytes."""
+    return end <= messages.lengths[0] <= (end + 3 if encoding == 'cdr' else end)

@@ -15,12 +15,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 import struct
 
 from ins_align.bag_files import (
-    ChunkedFile, INT64_MAX, MAX_DEFINITION_BYTES, MAX_MESSAGE_BYTES, Records, ros2_type, Segment,
-    Topic)
+    bytes_at, ChunkedFile, MAX_DEFINITION_BYTES, Messages, Records, ros2_type, Segment, Topic)
+import numpy as np
 
 MAGIC = b'\x89MCAP0\r\n'
 PLAIN_SEGMENT_BYTES = 1 << 22  # of records outside of chunks, read at a time
@@ -31,6 +30,8 @@ class McapFile(ChunkedFile):
 
     _RECORD = struct.Struct('<BQ')
     _MESSAGE = struct.Struct('<BQH4xQ8x')  # neither sequence number nor time of publication
+    _HEAD = np.dtype({'names': ['op', 'channel', 'log_time'], 'formats': ['u1', '<u2', '<u8'],
+                      'offsets': [0, 9, 15], 'itemsize': _MESSAGE.size})  # of a message, likewise
     _CHUNK = struct.Struct('<QQQII')
     _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _DATA_END = 1, 2, 3, 4, 5, 6, 15
     _LAST_OP = 15
@@ -101,9 +102,10 @@ class McapFile(ChunkedFile):
         for index, segment in enumerate(self._segments):
             data = self._load(segment)
             self._define(data)
-            times = [record[0] for record in self._records(data, None, 0, INT64_MAX)]
+            times = self._records(data).times_ns
             self._segments[index] = segment._replace(
-                start_ns=min(times, default=0), end_ns=max(times, default=-1))
+                start_ns=int(times.min()) if times.size else 0,
+                end_ns=int(times.max()) if times.size else -1)
 
     def _define(self, data: bytes) -> None:
         """Take the schemas and channels out of a run of records."""
@@ -134,24 +136,27 @@ class McapFile(ChunkedFile):
         end = position + 4 + length
         return record[position + 4:end].decode(), end
 
-    def _records(self, data: bytes, ids: Collection[int] | None, start_ns: int, stop_ns: int,
-                 ) -> Records:
-        records = []
-        unpack, head_size = self._MESSAGE.unpack_from, self._MESSAGE.size
+    def _records(self, data: bytes) -> Records:
+        """Return the messages, found from record to record by their lengths."""
+        unpack, head_size = self._RECORD.unpack_from, self._RECORD.size
         position, size = 0, len(data)
-        while position + head_size <= size:
-            op, length, channel, log_time = unpack(data, position)
-            start, position = position, position + 9 + length
-            if op == 0 or position > size:
+        last = size - self._MESSAGE.size
+        op = 0
+        edges: list[int] = []  # where each record starts and the last one ends
+        add = edges.append
+        while position <= last:
+            op, length = unpack(data, position)
+            add(position)
+            position += head_size + length
+            if not op:
                 break
-            if op != 5 or length < 22:
-                continue
-            if ids is None:
-                records.append((log_time, channel, b''))
-            elif channel in ids and start_ns <= log_time < stop_ns:
-                if length > MAX_MESSAGE_BYTES:
-                    self._refuse_message(length, channel)
-                records.append((log_time, channel, data[start + head_size:position]))
+        if op and position <= size:
+            add(position)  # otherwise the last record is none, and ends the one before it
         if position > size or position < size and not data[position]:
             self._warn_of_damage()
-        return records
+        places = np.fromiter(edges, np.int64, len(edges))
+        lengths = np.diff(places) - self._MESSAGE.size
+        heads = bytes_at(data, places[:-1], self._MESSAGE.size).view(self._HEAD)[:, 0]
+        chosen = np.flatnonzero((heads['op'] == self._MESSAGE_OP) & (lengths >= 0))
+        return Records(heads['log_time'][chosen], heads['channel'][chosen], Messages(
+            data, places[chosen] + self._MESSAGE.size, lengths[chosen]))

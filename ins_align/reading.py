@@ -22,8 +22,8 @@ from operator import itemgetter
 import os
 from typing import NamedTuple
 
-from ins_align.bag_files import BagError, Topic
-from ins_align.bags import Bag, Block, Topics
+from ins_align.bag_files import BagError, Block, Messages, Topic
+from ins_align.bags import Bag, Topics
 from ins_align.config import Config
 from ins_align.decoding import (
     decode_fixes, decode_imu, decode_orientations, decode_velocities, ImuSamples, Orientations,
@@ -107,15 +107,15 @@ def read(request: Request) -> Iterator[Part]:
         try:
             for block in bag.blocks(wanted, start_ns, stop_ns):
                 if end_ns > start_ns:
-                    done = min(max((block.times_ns[-1] - start_ns) / (end_ns - start_ns), 0.0),
-                               1.0)
+                    last_ns = int(block.times_ns[-1])
+                    done = min(max((last_ns - start_ns) / (end_ns - start_ns), 0.0), 1.0)
                 yield _decoded(block, wanted, topics, config, done, tuple(bag.warnings))
                 empty = False
         except OSError as error:
             raise BagError(f'{request.path} cannot be read: {error.strerror}') from None
         if empty:
             raise BagError(f'{request.path} has no IMU or GNSS messages {_part(request, bag)}')
-        yield _decoded(Block((), (), ()), wanted, topics, config, 1.0, tuple(bag.warnings))
+        yield _decoded(Block.of((), (), ()), wanted, topics, config, 1.0, tuple(bag.warnings))
 
 
 def _part(request: Request, bag: Bag) -> str:
@@ -131,27 +131,25 @@ def _part(request: Request, bag: Bag) -> str:
 def _decoded(block: Block, wanted: Sequence[Topic], topics: Topics, config: Config, done: float,
              warnings: tuple[str, ...]) -> Part:
     """Decode a block, the messages of a topic all at once."""
-    indices = np.array(block.topics, int)
+    def places_and_messages(topic: Topic) -> tuple[np.ndarray, Messages]:
+        places = np.flatnonzero(block.topics == wanted.index(topic))
+        return places, block.messages.take(places)
 
-    def places_and_messages(topic: Topic | None) -> tuple[list[int], list[bytes]]:
-        if topic is None:
-            return [], []
-        places = np.flatnonzero(indices == wanted.index(topic)).tolist()
-        return places, [block.messages[place] for place in places]
-
-    imu_places, imu_messages = places_and_messages(topics.imu)
-    samples = decode_imu(imu_messages, topics.imu)
-    before = np.zeros(indices.size, np.int64)
+    imu_places, messages = places_and_messages(topics.imu)
+    samples = decode_imu(messages, topics.imu)
+    before = np.zeros(len(block.messages), np.int64)
     before[imu_places] = samples.decoded
     before = np.cumsum(before)
     gnss: list[tuple[int, Fix | Velocity | Refused]] = []
     places, messages = places_and_messages(topics.fix)
-    gnss += zip(places, decode_fixes(messages, topics.fix))
+    gnss += zip(places.tolist(), decode_fixes(messages, topics.fix))
     if topics.velocity is not None:
         places, messages = places_and_messages(topics.velocity)
-        gnss += zip(places, decode_velocities(messages, topics.velocity, config))
+        gnss += zip(places.tolist(), decode_velocities(messages, topics.velocity, config))
     gnss.sort(key=itemgetter(0))
-    _, orientations = places_and_messages(topics.reference)
+    orientations = Messages.of(())
+    if topics.reference is not None:
+        _, orientations = places_and_messages(topics.reference)
     return Part(topics, config, samples,
                 tuple((int(before[place]), message) for place, message in gnss),
                 decode_orientations(orientations, topics.reference or topics.imu), done, warnings)

@@ -15,12 +15,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
 import struct
 
 from ins_align.bag_files import (
-    BagError, ChunkedFile, MAX_DEFINITION_BYTES, MAX_MESSAGE_BYTES, Records, ros2_type, Segment,
+    BagError, bytes_at, ChunkedFile, MAX_DEFINITION_BYTES, Messages, Records, ros2_type, Segment,
     Topic)
+import numpy as np
 
 MAGIC = b'#ROSBAG V'
 
@@ -79,14 +79,10 @@ class Rosbag1File(ChunkedFile):
     def _scan_chunks(self) -> None:
         """Find the topics and times of chunks that no index describes."""
         for index, segment in enumerate(self._segments):
-            times = []
-            for fields, body, end in self._split(data := self._load(segment)):
-                if fields.get(b'op') == self._CONNECTION:
-                    self._connect(fields, data[body:end])
-                elif fields.get(b'op') == self._MESSAGE:
-                    times.append(self._time(fields, b'time'))
+            times = self._records(self._load(segment), connect=True).times_ns
             self._segments[index] = segment._replace(
-                start_ns=min(times, default=0), end_ns=max(times, default=-1))
+                start_ns=int(times.min()) if times.size else 0,
+                end_ns=int(times.max()) if times.size else -1)
 
     def _connect(self, fields: dict[bytes, bytes], data: bytes) -> None:
         connection = self._uint(fields.get(b'conn', b''))
@@ -95,46 +91,95 @@ class Rosbag1File(ChunkedFile):
             msgtype = self._fields(data).get(b'type', b'').decode(errors='replace')
             self.topics[connection] = Topic('/' + name.strip('/'), ros2_type(msgtype), 'ros1')
 
-    def _records(self, data: bytes, ids: Collection[int], start_ns: int, stop_ns: int,
-                 ) -> Records:
-        records = []
-        for fields, body, end in self._split(data):
-            if fields.get(b'op') == self._MESSAGE:
-                connection = self._uint(fields.get(b'conn', b''))
-                time_ns = self._time(fields, b'time')
-                if connection is not None and connection in ids and start_ns <= time_ns < stop_ns:
-                    if end - body > MAX_MESSAGE_BYTES:
-                        self._refuse_message(end - body, connection)
-                    records.append((time_ns, connection, data[body:end]))
-        return records
-
-    def _split(self, data: bytes) -> Iterator[tuple[dict[bytes, bytes], int, int]]:
-        """Yield each whole record's header and where its data start and end."""
-        unpack = struct.Struct('<I').unpack_from
-        position = 0
-        while position + 8 <= len(data):
-            head_end = position + 4 + unpack(data, position)[0]
-            if not position + 4 < head_end <= len(data) - 4:
-                break
-            body = head_end + 4
-            end = body + unpack(data, head_end)[0]
-            if end > len(data):
-                break
-            yield self._fields(data[position + 4:head_end]), body, end
-            position = end
-        if position != len(data):
-            self._warn_of_damage()
+    def _records(self, data: bytes, connect: bool = False) -> Records:
+        """Return the messages; with `connect` learn the topics that are described among them."""
+        edges, bodies = self._split(data)
+        starts, ends = edges[:-1] + 4, edges[1:]
+        times_ns = np.zeros(starts.size, np.uint64)
+        connections = np.full(starts.size, -1)
+        is_message = np.zeros(starts.size, bool)
+        left = np.arange(starts.size)
+        alike_known = False
+        while left.size:
+            index = int(left[0])
+            header = data[starts[index]:bodies[index] - 4]
+            places = self._places(header)
+            fields = {name: header[place] for name, place in places.items()}
+            if fields.get(b'op') != self._MESSAGE:
+                if connect and fields.get(b'op') == self._CONNECTION:
+                    self._connect(fields, data[bodies[index]:ends[index]])
+                left = left[1:]
+                continue
+            connection = self._uint(fields.get(b'conn', b''))
+            if not alike_known and connection is not None and len(fields.get(b'time', b'')) == 8:
+                # The writer of a file has one way to write them: all others are taken from it.
+                alike_known = True
+                left, alike, rows = self._alike(data, starts, bodies, left, places)
+                seconds, nanoseconds = np.ascontiguousarray(
+                    rows[:, places[b'time']]).view('<u4').astype(np.uint64).T
+                times_ns[alike] = seconds * np.uint64(1_000_000_000) + nanoseconds
+                connections[alike] = np.ascontiguousarray(
+                    rows[:, places[b'conn']]).view('<u4')[:, 0]
+                is_message[alike] = True
+                continue
+            times_ns[index] = self._time(fields, b'time')
+            connections[index] = -1 if connection is None else connection
+            is_message[index] = True
+            left = left[1:]
+        chosen = np.flatnonzero(is_message)
+        return Records(times_ns[chosen], connections[chosen],
+                       Messages(data, bodies[chosen], (ends - bodies)[chosen]))
 
     @staticmethod
-    def _fields(header: bytes) -> dict[bytes, bytes]:
-        fields = {}
+    def _alike(data: bytes, starts: np.ndarray, bodies: np.ndarray, left: np.ndarray,
+               places: dict[bytes, slice]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Part the records that differ from the first one in no more than connection and time."""
+        lengths = (bodies - 4 - starts)[left]
+        long = lengths == lengths[0]
+        rows = bytes_at(data, starts[left[long]], int(lengths[0]))
+        same = rows == rows[0]
+        for name in (b'conn', b'time'):
+            same[:, places[name]] = True
+        alike = same.all(axis=1)
+        found = left[long][alike]
+        return np.setdiff1d(left, found, assume_unique=True), found, rows[alike]
+
+    def _split(self, data: bytes) -> tuple[np.ndarray, np.ndarray]:
+        """Return where each whole record starts and the last one ends, and where data start."""
+        unpack = struct.Struct('<I').unpack_from
+        position, size = 0, len(data)
+        edges: list[int] = []
+        bodies: list[int] = []
+        while position + 8 <= size:
+            body = position + 8 + unpack(data, position)[0]
+            if not position + 8 < body <= size:
+                break
+            end = body + unpack(data, body - 4)[0]
+            if end > size:
+                break
+            edges.append(position)
+            bodies.append(body)
+            position = end
+        if position != size:
+            self._warn_of_damage()
+        return np.array([*edges, position]), np.array(bodies, np.int64)
+
+    @classmethod
+    def _fields(cls, header: bytes) -> dict[bytes, bytes]:
+        return {name: header[place] for name, place in cls._places(header).items()}
+
+    @staticmethod
+    def _places(header: bytes) -> dict[bytes, slice]:
+        """Return where the value of each field lies."""
+        places = {}
         position = 0
         while position + 4 <= len(header):
             end = position + 4 + int.from_bytes(header[position:position + 4], 'little')
-            name, _, value = header[position + 4:end].partition(b'=')
-            fields[name] = value
+            field = header[position + 4:end]
+            name = field.partition(b'=')[0]
+            places[name] = slice(position + 4 + len(name) + 1, position + 4 + len(field))
             position = end
-        return fields
+        return places
 
     @staticmethod
     def _uint(data: bytes) -> int | None:

@@ -15,20 +15,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from array import array
+from collections.abc import Iterator, Mapping
 import contextlib
 from pathlib import Path
 import sqlite3
 from typing import Any
 from urllib.parse import quote
 
-from ins_align.bag_files import BagError, MAX_MESSAGE_BYTES, Records, ros2_type, Topic
+from ins_align.bag_files import (
+    BagError, Block, MAX_MESSAGE_BYTES, Messages, ros2_type, Topic)
+import numpy as np
 
 MAGIC = b'SQLite format 3\x00'
-BLOCK = 4096  # rows read at a time
+BLOCK = 4096  # rows yielded at a time
+FETCH = 256  # rows read at a time, so few that they stay in the processor's cache
 # Python decodes sqlite's messages, which quote what is damaged, as UTF-8.
 # What it has no memory for is a size that a damaged row claims.
 _ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
+
+Row = tuple[Any, Any, Any]  # recorded time, topic's id, message
 
 
 class SqliteFile:
@@ -96,33 +102,51 @@ class SqliteFile:
         """Close the file."""
         self._database.close()
 
-    def blocks(self, ids: Collection[int], start_ns: int, stop_ns: int) -> Iterator[Records]:
-        """Yield records many at a time, in the order of recorded time."""
-        taken: Records = []  # of the last stamp
+    def blocks(self, wanted: Mapping[int, int], start_ns: int, stop_ns: int) -> Iterator[Block]:
+        """Yield messages many at a time, in the order of recorded time."""
+        taken: list[tuple[int, int, bytes]] = []  # of the last stamp
         if self.end_ns is not None:
-            query = (self._SELECT + f'FROM messages WHERE topic_id IN ({",".join("?" * len(ids))})'
+            places = ','.join('?' * len(wanted))
+            query = (self._SELECT + f'FROM messages WHERE topic_id IN ({places})'
                      ' AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, rowid')
             try:
-                cursor = self._database.execute(query, (*ids, start_ns, stop_ns))
-                while rows := cursor.fetchmany(BLOCK):
-                    if records := self._sound(rows):
-                        yield records
-                        start_ns = records[-1][0]
-                        taken = [record for record in (*taken, *records) if record[0] == start_ns]
+                cursor = self._database.execute(query, (*wanted, start_ns, stop_ns))
+                while parts := self._fetched(cursor, wanted):
+                    block = Block.joined([
+                        part if isinstance(part, Block) else _columns(self._sound(part), wanted)
+                        for part in parts])
+                    if len(block.messages):
+                        yield block
+                        start_ns = int(block.times_ns[-1])
+                        last = block.take(block.times_ns == start_ns)
+                        taken = [record for record in taken if record[0] == start_ns]
+                        taken += zip(last.times_ns.tolist(), last.topics.tolist(), last.messages)
                 return
             except _ERRORS as error:
                 self._warn_of_damage(error)
-        records = []
-        for row in self._rows_as_stored():
-            record = row[:3]
-            if (row[1] in ids and type(row[0]) is int and start_ns <= row[0] < stop_ns
-                    and record not in taken):
-                records.append(record)
-            if len(records) == BLOCK:
-                yield self._sound(records)
-                records = []
-        if records:
-            yield self._sound(records)
+        rows: list[Row] = []
+        for time_ns, topic, data, _ in self._rows_as_stored():
+            if (topic in wanted and type(time_ns) is int and start_ns <= time_ns < stop_ns
+                    and (time_ns, wanted[topic], data) not in taken):
+                rows.append((time_ns, topic, data))
+            if len(rows) == BLOCK:
+                yield _columns(self._sound(rows), wanted)
+                rows = []
+        if rows:
+            yield _columns(self._sound(rows), wanted)
+
+    @staticmethod
+    def _fetched(cursor: sqlite3.Cursor, wanted: Mapping[int, int]) -> list[Block | list[Row]]:
+        """Read so many rows as a block has; as they are where some are no messages."""
+        parts: list[Block | list[Row]] = []
+        left = BLOCK
+        while left > 0 and (rows := cursor.fetchmany(min(FETCH, left))):
+            left -= len(rows)
+            try:
+                parts.append(_columns(rows, wanted))
+            except TypeError:
+                parts.append(rows)
+        return parts
 
     def _rows_as_stored(self) -> Iterator[tuple[Any, Any, Any, int]]:
         """
@@ -139,21 +163,18 @@ class SqliteFile:
                 last = row[3]
                 yield row
 
-    def _sound(self, rows: list[tuple[Any, Any, Any]]) -> Records:
+    def _sound(self, rows: list[Row]) -> list[Row]:
         """Leave out rows that are no messages; one that is too long is an error."""
-        times_ns, _, messages = zip(*rows)
-        if set(map(type, times_ns)) == {int} and set(map(type, messages)) == {bytes}:
-            return rows
-        records = []
+        sound = []
         for time_ns, topic, data in rows:
             if type(data) is int:
                 raise BagError(f'{self._path.name} has a message of {data} bytes on '
                                f'{self.topics[topic].name}, where {MAX_MESSAGE_BYTES} are allowed')
             if type(data) is bytes and type(time_ns) is int:
-                records.append((time_ns, topic, data))
+                sound.append((time_ns, topic, data))
             else:
                 self._warn('has damaged messages, which are left out')
-        return records
+        return sound
 
     def _warn_of_damage(self, error: Exception) -> None:
         self._warn(f'is damaged ({error}): it is read as far as it goes')
@@ -162,3 +183,11 @@ class SqliteFile:
         warning = f'{self._path.name} {text}'
         if warning not in self.warnings:
             self.warnings.append(warning)
+
+
+def _columns(rows: list[Row], wanted: Mapping[int, int]) -> Block:
+    """Put rows into columns; a TypeError where a time is no integer or a message no blob."""
+    times_ns, topics, messages = zip(*rows) if rows else ((), (), ())
+    return Block(np.frombuffer(array('q', times_ns), np.int64),
+                 np.fromiter(map(wanted.__getitem__, topics), np.int64, len(rows)),
+                 Messages.of(messages))

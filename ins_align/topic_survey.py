@@ -17,11 +17,10 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-import itertools
 import math
 from typing import Any, NamedTuple
 
-from ins_align.bag_files import BagError, Topic
+from ins_align.bag_files import BagError, Messages, Topic
 from ins_align.bags import Bag, FIX_TYPE, IMU_TYPE, REFERENCE_NAMESPACE, VELOCITY_TYPES
 from ins_align.buffers import (
     fault_of_fix, MAX_ACCELERATION, MAX_RATE, usable_velocity, with_an_altitude)
@@ -91,17 +90,17 @@ class Recorded:
         self._config = Config(velocity_type=topic.msgtype.rsplit('/', 1)[-1]
                               if kind == 'velocity' else Config.velocity_type)
 
-    def add(self, times_ns: list[int], messages: list[bytes]) -> None:
+    def add(self, times_ns: np.ndarray, messages: Messages) -> None:
         """Decode messages."""
         if self.kind == 'imu':
             if not self._rows:
                 self._look_at(messages[0])
             samples = decode_imu(messages, self.topic)
             self.undecodable += int(np.count_nonzero(~samples.decoded))
-            self._rows.append((np.array(times_ns)[samples.decoded], samples.stamps_ns,
+            self._rows.append((times_ns[samples.decoded], samples.stamps_ns,
                                np.hstack([samples.gyro, samples.accel])))
             return
-        for time_ns, data in zip(times_ns, messages):
+        for time_ns, data in zip(times_ns.tolist(), messages):
             try:
                 message = deserialize(data, self.topic)
             except MessageError:
@@ -224,11 +223,9 @@ def read_candidates(bag: Bag) -> list[Recorded]:
     topics = [data.topic for data in candidates]
     try:
         for block in bag.blocks(topics) if topics else ():
-            indices = np.array(block.topics)
-            for index in np.unique(indices).tolist():
-                chosen = (indices == index).tolist()
-                candidates[index].add(list(itertools.compress(block.times_ns, chosen)),
-                                      list(itertools.compress(block.messages, chosen)))
+            for index in np.unique(block.topics).tolist():
+                chosen = np.flatnonzero(block.topics == index)
+                candidates[index].add(block.times_ns[chosen], block.messages.take(chosen))
     except OSError as error:
         raise BagError(f'{bag.path} cannot be read: {error.strerror}') from None
     for data in candidates:

@@ -19,7 +19,7 @@ import struct
 
 from hypothesis import given, HealthCheck, settings, strategies as st
 from ins_align import bag_files, sqlite_file
-from ins_align.bag_files import decompress, ros2_type
+from ins_align.bag_files import decompress, Messages, ros2_type
 from ins_align.bags import Bag, BagError
 from ins_align.config import Config
 from ins_align.decoding import decode_imu
@@ -105,11 +105,26 @@ def test_real_recordings(name):
         assert bag.end_ns == records[-1][1]
 
 
+@given(st.lists(st.binary(max_size=9), max_size=8), st.lists(st.integers(0, 7), max_size=8))
+def test_messages_in_one_buffer(raws, places):
+    messages = Messages.of(raws)
+    assert [*messages] == [messages[k] for k in range(len(messages))] == raws
+    places = np.array([place % len(raws) for place in places if raws], int)
+    some = Messages.joined([messages.take(places), messages])
+    assert [*some] == [*some.alone()] == [raws[place] for place in places] + raws
+    long = some.take(np.flatnonzero(some.lengths >= 3))
+    assert [row.tobytes() for row in long.rows(1, 2)] == [raw[1:3] for raw in some if len(raw) > 2]
+
+
 @pytest.mark.parametrize('kind', FORMATS)
 def test_window_of_time(recordings, kind):
     start, stop = START_NS + 10 ** 10, START_NS + 2 * 10 ** 10
     records, _ = by_bag(recordings[kind], start_ns=start, stop_ns=stop)
     assert records == [r for r in by_library(recordings[kind]) if start <= r[1] < stop]
+    assert by_bag(recordings[kind], start_ns=-1, stop_ns=start)[0] + records == by_bag(
+        recordings[kind], stop_ns=stop)[0]
+    for start, stop in ((1 << 63, None), (1 << 64, 1 << 65), (-2, -1)):  # int64 holds neither
+        assert by_bag(recordings[kind], start_ns=start, stop_ns=stop) == ([], [])
 
 
 @pytest.mark.parametrize('kind', [kind for kind in FORMATS if not kind.startswith('ros1')])
@@ -261,6 +276,108 @@ def test_ros1_not_indexed(copy):
     assert 'not closed' in warnings[0]
 
 
+def ros1_header(*fields):
+    header = b''.join(struct.pack('<I', len(field)) + field for field in fields)
+    return struct.pack('<I', len(header)) + header
+
+
+def ros1_record(data, *fields):
+    return ros1_header(*fields) + struct.pack('<I', len(data)) + data
+
+
+def ros1_file(chunk, indexed):
+    """Return a file with one chunk; connections 0 to 3 are described behind it."""
+    start = b'#ROSBAG V2.0\n' + ros1_record(
+        b'', b'op=\x03', b'index_pos=' + struct.pack('<Q', indexed), b'chunk_count=' + bytes(
+            [1, 0, 0, 0]))
+    content = start + ros1_record(chunk, b'op=\x05', b'compression=none',
+                                  b'size=' + struct.pack('<I', len(chunk)))
+    content += b''.join(ros1_record(ros1_header(b'type=a/b')[4:], b'op=\x07',
+                                    b'topic=/%d' % key, b'conn=' + struct.pack('<I', key))
+                        for key in range(4))
+    return content + ros1_record(b'', b'op=\x06', b'chunk_pos=' + struct.pack('<Q', len(start)),
+                                 b'start_time=' + bytes(8), b'end_time=' + bytes([255] * 8))
+
+
+def plain_ros1(data):
+    """Return times, connections and messages of a chunk, and whether it is damaged."""
+    records = []
+    position = 0
+    while position + 8 <= len(data):
+        start, position = position, position + 4 + struct.unpack_from('<I', data, position)[0]
+        if not start + 4 < position <= len(data) - 4:
+            position = start
+            break
+        body = position + 4
+        end = body + struct.unpack_from('<I', data, position)[0]
+        if end > len(data):
+            position = start
+            break
+        header = data[start + 4:position]
+        position = end
+        fields = {}
+        while len(header) >= 4:
+            length, = struct.unpack_from('<I', header)
+            name, _, value = header[4:4 + length].partition(b'=')
+            fields[name] = value
+            header = header[4 + length:]
+        if fields.get(b'op') == b'\x02':
+            conn, time = fields.get(b'conn', b''), fields.get(b'time', b'')
+            seconds, nanoseconds = struct.unpack('<II', time) if len(time) == 8 else (0, 0)
+            records.append((seconds * 10 ** 9 + nanoseconds,
+                            struct.unpack('<I', conn)[0] if len(conn) == 4 else -1,
+                            data[body:end]))
+    return records, position != len(data)
+
+
+CONNECTION = st.builds(lambda key: b'conn=' + struct.pack('<I', key), st.one_of(
+    st.integers(0, 5), st.just((1 << 32) - 1)))
+TIME = st.builds(lambda *time: b'time=' + struct.pack('<II', *time), *[st.one_of(
+    st.integers(0, 9), st.just((1 << 32) - 1))] * 2)
+HEADER = st.one_of(
+    st.tuples(CONNECTION, st.just(b'op=\x02'), TIME),
+    st.tuples(TIME, st.just(b'op=\x02'), CONNECTION),
+    st.lists(st.one_of(CONNECTION, TIME, st.sampled_from([
+        b'op=\x02', b'op=\x07', b'conn=1', b'time=', b'time', b'=', b'', b'topic=/2']))))
+
+
+@settings(max_examples=500, deadline=None,
+          suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.tuples(HEADER, st.binary(max_size=8)), max_size=12),
+       st.lists(st.tuples(st.integers(0, 400), st.binary(max_size=9)), max_size=2),
+       st.binary(max_size=12), st.booleans())
+def test_records_of_a_ros1_chunk_as_one_finds_them_one_by_one(tmp_path, chunk, edits, end,
+                                                              indexed):
+    data = b''.join(ros1_record(body, *header) for header, body in chunk) + end
+    for at, piece in edits:
+        data = data[:at] + piece + data[at + len(piece):]
+    (tmp_path / 'a.bag').write_bytes(ros1_file(data, indexed))
+    records, warnings = by_bag(tmp_path / 'a.bag')
+    plain, damaged = plain_ros1(data)
+    with Bag(tmp_path / 'a.bag') as bag:
+        assert len(warnings) == (damaged if indexed else 1)
+        if indexed:
+            assert {topic.name for topic in bag.topics} == {'/0', '/1', '/2', '/3'}
+        else:
+            assert bag.end_ns == (max((time_ns for time_ns, *_ in plain), default=0) or None)
+        file, = bag._files
+        names = {key: topic.name for key, topic in file.topics.items()}
+    expected = [(names[key], time_ns, message) for time_ns, key, message in plain if key in names]
+    assert records == sorted(expected, key=lambda record: record[1])
+
+
+def test_topics_of_a_ros1_recording_without_index(tmp_path):
+    messages = [ros1_record(b'%d' % k, b'op=\x02', b'conn=' + struct.pack('<I', 7), b'time=' +
+                            struct.pack('<II', 1, k)) for k in range(3)]
+    described = ros1_record(ros1_header(b'type=a/b')[4:], b'op=\x07', b'topic=x',
+                            b'conn=' + struct.pack('<I', 7))
+    for at in range(4):
+        chunk = b''.join([*messages[:at], described, *messages[at:]])
+        (tmp_path / 'a.bag').write_bytes(ros1_file(chunk, False))
+        assert by_bag(tmp_path / 'a.bag')[0] == [
+            ('/x', 10 ** 9 + k, b'%d' % k) for k in range(3)]
+
+
 def test_mcap_without_chunks(tmp_path, recordings):
     content = b'\x89MCAP0\r\n' + mcap_record(1, mcap_string('ros2') + mcap_string('test'))
     content += mcap_record(3, struct.pack('<H', 1) + mcap_string(IMU) + mcap_string('ros2msg')
@@ -276,6 +393,80 @@ def test_mcap_without_chunks(tmp_path, recordings):
         records, warned = by_bag(tmp_path / name)
         assert records == [('/imu', k + 1, raw) for k, raw in enumerate(raws * 4)]
         assert len(warned) == warnings
+
+
+def mcap_file(chunks):
+    """Return a closed file whose chunks hold these bytes and which describes channels 0 to 3."""
+    content = b'\x89MCAP0\r\n'
+    for chunk in chunks:
+        content += mcap_record(6, struct.pack('<QQQII', 0, (1 << 64) - 1, len(chunk), 0, 0)
+                               + struct.pack('<Q', len(chunk)) + chunk)
+    return (content + mcap_record(15, bytes(4)) + b''.join(
+        mcap_record(4, struct.pack('<HH', key, 0) + mcap_string(f'/{key}') + mcap_string('cdr')
+                    + mcap_string('')) for key in range(4)) + mcap_record(2, bytes(20)))
+
+
+def plain_mcap(data):
+    """Return times, channels and messages of a chunk, and whether it is damaged."""
+    records = []
+    position = 0
+    while position + 31 <= len(data):
+        op, length, channel, time_ns = struct.unpack_from('<BQH4xQ8x', data, position)
+        start, position = position, position + 9 + length
+        if op == 0 or position > len(data):
+            break
+        if op == 5 and length >= 22:
+            records.append((time_ns, channel, data[start + 31:position]))
+    return records, position > len(data) or position < len(data) and not data[position]
+
+
+SIZES = st.one_of(st.integers(0, 40), st.sampled_from([1000, (1 << 16) + 1, 1 << 40, 1 << 63]))
+TIMES = st.one_of(st.integers(0, 9), st.sampled_from([(1 << 63) - 2, (1 << 63) - 1, 1 << 63,
+                                                      (1 << 64) - 1]))
+MESSAGE = st.tuples(st.just(5), st.none(), st.integers(0, 5), TIMES, st.binary(max_size=8))
+RECORD = st.one_of(MESSAGE, st.tuples(st.integers(0, 15), st.one_of(st.none(), SIZES),
+                                      st.integers(0, 5), TIMES, st.binary(max_size=40)))
+
+
+@settings(max_examples=500, deadline=None,
+          suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.lists(RECORD, max_size=12), min_size=1, max_size=3),
+       st.lists(st.tuples(st.integers(0, 400), st.binary(max_size=9)), max_size=2),
+       st.binary(max_size=40))
+def test_records_of_an_mcap_chunk_as_one_finds_them_one_by_one(tmp_path, chunks, edits, end):
+    data = [b''.join(
+        struct.pack('<BQHIQQ', op, 22 + len(body) if length is None else length, channel, 0,
+                    time_ns, 0) + body
+        for op, length, channel, time_ns, body in chunk) + end for chunk in chunks]
+    for at, piece in edits:
+        data[0] = data[0][:at] + piece + data[0][at + len(piece):]
+    (tmp_path / 'a.mcap').write_bytes(mcap_file(data))
+    plain = [plain_mcap(chunk) for chunk in data]
+    expected = [(f'/{channel}', time_ns, message) for records, _ in plain
+                for time_ns, channel, message in records
+                if channel < 4 and time_ns < (1 << 63) - 1]
+    expected.sort(key=lambda record: record[1])
+    records, warnings = by_bag(tmp_path / 'a.mcap')
+    assert records == expected
+    assert len(warnings) == any(damaged for _, damaged in plain)
+    # Without the summary each chunk is looked into for its times: all that are there.
+    (tmp_path / 'b.mcap').write_bytes(mcap_file(data)[:-29])
+    with Bag(tmp_path / 'b.mcap') as bag:
+        times = [time_ns for records, _ in plain for time_ns, *_ in records]
+        assert bag.end_ns == (max(times, default=0) or None)
+
+
+def test_images_beside_the_messages_are_not_held(tmp_path):
+    """What a block holds is at most twice as large as its messages."""
+    for image in (0, 200, 100_000):
+        chunk = b''.join(mcap_record(5, struct.pack('<HIQQ', key, 0, k, k) + bytes(size))
+                         for k in range(9) for key, size in ((0, 100), (1, image)))
+        (tmp_path / 'a.mcap').write_bytes(mcap_file([chunk]))
+        with Bag(tmp_path / 'a.mcap') as bag:
+            imu, = [topic for topic in bag.topics if topic.name == '/0']
+            block, = bag.blocks([imu])
+            assert [*block.messages] == [bytes(100)] * 9
+            assert len(block.messages._buffer) <= 2 * 9 * 100
 
 
 def test_messages_of_overlapping_chunks_come_in_order(tmp_path):
@@ -373,7 +564,7 @@ def test_any_damage(short_recordings, tmp_path, kind, edits):
             for topic, _, message in bag.messages(bag.topics):
                 assert len(message) <= 1 << 16
                 if topic.msgtype == IMU:
-                    decode_imu([message], topic)
+                    decode_imu(Messages.of([message]), topic)
             bag.choose_topics(Config())
     except BagError as error:
         assert str(error).isprintable()

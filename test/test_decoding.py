@@ -15,7 +15,7 @@
 
 from hypothesis import given, settings, strategies as st
 from ins_align import decoding
-from ins_align.bag_files import Topic
+from ins_align.bag_files import Messages, Topic
 from ins_align.bags import VELOCITY_TYPES
 from ins_align.config import Config
 from ins_align.decoding import (
@@ -60,49 +60,65 @@ def test_as_the_library(encoding, frame_id, monkeypatch):
     raws = serialized(encoding, frame_id=frame_id)
     expected = by_library(raws, TOPICS[encoding])
     monkeypatch.setattr(decoding, 'deserialize', None)  # the bulk path needs no library
-    assert_same(decode_imu(raws, TOPICS[encoding]), expected)
+    assert_same(decode_imu(Messages.of(raws), TOPICS[encoding]), expected)
 
 
 @pytest.mark.parametrize('encoding', ['cdr', 'ros1'])
-def test_mixed_layouts_keep_their_order(encoding):
+def test_mixed_layouts_keep_their_order(encoding, monkeypatch):
     raws = [raw for pair in zip(serialized(encoding, seed=1),
                                 serialized(encoding, frame_id='another_frame', seed=2),
                                 serialized(encoding, frame_id='imu_lin2', seed=3))
             for raw in pair]
-    assert_same(decode_imu(raws, TOPICS[encoding]), by_library(raws, TOPICS[encoding]))
+    expected = by_library(raws, TOPICS[encoding])
+    monkeypatch.setattr(decoding, 'deserialize', None)  # each layout is known
+    assert_same(decode_imu(Messages.of(raws), TOPICS[encoding]), expected)
 
 
 def test_big_endian_and_padding_go_to_the_library():
     raws = serialized('cdr', little_endian=False)
     assert body_start(raws[0], 'cdr') is None
-    assert_same(decode_imu(raws, TOPICS['cdr']), by_library(raws, TOPICS['cdr']))
+    assert_same(decode_imu(Messages.of(raws), TOPICS['cdr']), by_library(raws, TOPICS['cdr']))
 
 
 @pytest.mark.parametrize('encoding', ['cdr', 'ros1'])
 def test_what_cannot_be_decoded_is_left_out(encoding):
     raws = serialized(encoding)
     spoilt = [b'', raws[0], b'\x00', raws[1][:100], raws[2], b'\xff' * 324, raws[3][:-1]]
-    samples = decode_imu(spoilt, TOPICS[encoding])
+    samples = decode_imu(Messages.of(spoilt), TOPICS[encoding])
     assert_same(samples, by_library([raws[0], raws[2]], TOPICS[encoding]))
     assert np.flatnonzero(samples.decoded).tolist() == [1, 4]
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from(['cdr', 'ros1']), st.lists(st.tuples(
+    st.sampled_from([0, 12, 15, 16, 20, 323, 324, 328]), st.binary(max_size=2),
+    st.sampled_from([0, 1, 4, 8, 9, 12, 1 << 31, (1 << 32) - 1])), max_size=6))
+def test_where_the_numbers_start(encoding, kinds):
+    """Of many messages the same as of each."""
+    raws = [(front + bytes(12))[:12] + frame.to_bytes(4, 'little') + bytes(400)
+            for _, front, frame in kinds]
+    raws = [raw[:length] for raw, (length, *_) in zip(raws, kinds)]
+    starts = decoding._body_starts(Messages.of(raws), encoding).tolist()
+    assert starts == [-1 if start is None else start
+                      for start in (body_start(raw, encoding) for raw in raws)]
 
 
 @pytest.mark.parametrize('encoding', ['cdr', 'ros1'])
 def test_orientations(encoding):
     raws = serialized(encoding) + [b''] + serialized(encoding, 1, frame_id='x')
-    orientations = decode_orientations(raws, TOPICS[encoding])
+    orientations = decode_orientations(Messages.of(raws), TOPICS[encoding])
     np.testing.assert_array_equal(orientations.quaternions, [[0.0, 0.0, 0.0, 1.0]] * 6)
     np.testing.assert_array_equal(orientations.covariances, [[-1.0] + [0.0] * 8] * 6)
     np.testing.assert_array_equal(orientations.stamps_ns,
-                                  decode_imu(raws, TOPICS[encoding]).stamps_ns)
+                                  decode_imu(Messages.of(raws), TOPICS[encoding]).stamps_ns)
     if encoding == 'cdr':
         big = serialized(encoding, little_endian=False)
-        assert_same(decode_orientations(big, TOPICS[encoding]),
-                    decode_orientations(raws[:5], TOPICS[encoding]))
+        assert_same(decode_orientations(Messages.of(big), TOPICS[encoding]),
+                    decode_orientations(Messages.of(raws[:5]), TOPICS[encoding]))
 
 
 def test_nothing():
-    samples = decode_imu([], TOPICS['cdr'])
+    samples = decode_imu(Messages.of([]), TOPICS['cdr'])
     assert [array.shape for array in samples] == [(0,), (0, 3), (0, 3), (0,)]
 
 
@@ -111,7 +127,7 @@ def test_stamps_at_the_ends_of_time(seconds):
     raw = bytearray(serialized('cdr', 1)[0])
     raw[4:8] = seconds.to_bytes(4, 'little', signed=True)
     raw[8:12] = b'\xff' * 4
-    stamp = decode_imu([bytes(raw)], TOPICS['cdr']).stamps_ns[0]
+    stamp = decode_imu(Messages.of([bytes(raw)]), TOPICS['cdr']).stamps_ns[0]
     assert stamp == seconds * 10 ** 9 + 2 ** 32 - 1
 
 
@@ -128,7 +144,7 @@ def test_any_bytes(encoding, edits):
     raws = serialized(encoding)
     for index, at, replacement in edits:
         raws[index] = raws[index][:at] + replacement + raws[index][at + len(replacement):]
-    decoded = decode_imu(raws, TOPICS[encoding])
+    decoded = decode_imu(Messages.of(raws), TOPICS[encoding])
     expected = []
     for raw in raws:
         try:
@@ -136,7 +152,7 @@ def test_any_bytes(encoding, edits):
         except MessageError:
             # A frame_id that is no text: the numbers behind it are good all the same.
             if body_start(raw, encoding) is not None:
-                expected.append(decode_imu([raw], TOPICS[encoding]))
+                expected.append(decode_imu(Messages.of([raw]), TOPICS[encoding]))
     assert len(decoded.stamps_ns) == len(expected)
     if expected:
         assert_same(decoded, [np.concatenate(parts) for parts in zip(*expected)])
@@ -183,9 +199,10 @@ def serialized_gnss(encoding, kind, count=5, frame_id='gps', seed=0, little_endi
 
 def decode_gnss(raws, encoding, kind):
     topic = Topic('/gnss', VELOCITY_TYPES.get(kind, kind), encoding)
+    messages = Messages.of(raws)
     if kind == FIX:
-        return decode_fixes(raws, topic)
-    return decode_velocities(raws, topic, Config(velocity_type=kind, velocity_frame='ned'))
+        return decode_fixes(messages, topic)
+    return decode_velocities(messages, topic, Config(velocity_type=kind, velocity_frame='ned'))
 
 
 def gnss_by_library(raws, encoding, kind):

@@ -24,7 +24,7 @@ import subprocess
 import sys
 
 from hypothesis import example, given, HealthCheck, settings, strategies as st
-from ins_align.bag_files import BagError, Topic
+from ins_align.bag_files import BagError, Messages, Topic
 from ins_align.bags import Bag
 from ins_align.config import Config, config_from_mapping, ConfigError, load_params
 from ins_align.decoding import body_start, decode_imu, deserialize
@@ -108,7 +108,7 @@ def test_imu_messages_agree_with_the_library_or_are_refused(damage, encoding, fr
         head += b'\0' * (-(len(head) - 4) % 8)
     message = damaged(head + values[:296], damage)
     topic = Topic('/imu', 'sensor_msgs/msg/Imu', encoding)
-    samples = decode_imu([message], topic)
+    samples = decode_imu(Messages.of([message]), topic)
     try:
         stamp_ns, gyro, accel = imu_from_msg(deserialize(message, topic))
     except MessageError:
