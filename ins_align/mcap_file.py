@@ -23,15 +23,16 @@ import numpy as np
 
 MAGIC = b'\x89MCAP0\r\n'
 PLAIN_SEGMENT_BYTES = 1 << 22  # of records outside of chunks, read at a time
+PLAIN_PIECE_BYTES = 1 << 16  # of the same, looked into at a time: few where images lie between
 
 
 class McapFile(ChunkedFile):
     """An mcap file with ROS messages."""
 
     _RECORD = struct.Struct('<BQ')
-    _MESSAGE = struct.Struct('<BQH4xQ8x')  # neither sequence number nor time of publication
+    # Of a message: neither its length nor sequence number nor time of publication.
     _HEAD = np.dtype({'names': ['op', 'channel', 'log_time'], 'formats': ['u1', '<u2', '<u8'],
-                      'offsets': [0, 9, 15], 'itemsize': _MESSAGE.size})  # of a message, likewise
+                      'offsets': [0, 9, 15], 'itemsize': 31})
     _CHUNK = struct.Struct('<QQQII')
     _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _DATA_END = 1, 2, 3, 4, 5, 6, 15
     _LAST_OP = 15
@@ -44,7 +45,7 @@ class McapFile(ChunkedFile):
         plain: Segment | None = None
         while True:
             self._file.seek(position)
-            head = self._file.read(self._MESSAGE.size)
+            head = self._file.read(self._HEAD.itemsize)
             if len(head) < self._RECORD.size:
                 break
             op, length = self._RECORD.unpack_from(head)
@@ -56,8 +57,10 @@ class McapFile(ChunkedFile):
             if op == self._FOOTER:
                 self._complete = True
                 break
-            if op == self._MESSAGE_OP and len(head) == self._MESSAGE.size:
-                plain = self._extend(plain, start, position, self._MESSAGE.unpack(head)[3])
+            if op == self._MESSAGE_OP and len(head) == self._HEAD.itemsize:
+                messages = self._plain_messages(start, position)
+                position = messages.offset + messages.size
+                plain = self._extend(plain, messages)
             elif op in (self._SCHEMA, self._CHANNEL):
                 if length <= MAX_DEFINITION_BYTES:
                     self._file.seek(start)
@@ -72,16 +75,36 @@ class McapFile(ChunkedFile):
         if not (self._complete and summary_channels):
             self._scan_chunks()
 
-    def _extend(self, plain: Segment | None, start: int, end: int, log_time: int) -> Segment:
+    def _plain_messages(self, start: int, end: int) -> Segment:
+        """Return the message that lies here, and those right behind it, outside of chunks."""
+        self._file.seek(start)
+        data = self._file.read(PLAIN_PIECE_BYTES)
+        unpack, head_size = self._RECORD.unpack_from, self._RECORD.size
+        size = len(data)
+        last = size - self._HEAD.itemsize
+        places = [0]
+        position = end - start
+        while position <= last:
+            op, length = unpack(data, position)
+            behind = position + head_size + length
+            if op != self._MESSAGE_OP or behind > size:
+                break
+            places.append(position)
+            position = behind
+        times = self._heads(data, np.array(places))['log_time']
+        return Segment(start, position, '', position, 0, int(times.min()), int(times.max()))
+
+    def _extend(self, plain: Segment | None, messages: Segment) -> Segment:
         """Gather messages outside of chunks."""
-        if plain is not None:
-            size = end - plain.offset
-            if size <= PLAIN_SEGMENT_BYTES:
-                return plain._replace(size=size, raw_size=size,
-                                      start_ns=min(plain.start_ns, log_time),
-                                      end_ns=max(plain.end_ns, log_time))
-            self._add_segment(plain)
-        return Segment(start, end - start, '', end - start, 0, log_time, log_time)
+        if plain is None:
+            return messages
+        size = messages.offset + messages.size - plain.offset
+        if size <= PLAIN_SEGMENT_BYTES:
+            return plain._replace(size=size, raw_size=size,
+                                  start_ns=min(plain.start_ns, messages.start_ns),
+                                  end_ns=max(plain.end_ns, messages.end_ns))
+        self._add_segment(plain)
+        return messages
 
     def _read_chunk_header(self, start: int, end: int) -> None:
         self._file.seek(start + self._RECORD.size)
@@ -109,12 +132,14 @@ class McapFile(ChunkedFile):
 
     def _define(self, data: bytes) -> None:
         """Take the schemas and channels out of a run of records."""
-        position = 0
-        while position + self._RECORD.size <= len(data):
-            op, length = self._RECORD.unpack_from(data, position)
-            body = position + self._RECORD.size
+        unpack, head_size = self._RECORD.unpack_from, self._RECORD.size
+        definitions = (self._SCHEMA, self._CHANNEL)
+        position, size = 0, len(data)
+        while position + head_size <= size:
+            op, length = unpack(data, position)
+            body = position + head_size
             position = body + length
-            if op not in (self._SCHEMA, self._CHANNEL) or position > len(data):
+            if op not in definitions or position > size:
                 continue
             record = data[body:position]
             try:
@@ -140,7 +165,7 @@ class McapFile(ChunkedFile):
         """Return the messages, found from record to record by their lengths."""
         unpack, head_size = self._RECORD.unpack_from, self._RECORD.size
         position, size = 0, len(data)
-        last = size - self._MESSAGE.size
+        last = size - self._HEAD.itemsize
         op = 0
         edges: list[int] = []  # where each record starts and the last one ends
         add = edges.append
@@ -155,8 +180,12 @@ class McapFile(ChunkedFile):
         if position > size or position < size and not data[position]:
             self._warn_of_damage()
         places = np.fromiter(edges, np.int64, len(edges))
-        lengths = np.diff(places) - self._MESSAGE.size
-        heads = bytes_at(data, places[:-1], self._MESSAGE.size).view(self._HEAD)[:, 0]
+        lengths = np.diff(places) - self._HEAD.itemsize
+        heads = self._heads(data, places[:-1])
         chosen = np.flatnonzero((heads['op'] == self._MESSAGE_OP) & (lengths >= 0))
         return Records(heads['log_time'][chosen], heads['channel'][chosen], Messages(
-            data, places[chosen] + self._MESSAGE.size, lengths[chosen]))
+            data, places[chosen] + self._HEAD.itemsize, lengths[chosen]))
+
+    def _heads(self, data: bytes, places: np.ndarray) -> np.ndarray:
+        """Return the heads of the records that lie at some places, all as those of messages."""
+        return bytes_at(data, places, self._HEAD.itemsize).view(self._HEAD)[:, 0]

@@ -18,7 +18,7 @@ import sqlite3
 import struct
 
 from hypothesis import given, HealthCheck, settings, strategies as st
-from ins_align import bag_files, sqlite_file
+from ins_align import bag_files, mcap_file, sqlite_file
 from ins_align.bag_files import decompress, Messages, ros2_type
 from ins_align.bags import Bag, BagError
 from ins_align.config import Config
@@ -395,7 +395,7 @@ def test_mcap_without_chunks(tmp_path, recordings):
         assert len(warned) == warnings
 
 
-def mcap_file(chunks):
+def chunked_mcap(chunks):
     """Return a closed file whose chunks hold these bytes and which describes channels 0 to 3."""
     content = b'\x89MCAP0\r\n'
     for chunk in chunks:
@@ -440,7 +440,7 @@ def test_records_of_an_mcap_chunk_as_one_finds_them_one_by_one(tmp_path, chunks,
         for op, length, channel, time_ns, body in chunk) + end for chunk in chunks]
     for at, piece in edits:
         data[0] = data[0][:at] + piece + data[0][at + len(piece):]
-    (tmp_path / 'a.mcap').write_bytes(mcap_file(data))
+    (tmp_path / 'a.mcap').write_bytes(chunked_mcap(data))
     plain = [plain_mcap(chunk) for chunk in data]
     expected = [(f'/{channel}', time_ns, message) for records, _ in plain
                 for time_ns, channel, message in records
@@ -450,7 +450,7 @@ def test_records_of_an_mcap_chunk_as_one_finds_them_one_by_one(tmp_path, chunks,
     assert records == expected
     assert len(warnings) == any(damaged for _, damaged in plain)
     # Without the summary each chunk is looked into for its times: all that are there.
-    (tmp_path / 'b.mcap').write_bytes(mcap_file(data)[:-29])
+    (tmp_path / 'b.mcap').write_bytes(chunked_mcap(data)[:-29])
     with Bag(tmp_path / 'b.mcap') as bag:
         times = [time_ns for records, _ in plain for time_ns, *_ in records]
         assert bag.end_ns == (max(times, default=0) or None)
@@ -461,12 +461,38 @@ def test_images_beside_the_messages_are_not_held(tmp_path):
     for image in (0, 200, 100_000):
         chunk = b''.join(mcap_record(5, struct.pack('<HIQQ', key, 0, k, k) + bytes(size))
                          for k in range(9) for key, size in ((0, 100), (1, image)))
-        (tmp_path / 'a.mcap').write_bytes(mcap_file([chunk]))
+        (tmp_path / 'a.mcap').write_bytes(chunked_mcap([chunk]))
         with Bag(tmp_path / 'a.mcap') as bag:
             imu, = [topic for topic in bag.topics if topic.name == '/0']
             block, = bag.blocks([imu])
             assert [*block.messages] == [bytes(100)] * 9
             assert len(block.messages._buffer) <= 2 * 9 * 100
+
+
+@settings(max_examples=300, deadline=None,
+          suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.one_of(MESSAGE, st.tuples(
+    st.sampled_from([3, 5, 8, 9]), st.none(), st.integers(0, 5), TIMES, st.one_of(
+        st.binary(max_size=40), st.just(bytes(200))))), max_size=30), st.floats(0.0, 1.0))
+def test_records_outside_of_chunks_as_one_finds_them_one_by_one(tmp_path, records, kept):
+    described = b''.join(mcap_record(4, struct.pack('<HH', key, 0) + mcap_string(f'/{key}')
+                                     + mcap_string('cdr') + mcap_string('')) for key in range(4))
+    data = b''.join(mcap_record(op, struct.pack('<HIQQ', channel, 0, time_ns, 0) + body)
+                    for op, _, channel, time_ns, body in records)
+    front = b'\x89MCAP0\r\n' + described
+    closed = front + data + mcap_record(15, bytes(4)) + described + mcap_record(2, bytes(20))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mcap_file, 'PLAIN_PIECE_BYTES', 90)
+        patch.setattr(mcap_file, 'PLAIN_SEGMENT_BYTES', 300)
+        for content in (closed, front + data[:int(kept * len(data))]):
+            (tmp_path / 'a.mcap').write_bytes(content)
+            expected = [(f'/{channel}', time_ns, message) for time_ns, channel, message
+                        in plain_mcap(content[len(front):])[0]
+                        if channel < 4 and time_ns < (1 << 63) - 1]
+            expected.sort(key=lambda record: record[1])
+            found, warnings = by_bag(tmp_path / 'a.mcap')
+            assert found == expected
+            assert bool(warnings) == (content is not closed)
 
 
 def test_messages_of_overlapping_chunks_come_in_order(tmp_path):
