@@ -38,7 +38,7 @@ DRY_INTERVAL_NS = 2_000_000_000
 # Positions alone are taken when no velocity came for this long (ns).
 NO_VELOCITY_NS = 2_000_000_000
 # The IMU samples of a run of epochs that are handled at one go, and what an epoch costs beside.
-MAX_RUN_SAMPLES, EPOCH_SAMPLES = 4096, 16
+MAX_RUN_SAMPLES, EPOCH_SAMPLES = 6144, 16
 # IMU samples and GNSS messages that are left out, as they are counted, and why.
 _IMU_LEFT_OUT = {'imu_undecodable': 'that cannot be decoded',
                  'imu_nan': 'without numbers or with impossible ones',

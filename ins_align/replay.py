@@ -38,6 +38,8 @@ from ins_align.rotation import (
 import numpy as np
 
 MAX_REFERENCE_GAP_NS = 1_500_000_000  # the reference is not interpolated over more
+# What is prepared at one go, at least: up to some thousands, many cost less each than few.
+PREPARED_MESSAGES = 2500
 
 _ATTITUDE_COLUMNS = 'qx,qy,qz,qw,sigma_e_deg,sigma_n_deg,sigma_u_deg'
 CSV_HEADER = 'stamp_ns,t_s,state,' + ','.join(
@@ -229,13 +231,17 @@ class _Prepared(NamedTuple):
 def _prepared(request: Request) -> Generator[_Prepared, None, None]:
     """Read a recording and prepare it; the last part has all counts and warnings."""
     intake: Intake | None = None
+    waiting = 0
     for part in read(request):
         intake = intake or Intake(part.config)
         _feed(intake, part)
+        waiting += len(part.imu.stamps_ns) + len(part.gnss)
         fixes = [(message.stamp_ns, message.latitude_deg, message.longitude_deg)
                  for _, message in part.gnss
                  if isinstance(message, Fix) and not fault_of_fix(message)]
-        intake.prepare()
+        if waiting >= PREPARED_MESSAGES:
+            intake.prepare()
+            waiting = 0
         prepared = _Prepared(part.topics, part.config, intake.take_steps(), fixes,
                              part.orientations.known(), Counter(intake.counts), part.done,
                              part.warnings)
