@@ -532,7 +532,10 @@ def _of_gyros(variance: Array, v_rest: Array, p_rest: Array) -> Array:
     variance = np.asfortranarray(variance)
     rest = np.empty(variance.shape + (7,), order='F')
     rest[..., 0], rest[..., 1:4], rest[..., 4:] = 1.0, v_rest, p_rest
-    moment = _total((variance[..., None] * rest)[..., None] * rest[..., None, :])
+    weighted = variance[..., None] * rest
+    moment = np.empty((variance.shape[0], 7, 7))
+    for i in range(7):
+        moment[:, i, i:] = moment[:, i:, i] = _total(weighted[..., i, None] * rest[..., i:])
     eye = np.eye(3)
     # Of blocks of 3 x 3.
     Q = np.zeros((variance.shape[0], 3, 3, 3, 3))
