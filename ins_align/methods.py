@@ -48,9 +48,9 @@ PAST_DOF = 300
 VELOCITY_STOPPED_NS = 10_000_000_000
 # It leaves them out again when velocities have come for this long (ns).
 VELOCITY_BACK_NS = 2_000_000_000
-# Epochs that are integrated at one go: few right after the linearisation point has moved, because
-# then it will soon again.
-MAX_AHEAD = 64
+# Epochs for which what follows is worked out at one go: few right after the linearisation point
+# has moved, because then it will soon again.
+MAX_AHEAD = 128
 
 
 class Method(Protocol):
