@@ -166,7 +166,6 @@ class McapFile(ChunkedFile):
         unpack, head_size = self._RECORD.unpack_from, self._RECORD.size
         position, size = 0, len(data)
         last = size - self._HEAD.itemsize
-        op = 0
         edges: list[int] = []  # where each record starts and the last one ends
         add = edges.append
         while position <= last:
@@ -175,8 +174,8 @@ class McapFile(ChunkedFile):
             position += head_size + length
             if not op:
                 break
-        if op and position <= size:
-            add(position)  # otherwise the last record is none, and ends the one before it
+        if position <= size:
+            add(position)  # otherwise the last record is cut off, and ends the one before it
         if position > size or position < size and not data[position]:
             self._warn_of_damage()
         places = np.fromiter(edges, np.int64, len(edges))
