@@ -113,7 +113,7 @@ class SqliteFile:
                 cursor = self._database.execute(query, (*wanted, start_ns, stop_ns))
                 while parts := self._fetched(cursor, wanted):
                     block = Block.joined([
-                        part if isinstance(part, Block) else _columns(self._sound(part), wanted)
+                        part if isinstance(part, Block) else self._sound(part, wanted)
                         for part in parts])
                     if len(block.messages):
                         yield block
@@ -130,21 +130,21 @@ class SqliteFile:
                     and (time_ns, wanted[topic], data) not in taken):
                 rows.append((time_ns, topic, data))
             if len(rows) == BLOCK:
-                yield _columns(self._sound(rows), wanted)
+                yield self._sound(rows, wanted)
                 rows = []
         if rows:
-            yield _columns(self._sound(rows), wanted)
+            yield self._sound(rows, wanted)
 
     @staticmethod
     def _fetched(cursor: sqlite3.Cursor, wanted: Mapping[int, int]) -> list[Block | list[Row]]:
-        """Read so many rows as a block has; as they are where some are no messages."""
+        """Read so many rows as a block has; as they are where some of them are no messages."""
         parts: list[Block | list[Row]] = []
         left = BLOCK
         while left > 0 and (rows := cursor.fetchmany(min(FETCH, left))):
             left -= len(rows)
             try:
                 parts.append(_columns(rows, wanted))
-            except TypeError:
+            except (TypeError, KeyError):
                 parts.append(rows)
         return parts
 
@@ -163,18 +163,18 @@ class SqliteFile:
                 last = row[3]
                 yield row
 
-    def _sound(self, rows: list[Row]) -> list[Row]:
+    def _sound(self, rows: list[Row], wanted: Mapping[int, int]) -> Block:
         """Leave out rows that are no messages; one that is too long is an error."""
         sound = []
         for time_ns, topic, data in rows:
-            if type(data) is int:
+            if type(data) is int and topic in wanted:
                 raise BagError(f'{self._path.name} has a message of {data} bytes on '
                                f'{self.topics[topic].name}, where {MAX_MESSAGE_BYTES} are allowed')
-            if type(data) is bytes and type(time_ns) is int:
+            if type(data) is bytes and type(time_ns) is int and topic in wanted:
                 sound.append((time_ns, topic, data))
             else:
                 self._warn('has damaged messages, which are left out')
-        return sound
+        return _columns(sound, wanted)
 
     def _warn_of_damage(self, error: Exception) -> None:
         self._warn(f'is damaged ({error}): it is read as far as it goes')
@@ -186,7 +186,17 @@ class SqliteFile:
 
 
 def _columns(rows: list[Row], wanted: Mapping[int, int]) -> Block:
-    """Put rows into columns; a TypeError where a time is no integer or a message no blob."""
+    """
+    Put rows into columns.
+
+    Raises
+    ------
+    TypeError
+        If a time is no integer or a message no blob.
+    KeyError
+        If a topic is none that is wanted: a column of text finds '1' where 1 is looked for.
+
+    """
     times_ns, topics, messages = zip(*rows) if rows else ((), (), ())
     return Block(np.frombuffer(array('q', times_ns), np.int64),
                  np.fromiter(map(wanted.__getitem__, topics), np.int64, len(rows)),

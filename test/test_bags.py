@@ -17,9 +17,9 @@ import shutil
 import sqlite3
 import struct
 
-from hypothesis import given, HealthCheck, settings, strategies as st
+from hypothesis import assume, given, HealthCheck, settings, strategies as st
 from ins_align import bag_files, mcap_file, sqlite_file
-from ins_align.bag_files import decompress, Messages, ros2_type
+from ins_align.bag_files import decompress, Messages, ros2_type, ZSTD_MAGIC
 from ins_align.bags import Bag, BagError
 from ins_align.config import Config
 from ins_align.decoding import decode_imu
@@ -440,6 +440,7 @@ def test_records_of_an_mcap_chunk_as_one_finds_them_one_by_one(tmp_path, chunks,
         for op, length, channel, time_ns, body in chunk) + end for chunk in chunks]
     for at, piece in edits:
         data[0] = data[0][:at] + piece + data[0][at + len(piece):]
+    assume(ZSTD_MAGIC not in b''.join(data))  # of messages that are compressed one by one
     (tmp_path / 'a.mcap').write_bytes(chunked_mcap(data))
     plain = [plain_mcap(chunk) for chunk in data]
     expected = [(f'/{channel}', time_ns, message) for records, _ in plain
@@ -479,6 +480,7 @@ def test_records_outside_of_chunks_as_one_finds_them_one_by_one(tmp_path, record
                                      + mcap_string('cdr') + mcap_string('')) for key in range(4))
     data = b''.join(mcap_record(op, struct.pack('<HIQQ', channel, 0, time_ns, 0) + body)
                     for op, _, channel, time_ns, body in records)
+    assume(ZSTD_MAGIC not in data)  # of messages that are compressed one by one
     front = b'\x89MCAP0\r\n' + described
     closed = front + data + mcap_record(15, bytes(4)) + described + mcap_record(2, bytes(20))
     with pytest.MonkeyPatch.context() as patch:
@@ -662,17 +664,42 @@ def test_database_left_behind_with_its_log(tmp_path, recordings):
     assert by_bag(left / 'a.db3')[0][-1][2] == b'last'
 
 
-def test_odd_rows_of_a_database(copy):
+@pytest.mark.parametrize('block, fetch', [(4096, 256), (100, 30), (7, 7), (1, 1)])
+@pytest.mark.parametrize('cut', [False, True])
+def test_odd_rows_of_a_database(copy, monkeypatch, block, fetch, cut):
+    monkeypatch.setattr(sqlite_file, 'BLOCK', block)
+    monkeypatch.setattr(sqlite_file, 'FETCH', fetch)
     path = copy('sqlite3')
     expected = by_library(path)
     database = sqlite3.connect(storage_file(path))
-    database.executemany('INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)', [
-        (1, START_NS + 5, 'text'), (1, 'soon', b'x'), (1, 0.5, b'x'), (99, START_NS, b'x')])
+    odd = [(1, START_NS + 5, 'text'), (1, 'soon', b'x'), (1, 0.5, b'x'), (99, START_NS, b'x'),
+           *((2, START_NS + k * 10 ** 9, data) for k in range(40) for data in ('text', 0.5))]
+    database.executemany('INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)', odd)
+    database.commit()
+    database.execute('PRAGMA page_size=512')
+    database.execute('VACUUM')
+    database.close()
+    if cut:  # behind the last message, where rows are read in the order in which they are stored
+        file = storage_file(path)
+        file.write_bytes(file.read_bytes()[:-512])
+    records, warnings = by_bag(path)
+    assert records == expected
+    assert any('was cut off' in warning for warning in warnings) == cut
+    assert any('left out' in warning for warning in warnings)
+
+
+def test_topics_that_a_database_names_by_text(copy):
+    """Sqlite finds '1' where 1 is looked for, where the column is one of text."""
+    path = copy('sqlite3')
+    database = sqlite3.connect(storage_file(path))
+    database.execute('ALTER TABLE messages RENAME TO numbered')
+    database.execute('CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id TEXT, timestamp, '
+                     'data)')
+    database.execute('INSERT INTO messages SELECT * FROM numbered')
     database.commit()
     database.close()
     records, warnings = by_bag(path)
-    assert records == expected
-    assert 'left out' in warnings[0]
+    assert records == [] and 'left out' in warnings[0]
 
 
 @pytest.mark.parametrize('claim', [1 << 31, 1 << 62])
