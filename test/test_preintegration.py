@@ -224,6 +224,26 @@ def test_correction_is_re_integration_to_first_order():
         assert np.array_equal(getattr(corrected, name), getattr(again, name)), name
 
 
+@pytest.mark.parametrize('interval, rotation, force', [(0.2, 0.15, 3.0), (1.0, 3.0, 50.0)])
+def test_what_a_correction_leaves_of_a_bias_is_what_the_theory_tells(interval, rotation, force):
+    """In a turn, of 1 deg/s: an angular rate in deg/h and a force in millionths of gravity."""
+    stamps = np.arange(-0.1, 20.2, 0.005)
+    rate = np.stack([0.1 * np.sin(0.7 * stamps), 0.1 * np.cos(0.9 * stamps),
+                     np.full(stamps.size, 0.6)], axis=1)
+    accel = np.stack([np.sin(0.5 * stamps), np.full(stamps.size, 2.0),
+                      np.full(stamps.size, 9.8)], axis=1)
+    bias = np.radians(1.0) * np.array([0.6, -0.6, 0.5])
+    errors = SensorErrors.none()._replace(gyro_bias=bias)
+    steps = split_at_epochs(stamps, rate + bias, accel, np.arange(0.0, 20.0, interval))
+    exact = preintegrate(steps, errors, Noise())
+    corrected = preintegrate(steps, SensorErrors.none(), Noise()).corrected(errors.vector())
+    turned = Rotation.from_matrix(corrected.R @ exact.R.transpose(0, 2, 1)).as_rotvec()
+    for left, limit in ((np.degrees(turned) * 3600.0, rotation),
+                        ((corrected.v - exact.v) / 9.8e-6, force)):
+        size = np.linalg.norm(np.mean(left, axis=0)) / interval
+        assert 0.2 * limit < size < limit
+
+
 def test_correction_from_absurd_errors_back():
     """A fit that has lost its way asks for scale factors of 0.4; the way back must not depend."""
     errors = np.zeros(24)
