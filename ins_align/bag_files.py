@@ -269,11 +269,17 @@ class ChunkedFile:
                     if segment.end_ns >= start_ns and segment.start_ns < stop_ns]
         starts = [segment.start_ns for segment in segments[1:]] + [INT64_MAX]
         horizons = list(itertools.accumulate(reversed(starts), min))[::-1]
-        pending = Block.of((), (), ())
+        pending: list[Block] = []
+        held_bytes, earliest_ns = 0, INT64_MAX
         for segment, horizon in zip(segments, horizons):
             block = self._block(self._records(self._load(segment)), wanted, start_ns, stop_ns)
-            if len(pending.messages):
-                block = Block.joined([pending, block])
+            if len(block.messages):
+                pending.append(block)
+                held_bytes += int(block.messages.lengths.sum())
+                earliest_ns = min(earliest_ns, int(block.times_ns.min()))
+            if earliest_ns >= horizon and held_bytes <= MAX_PENDING_BYTES:
+                continue  # all of them wait, and are not joined time and again meanwhile
+            block = Block.joined(pending)
             if (np.diff(block.times_ns) < 0).any():
                 block = block.take(np.argsort(block.times_ns, kind='stable'))
             ready = int(np.searchsorted(block.times_ns, horizon))
@@ -281,8 +287,12 @@ class ChunkedFile:
                 ready = len(block.messages)
             if ready:
                 yield block.take(slice(ready))
-            later = block.take(slice(ready, None))
-            pending = later._replace(messages=later.messages.alone())
+            pending, held_bytes, earliest_ns = [], 0, INT64_MAX
+            if ready < len(block.messages):
+                later = block.take(slice(ready, None))
+                pending = [later._replace(messages=later.messages.alone())]
+                held_bytes = int(later.messages.lengths.sum())
+                earliest_ns = int(later.times_ns[0])
 
     def _block(self, records: Records, wanted: Mapping[int, int], start_ns: int, stop_ns: int,
                ) -> Block:

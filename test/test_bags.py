@@ -19,7 +19,7 @@ import struct
 
 from hypothesis import assume, given, HealthCheck, settings, strategies as st
 from ins_align import bag_files, mcap_file, sqlite_file
-from ins_align.bag_files import decompress, Messages, ros2_type, ZSTD_MAGIC
+from ins_align.bag_files import Block, decompress, Messages, ros2_type, ZSTD_MAGIC
 from ins_align.bags import Bag, BagError
 from ins_align.config import Config
 from ins_align.decoding import decode_imu
@@ -508,6 +508,23 @@ def test_messages_of_overlapping_chunks_come_in_order(tmp_path):
                                + struct.pack('<Q', len(chunk)) + chunk)
     (tmp_path / 'a.mcap').write_bytes(content)
     assert [r[1] for r in by_bag(tmp_path / 'a.mcap')[0]] == list(range(1, 10))
+
+
+def test_what_is_held_back_is_joined_once(tmp_path, monkeypatch):
+    """All chunks start at 0, as they say: each of them waits for the last one."""
+    joined = []
+    join = Block.joined
+
+    def counted(parts):
+        joined.append(sum(len(part.messages) for part in parts))
+        return join(parts)
+
+    monkeypatch.setattr(Block, 'joined', counted)
+    times = [*range(1, 51), 0]
+    (tmp_path / 'a.mcap').write_bytes(chunked_mcap(
+        [mcap_record(5, struct.pack('<HIQQ', 0, 0, time_ns, time_ns)) for time_ns in times]))
+    assert [record[1] for record in by_bag(tmp_path / 'a.mcap')[0]] == sorted(times)
+    assert joined == [51]
 
 
 def test_directory_of_several_files(tmp_path, recordings):
