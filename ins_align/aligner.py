@@ -90,7 +90,8 @@ class Aligner:
 
         """
         if isinstance(stamp_ns, np.ndarray):
-            self._intake.add_imu_array(stamp_ns, np.array(gyro, float),
+            # Copies: they are looked at later.
+            self._intake.add_imu_array(np.array(stamp_ns, np.int64), np.array(gyro, float),
                                        np.array(accel, float))
         else:
             self._intake.add_imu(stamp_ns, gyro, accel)

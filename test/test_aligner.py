@@ -337,6 +337,20 @@ def test_a_loop_inside_one_array_is_the_same_as_one_by_one(flight):
     assert counts[0] == counts[1] and counts[0]['clock_jumps'] == 2
 
 
+def test_arrays_of_samples_may_be_filled_again(flight):
+    aligner = Aligner(config_for(flight))
+    columns = flight.imu_stamps_ns, flight.gyro, flight.accel
+    arrays = [column[:10].copy() for column in columns]
+    for start in range(0, 200, 10):
+        for array, column in zip(arrays, columns):
+            array[:] = column[start:start + 10]
+        aligner.add_imu(*arrays)
+    aligner.update()
+    imu = aligner._intake.imu
+    assert np.array_equal(imu.stamps, flight.imu_stamps_ns[200 - imu.stamps.size:200])
+    assert np.array_equal(imu.samples, np.hstack(columns[1:])[200 - imu.stamps.size:200])
+
+
 def test_epochs_outlive_a_clock_set_back_and_nothing_else(flight):
     """The same messages once more, the same attitude: they are no prior to themselves."""
     aligner = Aligner(config_for(flight))
