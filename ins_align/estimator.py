@@ -288,10 +288,10 @@ class MapEstimator:
                  and self.free_axis_tilt < self.IDLE_AXIS_TILT)
         return bool(age >= (self.IDLE_TIME if still else self.MAX_IDLE_TIME))
 
-    def _rows(self, s: Solution, alike: Rows | None = None) -> Rows:
+    def _rows(self, s: Solution) -> Rows:
         """Return what an empty solution makes of all stored epochs; see `Solution.rows`."""
         epochs = slice(0, self.count)
-        return s.rows(self._gnss.take(epochs), self._corrected(epochs, s.point.sensors), alike)
+        return s.rows(self._gnss.take(epochs), self._corrected(epochs, s.point.sensors))
 
     def _run(self, s: Solution, rows: Rows, gate: Gate | None, refused: np.ndarray) -> Whitened:
         """Take all stored epochs into an empty solution; without a gate those not refused."""

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Messages → what an alignment works on: epochs of the antenna and the IMU steps between them.
+Messages → what an alignment works on: epochs of the antenna, and IMU intervals between them.
 
 Messages are buffered, put in order and checked. What comes out does not depend on what is
 estimated with it, so that a recording can be prepared in one process and aligned in another.

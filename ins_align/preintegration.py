@@ -205,10 +205,6 @@ class Noise:
     gyro_excess: ArrayLike = 0.0
     accel_excess: ArrayLike = 0.0
 
-    def take(self, index: slice) -> 'Noise':
-        """Return the noise in the intervals of `index`; all fields have an axis of K."""
-        return Noise(*(np.asarray(array)[index] for array in vars(self).values()))
-
 
 @dataclass(frozen=True)
 class Steps:
@@ -230,10 +226,6 @@ class Steps:
     f: Array
     omega_dot: Array
     f_dot: Array
-
-    def take(self, index: slice) -> 'Steps':
-        """Return the intervals of `index`."""
-        return Steps(*(array[index] for array in vars(self).values()))
 
 
 def split_at_epochs(stamps: 'Array | Index', gyro: Array, accel: Array,
