@@ -58,10 +58,6 @@ class Recent:
         """Return what forces and rates, shape (K, 3), would have made had they lasted."""
         return Recent(*(AGES[:, None] * values[:, None] for values in (force, rate)))
 
-    def take(self, index: slice) -> 'Recent':
-        """Return those of some epochs."""
-        return Recent(self.gained[index], self.turned[index])
-
 
 def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'Array | Index',
                   unit: float = 1.0) -> Recent:

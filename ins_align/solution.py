@@ -317,12 +317,8 @@ class Solution:
     @property
     def log_likelihood(self) -> float:
         """Log likelihood at the best overall scale of all covariances, but for a constant."""
-        return _log_likelihood(self.chi2, self.dof, self.whitener.log_det)
-
-
-def _log_likelihood(chi2: float, dof: int, log_det: float) -> float:
-    scale = max(chi2 / max(dof, 1), 1.0)
-    return -0.5 * (log_det + dof * math.log(scale) + chi2 / scale)
+        scale = max(self.chi2 / max(self.dof, 1), 1.0)
+        return -0.5 * (self.whitener.log_det + self.dof * math.log(scale) + self.chi2 / scale)
 
 
 def _nonlinearity(step: Array, P: Array, time: Array) -> Array:

@@ -160,7 +160,6 @@ def test_one_epoch_is_the_same_with_others_to_the_bit(monkeypatch):
     in_parts = motion(-200, [300, 423, 700])
     assert np.array_equal(together.gained, in_parts.gained)
     assert np.array_equal(together.turned, in_parts.turned)
-    both = together.take(slice(1, 3))
     for age in (0.0, 0.07, 0.2):
-        for ours, its in zip(exact(both.gained, age), exact(alone.gained, age)):
+        for ours, its in zip(exact(together.gained[1:], age), exact(alone.gained, age)):
             assert np.array_equal(ours[0], its[0])
