@@ -169,6 +169,12 @@ class Segment(NamedTuple):
     start_ns: int
     end_ns: int
 
+    def with_times(self, times_ns: np.ndarray) -> Segment:
+        """Return it with the times of its messages, shape (N,); one without any ends before 0."""
+        if not times_ns.size:
+            return self._replace(start_ns=0, end_ns=-1)
+        return self._replace(start_ns=int(times_ns.min()), end_ns=int(times_ns.max()))
+
 
 def decompressor(compression: str) -> Any:
     """

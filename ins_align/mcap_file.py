@@ -91,8 +91,8 @@ class McapFile(ChunkedFile):
                 break
             places.append(position)
             position = behind
-        times = self._heads(data, np.array(places))['log_time']
-        return Segment(start, position, '', position, 0, int(times.min()), int(times.max()))
+        return Segment(start, position, '', position, 0, 0, -1).with_times(
+            self._heads(data, np.array(places))['log_time'])
 
     def _extend(self, plain: Segment | None, messages: Segment) -> Segment:
         """Gather messages outside of chunks."""
@@ -125,10 +125,7 @@ class McapFile(ChunkedFile):
         for index, segment in enumerate(self._segments):
             data = self._load(segment)
             self._define(data)
-            times = self._records(data).times_ns
-            self._segments[index] = segment._replace(
-                start_ns=int(times.min()) if times.size else 0,
-                end_ns=int(times.max()) if times.size else -1)
+            self._segments[index] = segment.with_times(self._records(data).times_ns)
 
     def _define(self, data: bytes) -> None:
         """Take the schemas and channels out of a run of records."""

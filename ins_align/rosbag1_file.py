@@ -79,10 +79,8 @@ class Rosbag1File(ChunkedFile):
     def _scan_chunks(self) -> None:
         """Find the topics and times of chunks that no index describes."""
         for index, segment in enumerate(self._segments):
-            times = self._records(self._load(segment), connect=True).times_ns
-            self._segments[index] = segment._replace(
-                start_ns=int(times.min()) if times.size else 0,
-                end_ns=int(times.max()) if times.size else -1)
+            records = self._records(self._load(segment), connect=True)
+            self._segments[index] = segment.with_times(records.times_ns)
 
     def _connect(self, fields: dict[bytes, bytes], data: bytes) -> None:
         connection = self._uint(fields.get(b'conn', b''))
