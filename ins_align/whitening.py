@@ -23,7 +23,6 @@ first, then position; both in n0.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from ins_align.preintegration import Intervals
 from ins_align.recent import AGES, exact, smooth
@@ -398,22 +397,6 @@ class Whitened:
     S: Array
 
 
-class _Factors(NamedTuple):
-    """What factoring K epochs yields: the state after the last one, and their innovations."""
-
-    P: Array
-    X: Array
-    normal: Array
-    white: Array            # innovations, whitened, (K, 3 * kinds, 1 + n)
-    roots: Array            # Cholesky factors of their covariances, (K, kinds, 3, 3)
-    covariance: Array       # of the measurements; unit matrices where none is taken, as roots
-
-    @property
-    def log_det(self) -> float:
-        """Of the covariance of all innovations."""
-        return 2.0 * float(np.sum(np.log(np.diagonal(self.roots, axis1=-2, axis2=-1))))
-
-
 class Whitener:
     """
     The small Kalman filter over the chain's errors, and the normal equations that it feeds.
@@ -525,22 +508,8 @@ class Whitener:
                         total(self.log_det, np.log(determinant_of)), used, innovation, S_of)
 
     def whitened_at_once(self, rows: Rows, wanted: np.ndarray) -> Whitened:
-        """Filter epochs like `whitened`, several times faster, for the state after the last."""
-        factors = self._factored(rows, wanted)
-        if factors is None:
-            return self.whitened(rows, wanted)
-        roots = factors.roots
-        S_of = roots @ roots.swapaxes(-1, -2)
-        feigned = _feigned(inverse_spd(S_of), S_of - factors.covariance)
-        return Whitened(factors.P[None], factors.X[None], factors.normal[None],
-                        np.array([self.rows + 3 * np.count_nonzero(wanted)]),
-                        np.array([self.spurious + np.sum(feigned)]),
-                        np.array([self.log_det + factors.log_det]), wanted,
-                        roots @ factors.white.reshape(rows.Y.shape), S_of)
-
-    def _factored(self, rows: Rows, wanted: np.ndarray) -> '_Factors | None':
         """
-        Factor the covariance of the measurements of epochs, block by block; None if that fails.
+        Filter epochs like `whitened`, several times faster, for the state after the last.
 
         The errors of the chain are a random walk: the covariance of the measurements of a block
         of epochs can be written down. Its Cholesky factor makes of them, row after row, the same
@@ -567,7 +536,7 @@ class Whitener:
             try:
                 root = np.linalg.cholesky(S)
             except np.linalg.LinAlgError:           # rounding, or numbers that are none
-                return None
+                return self.whitened(rows, wanted)
             new = Y[block].reshape(len(D), -1) - D @ X
             both = np.linalg.solve(root, np.hstack([new, PD]))
             new, PD = both[:, :-len(P)], both[:, -len(P):]
@@ -577,7 +546,14 @@ class Whitener:
             normal = normal + new.T @ new
             white[block] = new.reshape(count, 3 * kinds, -1)
             roots[block] = root.reshape(shape)[own]
-        return _Factors(P, X, normal, white, roots, covariance)
+        S_of = roots @ roots.swapaxes(-1, -2)
+        feigned = _feigned(inverse_spd(S_of), S_of - covariance)
+        log_det = 2.0 * np.sum(np.log(np.diagonal(roots, axis1=-2, axis2=-1)))
+        return Whitened(P[None], X[None], normal[None],
+                        np.array([self.rows + 3 * np.count_nonzero(wanted)]),
+                        np.array([self.spurious + np.sum(feigned)]),
+                        np.array([self.log_det + log_det]), wanted,
+                        roots @ white.reshape(rows.Y.shape), S_of)
 
 
 def _feigned(inverse: Array, own: Array) -> Array:
