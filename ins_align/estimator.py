@@ -182,7 +182,7 @@ class MapEstimator:
         if s is None:
             yield from self._first(measured)
             return
-        rows = s.rows(self._gnss.take(places), self._corrected(places, s.point.sensors))
+        rows = self._rows(s, places)
         wanted = gnss.present[:count, :s.kinds].copy()
         done, ahead = 0, count
         refused: Tests = {}                       # of the next epoch
@@ -288,15 +288,19 @@ class MapEstimator:
                  and self.free_axis_tilt < self.IDLE_AXIS_TILT)
         return bool(age >= (self.IDLE_TIME if still else self.MAX_IDLE_TIME))
 
-    def _rows(self, s: Solution) -> Rows:
-        """Return what an empty solution makes of all stored epochs; see `Solution.rows`."""
-        epochs = slice(0, self.count)
-        return s.rows(self._gnss.take(epochs), self._corrected(epochs, s.point.sensors))
+    @property
+    def _all(self) -> slice:
+        """Epochs that are stored."""
+        return slice(0, self.count)
+
+    def _rows(self, s: Solution, epochs: slice, alike: Rows | None = None) -> Rows:
+        """Return what a solution makes of stored epochs behind its own; see `Solution.rows`."""
+        return s.rows(self._gnss.take(epochs), self._corrected(epochs, s.point.sensors), alike)
 
     def _run(self, s: Solution, rows: Rows, gate: Gate | None, refused: np.ndarray) -> Whitened:
         """Take all stored epochs into an empty solution; without a gate those not refused."""
         present = self._gnss.present[:self.count, :s.kinds]
-        wanted = present if gate is not None else self._unrefused(s, refused, slice(0, self.count))
+        wanted = present if gate is not None else self._unrefused(s, refused, self._all)
         return s.run(rows, present, wanted, gate, self._gate_scale)
 
     def _unrefused(self, s: Solution, refused: np.ndarray, epochs: slice) -> np.ndarray:
@@ -325,7 +329,7 @@ class MapEstimator:
         """
         for _ in range(self.MAX_ITERATIONS):
             s = self._start(point)
-            rows = self._rows(s)
+            rows = self._rows(s, self._all)
             whitened = self._run(s, rows, None if P is None else Gate(s.dx, P), refused)
             if s.rejected_epochs > self.MAX_REJECTED * self.measured:
                 # Not a few outliers but a wrong picture: look at everything again.
@@ -405,7 +409,7 @@ class MapEstimator:
                noise: NoiseLevels | None = None) -> tuple[Solution, Whitened]:
         """Take the stored epochs once more, as `_start` has it."""
         solution = self._start(point, prior, columns, noise)
-        return solution, self._run(solution, self._rows(solution), None,
+        return solution, self._run(solution, self._rows(solution, self._all), None,
                                    self._refused[:self.count])
 
     def _likelihood_with(self, s: Solution, noise: NoiseLevels, alike: dict[int, Rows]) -> float:
@@ -417,8 +421,7 @@ class MapEstimator:
         """
         trial, done = self._trials.get(noise) or (self._start(s.point, noise=noise), 0)
         epochs = slice(done, self.count)
-        rows = alike[done] = trial.rows(self._gnss.take(epochs),
-                                        self._corrected(epochs, s.point.sensors), alike.get(done))
+        rows = alike[done] = self._rows(trial, epochs, alike.get(done))
         wanted = self._unrefused(trial, self._refused, epochs)
         trial.run(rows, wanted, wanted, None, 1.0)
         self._trials[noise] = trial, self.count
@@ -473,10 +476,9 @@ class MapEstimator:
 
     def _rough_attitude(self, point: Unknowns) -> Array:
         """Centred q-method over the store, with the sensor errors and lever arm of `point`."""
-        epochs = slice(0, self.count)
-        interval = self._corrected(epochs, point.sensors)
+        interval = self._corrected(self._all, point.sensors)
         chain = Chain.start().extended(interval)
-        gnss = self._gnss.take(epochs)
+        gnss = self._gnss.take(self._all)
         moments = np.zeros((3, 3))
         total = 0.0
         for kind, rows in enumerate((VELOCITY, POSITION)):
@@ -527,7 +529,7 @@ class MapEstimator:
                              estimate_matrices=GYRO_MATRIX.start in self.columns,
                              capacity=self.count, noise=self.noise,
                              rate_random_walk=self._rate_random_walk)
-        other._intervals, other._gnss = intervals, self._gnss.take(slice(0, self.count))
+        other._intervals, other._gnss = intervals, self._gnss.take(self._all)
         other.count, other.measured = self.count, self.measured
         other.gated = False
         other._fit()
@@ -558,7 +560,7 @@ class MapEstimator:
             prior, columns = prior.loosened(block, std), np.union1d(columns, np.r_[block])
         refused = self._refused[:self.count]
         solution = self._start(self._solved.point, prior, columns)
-        rows = self._rows(solution)
+        rows = self._rows(solution, self._all)
         self._run(solution, rows, None, refused)
         if reconsider and refused.any():
             gate = Gate(solution.dx, solution.P)
@@ -595,7 +597,7 @@ class MapEstimator:
 
     def raw_intervals(self) -> Intervals:
         """Return the stored intervals, as they are with sensor errors of zero."""
-        return self._intervals.take(slice(0, self.count))
+        return self._intervals.take(self._all)
 
     # Results
 
