@@ -23,7 +23,7 @@ import importlib
 from pathlib import Path
 
 # In the order in which `all` runs them.
-NAMES = ('note', 'bound', 'declare', 'faults', 'cost', 'compare', 'recordings')
+NAMES = ('note', 'bound', 'declare', 'faults', 'weak-spots', 'cost', 'compare', 'recordings')
 NEED_DATA = ('recordings',)
 # Only by name: they measure the machine too, and need ROS.
 MEASUREMENTS = ('bench', 'soak')
@@ -75,5 +75,5 @@ def run(name: str, out_dir: str | Path, data_dir: str | Path | None = None,
         if each in NEED_DATA and data_dir is None:
             print(f'{each}: left out, it needs recordings (--data DIR)')
             continue
-        module = importlib.import_module(f'ins_align.experiments.{each}')
+        module = importlib.import_module(f'ins_align.experiments.{each.replace("-", "_")}')
         module.run(out, None if data_dir is None else Path(data_dir), runs, jobs)
