@@ -13,13 +13,15 @@
 # limitations under the License.
 """The experiments: small runs whose numbers are known, and the errors a user can make."""
 
+from functools import partial
 import json
 import math
 
 from ins_align import experiments
-from ins_align.aligner import Attitude, State
+from ins_align.aligner import Aligner, Attitude, State
 from ins_align.config import PRESETS
-from ins_align.experiments import bound, common, compare, cost, declare, note, recorded
+from ins_align.experiments import (
+    bound, common, compare, cost, declare, note, recorded, spoilt, weak_spots)
 from ins_align.rotation import exp_so3, matrix_from_rpy
 from ins_align.simulation import simulate, write_bag
 import numpy as np
@@ -169,6 +171,60 @@ def test_recordings_and_their_files(folder, tmp_path, capsys):
     assert [window['start_s'] for window in numbers['driven']['map']] == [0.0, 10.0, 20.0]
     assert (tmp_path / 'recordings.png').stat().st_size > 10_000
     assert 'driven, note' in capsys.readouterr().out
+
+
+def test_every_weak_spot_is_one_of_its_own():
+    s = simulate('car', imu_rate=50.0, duration=100.0, seed=1, velocity_std_vertical=1.0)
+    whole = spoilt.stream_of(s)
+    for case in weak_spots.CASES:
+        stream = spoilt.stream_of(s)
+        if case.spoil is not None:
+            case.spoil(stream, np.random.default_rng(1))
+            assert stream.config != whole.config or any(
+                getattr(stream, name).tobytes() != getattr(whole, name).tobytes()
+                for name in ('imu', 'fix', 'velocity')), case.name
+        else:
+            assert case.simulate or case.config or 'nothing wrong' in case.name
+    assert len({case.name for case in weak_spots.CASES}) == len(weak_spots.CASES)
+
+
+def test_weak_spots_are_judged_by_the_clock_of_the_imu():
+    s = simulate('flight', imu_grade='mems', duration=40.0, seed=1)
+    for by_ns in (0, 3_600_000_000_000):
+        stream = spoilt.stream_of(s)
+        for rows in stream.imu, stream.fix, stream.velocity:
+            rows['stamp'] += by_ns
+        aligner = Aligner(common.config_for(s))
+        true = partial(weak_spots.truth, s, stream)
+        result = weak_spots.follow(aligner, weak_spots.messages(stream, 100), true)
+        assert result['end'] and 0.0 < result['worst_sigmas'] < 5.0
+        assert result['beyond_s'] == 0.0 and 0.3 < result['aligned_part'] < 0.9
+        turned = exp_so3(np.radians([0.0, 0.0, 20.0]))
+        wrong = weak_spots.follow(
+            Aligner(common.config_for(s)), weak_spots.messages(stream, 100),
+            lambda stamps: [turned @ C for C in true(stamps)])
+        assert wrong['declared_sigmas'] > 10.0 and 15.0 < wrong['worst_heading_deg'] < 25.0
+        assert wrong['beyond_s'] == pytest.approx(40.0 - wrong['declared_s'], abs=0.5)
+
+
+def test_weak_spots_and_their_files(folder, tmp_path, monkeypatch):
+    chosen = ('nothing wrong', 'GNSS stays away after 60 s', 'gyro x alone reversed, launch',
+              'IMU losses of 50 to 600 ms, attitude between epochs')
+    monkeypatch.setattr(weak_spots, 'CASES', [
+        case._replace(simulate={'duration': 40.0, **case.simulate})
+        for case in weak_spots.CASES if case.name in chosen])
+    monkeypatch.setattr(weak_spots, 'RECORDING', 'driven')
+    monkeypatch.setattr(weak_spots, 'STARTS', (0.0,))
+    monkeypatch.setitem(recorded.KNOWN_LEVER_ARMS, 'driven', (0.0, 0.0, 0.0))
+    experiments.run('weak-spots', tmp_path, folder, runs=1, jobs=1)
+    assert 'weak-spots --out DIR --runs 1' in (tmp_path / 'weak-spots.md').read_text('utf-8')
+    cases = json.loads((tmp_path / 'weak-spots.json').read_text('utf-8'))['cases']
+    assert len(cases) == len(chosen) + 2 and all(len(runs) == 1 for runs in cases.values())
+    right, away, between, reversed_, *of_recording = (runs[0] for runs in cases.values())
+    assert right['end'] and right['worst_sigmas'] < 5.0
+    assert not away['end'] and 0.1 < away['aligned_part'] < 0.9
+    assert between['worst_sigmas'] < 5.0 and reversed_['declared_s'] is None
+    assert [run['end'] for run in of_recording] == [True, False]
 
 
 @pytest.mark.parametrize('arguments, reason', [
