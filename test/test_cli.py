@@ -270,7 +270,7 @@ def test_help_names_the_experiments(capsys):
     from ins_align.experiments import MEASUREMENTS, NAMES
     with pytest.raises(SystemExit):
         main(['experiment', '--help'])
-    words = re.findall(r'\w+', capsys.readouterr().out)
+    words = re.findall(r'\w[\w-]*', capsys.readouterr().out)
     assert {*NAMES, 'all', *MEASUREMENTS} <= set(words)
 
 
