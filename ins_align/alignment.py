@@ -119,18 +119,12 @@ class Alignment:
         if self._first_t0_ns is None:
             self._first_t0_ns = epoch.stamp_ns
         if self.config.method == 'map':
-            self._method = MapMethod(self.config, epoch, step.imu, step.use_position,
-                                     self._prior(epoch.stamp_ns))
+            from ins_align.estimation.bank import Bank
+            self._method = Bank(self.config, epoch, step.imu, step.use_position,
+                                     self._learnt)
         else:
             self._method = NoteMethod(self.config, epoch, step.imu, epoch.v_n is None)
         return self._judge(self._method, step.first)
-
-    def _prior(self, stamp_ns: int) -> Prior | None:
-        """Return what is known at a stamp of what was learnt before."""
-        if self._learnt is None:
-            return None
-        prior, learnt_ns = self._learnt
-        return aged(prior, self.config, (stamp_ns - learnt_ns) * 1e-9)
 
     def _advance(self, run: Run) -> list[Epoch]:
         method = self._method
@@ -148,8 +142,7 @@ class Alignment:
         if self._method is not None and self._stamp_ns is not None:
             self.counts['restarts'] += 1
             self._events.append(Event(Severity.WARNING, f'alignment starts over: {why}'))
-            prior = self._method.prior_without_attitude()
-            learnt = None if prior is None else _Learnt(prior, self._stamp_ns)
+            learnt = self._method.learnt()
         self._forget(learnt)
 
     def _judge(self, method: Method, located: Located) -> Epoch:

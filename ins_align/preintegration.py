@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 from ins_align.recent import Recent, RUNGS
 from ins_align.rotation import (apply, Array, cross, cumulative_rotations, exp_and_left_jacobian,
-                                exp_so3, Index, orthonormalized, product, skew)
+                                exp_so3, Index, log_so3, orthonormalized, product, skew)
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -145,25 +145,44 @@ class Intervals:
         none.R[:] = np.eye(3)
         return replace(none, omega=self.omega, gained=self.gained, turned=self.turned)
 
-    def mirrored(self, gyro_sign: float, accel_sign: float) -> 'Intervals':
+    def mirrored(self, signs: Array) -> 'Intervals':
         """
-        Return what the intervals would be with the signs of the sensors changed, +1 or -1 each.
+        Return what the intervals would be with the signs of sensors changed, leading axes (K, M).
 
-        To first order in the rotation over an interval: good for telling the signs apart.
+        To second order in the rotation over an interval, with rate and force steady in it: good
+        for telling the signs apart.
+
+        Parameters
+        ----------
+        signs : ndarray, shape (M, 4)
+            +1 or -1: of the gyros x, y, z and of the accelerometers.
+
         """
-        R, v, p = self.R, self.v, self.p
+        gyro, accel = signs[:, :3], signs[:, 3:]
+        wider = {name: array[:, None] for name, array in vars(self).items()}
+        if (signs == 1).all():
+            shape = self.duration.size, len(signs)
+            return Intervals(**wider | {
+                name: np.broadcast_to(array, shape + array.shape[2:])
+                for name, array in wider.items() if name != 'duration'} | {
+                    'duration': self.duration})
+        turn = log_so3(self.R)[:, None]
+        # Forces act on average half and, for the way, a third of the rotation after the start.
+        half, third = (exp_so3(part * gyro * turn) @ exp_so3(-part * turn) for part in (1/2, 1/3))
+        ones = np.ones((len(signs), 3))
         # What a bias does stays; an entry of a matrix is one in proportion to what is mirrored.
-        gyro, accel = (np.repeat([1.0, sign], [3, 9]) for sign in (gyro_sign, accel_sign))
-        if gyro_sign < 0:
-            back = R.transpose(0, 2, 1)
-            R, v, p = back, apply(back, v), apply(back, p)
-        return Intervals(**{
-            **vars(self), 'R': R, 'v': accel_sign * v, 'p': accel_sign * p,
-            'J_Rg': gyro * self.J_Rg, 'J_vg': accel_sign * gyro * self.J_vg,
-            'J_pg': accel_sign * gyro * self.J_pg,
-            'J_va': accel * self.J_va, 'J_pa': accel * self.J_pa,
-            'omega': gyro_sign * self.omega, 'gained': accel_sign * self.gained,
-            'turned': gyro_sign * self.turned})
+        of_gyro = np.hstack([ones, np.tile(gyro, 3)])[:, None]
+        of_accel = np.hstack([ones, np.tile(accel, 9)])[:, None]
+        force = accel[:, None]
+        return Intervals(**wider | {
+            'duration': self.duration, 'R': exp_so3(gyro * turn),
+            'v': accel * apply(half, wider['v']), 'p': accel * apply(third, wider['p']),
+            'J_Rg': of_gyro * (half @ wider['J_Rg']),
+            'J_vg': force * of_gyro * (half @ wider['J_vg']),
+            'J_pg': force * of_gyro * (third @ wider['J_pg']),
+            'J_va': of_accel * (half @ wider['J_va']), 'J_pa': of_accel * (third @ wider['J_pa']),
+            'omega': gyro * wider['omega'], 'gained': force * wider['gained'],
+            'turned': gyro[:, None] * wider['turned']})
 
     def corrected(self, change: Array) -> 'Intervals':
         """

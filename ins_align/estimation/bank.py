@@ -1,0 +1,565 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+The bank: filters for every heading and every rival, side by side on the same data.
+
+It starts from the note's own pair of vectors, weighs means and rivals by their likelihood, and
+gives the attitude as a mixture (docs, "Theory").
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+import math
+from typing import NamedTuple
+
+from ins_align.antenna import AntennaEpoch
+from ins_align.config import Config, STANDARD_GRAVITY
+from ins_align.estimation.filter import (
+    DELAY, Filters, FIRST, GATE, GYRO, Linearised, linearised, PHI, PHI0, RHO, Track, XI)
+from ins_align.estimation.rivals import in_words, log_sum, Parameters, rivals_of
+from ins_align.fit import Fit, Innovation, no_fit, NOTHING_NEW
+from ins_align.formula import AttitudeMoments, InertialTrack
+from ins_align.preintegration import Intervals, SensorErrors
+from ins_align.results import Nuisance
+from ins_align.rotation import apply, Array, cross, cumulative_rotations, exp_so3, log_so3
+import numpy as np
+
+# Headings that the bank starts with, every two degrees, and their sigma over the step between
+# them: the sum of such normal densities is flat to 2e-6.
+HEADINGS, STEP_STD = 180, 0.6
+TILT_STD = math.radians(10.0)
+# The bank starts when the vector from which it does is so many times its noise.
+START_RATIO = 20.0
+# What is not known of velocity and position at first (m/s, m).
+OPEN_VELOCITY, OPEN_POSITION = 1e3, 1e4
+# Means whose log weight is so much below the likeliest's are dropped, and so are rivals that are
+# wrong; levels stay, for what they assume may become true.
+UNLIKELY, HOPELESS, LEAST = 14.0, 25.0, 13.0
+# Means of a rival that agree to so many sigmas are merged.
+ALIKE = 0.5
+# A wrong rival has to be less likely by this (log likelihood) or to give the same attitude, to so
+# many sigmas.
+MARGIN, HARMLESS = 6.0, 2.0
+# The receiver's noise is taken to be larger than stated when innovations are so many times as
+# large in the mean square; it follows at this rate for each epoch, a single epoch counting up to
+# the last.
+LOUD, FOLLOW, CLIP = 2.0, 0.02, 5.0
+# Epochs over which the mean square of innovations is taken, and those it is believed to be 1 for.
+MEMORY, BELIEVED = 300, 30
+# Parameters are linearised anew when the likeliest mean has gone so far from the point: lever arm
+# (m), delay (s), bias and matrix of the gyros (rad/s, 1) and of the accelerometers (m/s^2, 1).
+_REACH = np.array([0.2] * 3 + [0.01] + [5e-4] * 3 + [0.02] * 9 + [0.1] * 3 + [0.02] * 9)
+MAX_AHEAD = 64
+# Beside velocities positions gain little and hurt when their errors wander: where the bank may
+# choose, it takes them when no velocity came for this long (ns), and leaves them out again when
+# velocities have come for the second.
+VELOCITY_STOPPED_NS, VELOCITY_BACK_NS = 10_000_000_000, 2_000_000_000
+# So many epochs in a row that do not fit show that the bank has gone astray.
+ASTRAY = 10
+# A heading that is known to this (rad) is resolved.
+RESOLVED_STD = 0.35
+# A start takes so many epochs, fewer leave the formula no redundancy, and waits for no more.
+FIRST_EPOCHS, MAX_WAITING = 4, 64
+
+
+class Learnt(NamedTuple):
+    """What an alignment that is over has learnt of the body, shapes (m,) and (m, m), and when."""
+
+    x: Array
+    P: Array
+    stamp_ns: int
+
+
+class Bank:
+    """
+    Estimates from t0 on.
+
+    Parameters
+    ----------
+    config : Config
+    epoch : AntennaEpoch
+        t0.
+    imu : Intervals
+        Of no length, at t0.
+    use_position : bool
+
+    """
+
+    def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals, use_position: bool,
+                 prior: Learnt | None = None) -> None:
+        """Start at t0."""
+        self._config = config
+        self._use_position = use_position
+        self._velocity_ns = epoch.stamp_ns          # the last one
+        self._velocities_since_ns: int | None = None
+        self.moved = self.restarts = 0
+        self._rivals = rivals_of(config)
+        self._signs = np.array([rival.signs for rival in self._rivals])
+        self._share_of = np.array([rival.share for rival in self._rivals])
+        self._prior = np.array([rival.prior for rival in self._rivals])
+        self._wrong = np.array([rival.wrong for rival in self._rivals])
+        self._offered = 0
+        self._rejected = [0, 0, 0]
+        self._begin(epoch, imu, prior)
+
+    def _begin(self, epoch: AntennaEpoch, imu: Intervals, prior: Learnt | None = None) -> None:
+        """Wait for a start, with nothing known but what was learnt before."""
+        self.t0_ns = epoch.stamp_ns
+        force = imu.gained[0, -1]
+        force = STANDARD_GRAVITY * force / max(float(np.linalg.norm(force)), 1e-3)
+        self._known = [Parameters.of(self._config, rival, force) for rival in self._rivals]
+        if prior is not None:
+            self._remember(prior)
+        size = (self._known[0].x.size - GYRO) // 2
+        self._reach = np.concatenate([_REACH[:4 + size], _REACH[16:16 + size]])
+        self._filters: Filters | None = None
+        self._waiting: list[tuple[AntennaEpoch, Intervals]] = []
+        self._last = epoch                          # the last epoch that was processed
+        self._C_nn0 = np.eye(3)
+        self._innovation = NOTHING_NEW
+        self._noise = [0.0, 0.0]                    # log factors
+        self._misfit, self._heard = 1.0, BELIEVED
+        self._in_a_row = 0                          # epochs that were rejected
+        self._ahead = 1
+        self._wait(epoch, imu)
+
+    def _remember(self, learnt: Learnt) -> None:
+        """Start with what was learnt before, as old as it is."""
+        age = (self.t0_ns - learnt.stamp_ns) * 1e-9
+        for rival, known in zip(self._rivals, self._known):
+            if rival.wrong:
+                continue
+            known.x[:] = learnt.x
+            grown = np.minimum(learnt.P.diagonal() + age * known.walk[FIRST:], known.P.diagonal())
+            known.P = learnt.P + np.diag(np.maximum(grown - learnt.P.diagonal(), 0.0))
+
+    # Input
+
+    def advance(self, epochs: Sequence[AntennaEpoch], imu: Intervals) -> Iterator[AntennaEpoch]:
+        """Take epochs and the IMU intervals before each; yield each when the results are its."""
+        done = 0
+        while done < len(epochs):
+            if self._filters is None:
+                self._wait(epochs[done], imu.take(slice(done, done + 1)))
+                done += 1
+                yield epochs[done - 1]
+                continue
+            part = slice(done, done + self._ahead)
+            before = done
+            for epoch in self._take(epochs[part], imu.take(part)):
+                done += 1
+                yield epoch
+            self._ahead = min(2 * self._ahead, MAX_AHEAD) if done - before == self._ahead else 1
+
+    def _take(self, epochs: Sequence[AntennaEpoch], imu: Intervals) -> Iterator[AntennaEpoch]:
+        """Take epochs as long as they are linearised close enough."""
+        filters = self._filters
+        assert filters is not None
+        track = self._track_of(epochs)
+        ids = filters.ids
+        point = filters.x[filters.lead]
+        point[:, DELAY] = point[0, DELAY]
+        model = self._model(point, ids, imu)
+        self._C_nn0 = np.eye(3)
+        for k, epoch in enumerate(epochs):
+            self._step(filters, model, k, track)
+            self._C_nn0 = track.C_n0n[k].T
+            self._last = epoch
+            if self._in_a_row >= ASTRAY:
+                self.restarts += 1
+                self._begin(epoch, imu.take(slice(k, k + 1)).end())
+                yield epoch
+                return
+            changed = self._choose(epoch)
+            if (changed or filters.ids.size != ids.size or k + 1 == len(epochs) or np.any(
+                    np.abs(filters.x[filters.lead] - point) > self._reach)):
+                self._anchor(filters, k)
+                if changed and self._use_position:
+                    filters.open_position(np.zeros(3), OPEN_POSITION)
+                yield epoch
+                return
+            yield epoch
+
+    def _choose(self, epoch: AntennaEpoch) -> bool:
+        """Use positions where velocities have stopped, until they are back; whether it changes."""
+        before = self._use_position
+        stopped = epoch.stamp_ns - self._velocity_ns > VELOCITY_STOPPED_NS
+        if epoch.v_n is not None:
+            if self._velocities_since_ns is None or stopped:
+                self._velocities_since_ns = epoch.stamp_ns
+            self._velocity_ns = epoch.stamp_ns
+            if (self._config.use_position == 'auto'
+                    and epoch.stamp_ns - self._velocities_since_ns >= VELOCITY_BACK_NS):
+                self._use_position = False
+        elif self._config.use_position == 'auto' and epoch.position_measured and stopped:
+            self._use_position = True
+        return self._use_position != before
+
+    def _track_of(self, epochs: Sequence[AntennaEpoch]) -> Track:
+        """Return the GNSS side of epochs in the n0 of the last epoch before them."""
+        last = self._last
+        self._inertial = track = InertialTrack.start(
+            last.latitude, last.longitude, last.altitude).extended(
+            np.array([epoch.stamp_ns - last.stamp_ns for epoch in epochs]) * 1e-9,
+            *(np.array([getattr(epoch, name) for epoch in epochs])
+              for name in ('latitude', 'longitude', 'altitude')))
+        v_n = np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n for epoch in epochs])
+        covariance = np.array([[epoch.velocity_covariance, epoch.position_covariance]
+                               for epoch in epochs])
+        C_n0n = track.C_n0n[:, None]
+        return Track(np.stack([track.s_v(v_n), track.s_p], axis=1),
+                     C_n0n @ covariance @ C_n0n.swapaxes(-1, -2),
+                     [(epoch.v_n is not None, epoch.position_measured and self._use_position)
+                      for epoch in epochs], track.C_n0n)
+
+    def _model(self, point: Array, ids: Array, imu: Intervals) -> Linearised:
+        shares = self._share_of[ids, None, None]
+        return linearised(point, imu.mirrored(self._signs[ids]),
+                          imu.Q[:, None] + shares * imu.Q_excess[:, None], self._use_position)
+
+    def _anchor(self, filters: Filters, k: int) -> None:
+        """Freeze n0 at epoch k, the last one that was processed."""
+        track = self._inertial.at(k)
+        filters.turned(track.C_n0n.T, track.still_v, track.s_p)
+        self._C_nn0 = np.eye(3)
+
+    def _step(self, filters: Filters, model: Linearised, k: int, track: Track) -> None:
+        filters.propagate(model, k)
+        self._innovation = NOTHING_NEW
+        if not any(track.present[k]):
+            return
+        self._offered += 1
+        nis: list[float] = []
+        bad = astray = False
+        for kind, present in enumerate(track.present[k]):
+            if not present:
+                continue
+            new = filters.update(model, k, kind, track, math.exp(self._noise[kind]))
+            best = self._best(filters)
+            square = float(new.nis[best]) / 3
+            self._hear(kind, square)
+            rejected = not new.taken[best]
+            self._rejected[kind] += rejected
+            bad |= rejected
+            astray |= not new.taken[np.argmax(filters.evidence)]
+            if not nis:
+                normalised = new.residual[best] / np.sqrt(np.diagonal(new.covariance[best]))
+            nis.append(square)
+        self._rejected[2] += bad
+        self._in_a_row = self._in_a_row + 1 if astray else 0
+        self._innovation = Innovation(sum(nis) / len(nis), normalised)
+        self._select(filters)
+
+    def _best(self, filters: Filters) -> int:
+        """Return the place of the likeliest level."""
+        return int(np.argmax(np.where(self._wrong[filters.ids], -np.inf,
+                                      filters.evidence + self._prior[filters.ids])))
+
+    def _hear(self, kind: int, square: float) -> None:
+        """Follow the noise of the receiver."""
+        square = min(square, CLIP)
+        self._noise[kind] = max(self._noise[kind] + FOLLOW * (square - LOUD), 0.0)
+        self._heard += 1
+        self._misfit += (square - self._misfit) / min(self._heard, MEMORY)
+
+    def _select(self, filters: Filters) -> None:
+        """Drop means and rivals that are unlikely, merge means that agree."""
+        ids = filters.ids
+        if len(filters.C) == 1:
+            return
+        wrong = self._wrong[ids]
+        level = filters.evidence + self._prior[ids]
+        best = np.max(level[~wrong])
+        filters.evidence = np.where(wrong, filters.evidence,
+                                    np.maximum(level, best - LEAST) - self._prior[ids])
+        filters.evidence = filters.evidence - best
+        if len(filters.C) > len(ids):
+            keep = filters.weight > filters.weight[filters.lead][filters.place] - UNLIKELY
+        else:
+            keep = np.ones(len(filters.C), bool)
+        keep &= (~wrong | (filters.evidence > -HOPELESS))[filters.place]
+        if not keep.all():
+            filters.keep(keep)
+        filters.merge(ALIKE)
+
+    # Start
+
+    def _wait(self, epoch: AntennaEpoch, imu: Intervals) -> None:
+        """Take an epoch that comes before the start, and start if it suffices."""
+        if epoch.v_n is None and not epoch.position_measured:
+            if not self._waiting:
+                return
+        self._waiting.append((epoch, imu))
+        found = self._rough_attitude()
+        if found is not None:
+            self._start(*found)
+        elif len(self._waiting) > MAX_WAITING:
+            self._begin_later()
+
+    def _begin_later(self) -> None:
+        """Wait for a start from a later epoch than the first one that waits."""
+        (_, imu), *rest = self._waiting
+        while rest and rest[0][0].v_n is None and not rest[0][0].position_measured:
+            imu, rest = rest[0][1], rest[1:]
+        if rest:
+            epoch, imu = rest[0]
+            self._waiting = [(epoch, imu.end()), *rest[1:]]
+            self._last, self.t0_ns = epoch, epoch.stamp_ns
+
+    def _rough_attitude(self) -> tuple[Array, Array] | None:
+        """
+        Solve the note's formula, its start free, for the epochs that wait.
+
+        Returns
+        -------
+        C : ndarray, shape (3, 3)
+            The attitude at t0, but for a rotation about an axis.
+        axis : ndarray, shape (3,)
+            In the body at t0. None for both where the epochs say too little, or contradict each
+            other.
+
+        """
+        epochs = [epoch for epoch, _ in self._waiting]
+        kind = 0 if sum(epoch.v_n is not None for epoch in epochs) >= FIRST_EPOCHS else 1
+        use = np.array([epoch.position_measured if kind else epoch.v_n is not None
+                        for epoch in epochs])
+        if np.count_nonzero(use) < FIRST_EPOCHS + kind or (kind and not self._use_position):
+            return None
+        imu, first = self._together(), epochs[0]
+        time = np.array([epoch.stamp_ns - first.stamp_ns for epoch in epochs]) * 1e-9
+        track = InertialTrack.start(first.latitude, first.longitude, first.altitude).extended(
+            time, *(np.array([getattr(epoch, name) for epoch in epochs])
+                    for name in ('latitude', 'longitude', 'altitude')))
+        C = np.concatenate([np.eye(3)[None], cumulative_rotations(imu.R)])
+        steps = apply(C[:-1], imu.v)
+        v = np.cumsum(steps, axis=0)
+        lever = np.array(self._config.lever_arm)
+        if kind:
+            s = track.s_p
+            a = (np.cumsum(imu.duration[:, None] * (v - steps) + apply(C[:-1], imu.p), axis=0)
+                 + C[1:] @ lever)
+            covariance = [epoch.position_covariance for epoch in epochs]
+        else:
+            s = track.s_v(np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n
+                                    for epoch in epochs]))
+            a = v + apply(C[1:], cross(imu.omega, np.broadcast_to(lever, imu.omega.shape)))
+            covariance = [epoch.velocity_covariance for epoch in epochs]
+        variance = np.array([float(np.trace(matrix)) / 3 for matrix in covariance])
+        places = np.flatnonzero(use)
+        while len(places) >= FIRST_EPOCHS + kind:
+            solved = _solved(s, a, time, places, kind)
+            usual = float(np.mean(variance[places]))
+            values, vectors = np.linalg.eigh(solved[2])
+            if values[-1] < START_RATIO ** 2 * usual:
+                return None
+            if solved[1] < GATE * usual * (len(places) - 1):
+                for k in np.setdiff1d(np.flatnonzero(use), places):
+                    self._leave_out(int(k), kind)
+                if not use[places[0]] or places[0] > 0:
+                    self._begin_later()
+                    return self._rough_attitude()
+                return solved[0], vectors[:, -1]
+            # One of them may be an outlier: without which do the others agree best?
+            left = [_solved(s, a, time, np.delete(places, i), kind)[1]
+                    for i in range(len(places))]
+            places = np.delete(places, int(np.argmin(left)))
+        return None
+
+    def _leave_out(self, k: int, kind: int) -> None:
+        """Forget what was measured at an epoch that waits."""
+        epoch, imu = self._waiting[k]
+        changes = {'position_measured': False} if kind else {'v_n': None}
+        self._waiting[k] = replace(epoch, **changes), imu
+        self._rejected[kind] += 1
+        self._rejected[2] += 1
+
+    def _together(self) -> Intervals:
+        intervals = [imu for _, imu in self._waiting]
+        return Intervals(**{name: np.concatenate([getattr(imu, name) for imu in intervals])
+                            for name in vars(intervals[0])})
+
+    def _start(self, C_rough: Array, axis: Array) -> None:
+        """Start filters for all headings and rivals at t0, and feed them what has come since."""
+        M, m = len(self._rivals), self._known[0].x.size
+        rival = np.repeat(np.arange(M), HEADINGS)
+        step = 2 * math.pi / HEADINGS
+        around = exp_so3(step * np.arange(HEADINGS)[:, None] * axis)
+        # With the accelerations reversed it is half a turn about any axis across.
+        across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+        half = exp_so3(math.pi * across / np.linalg.norm(across))
+        C = np.concatenate([C_rough @ around if sign > 0 else C_rough @ half @ around
+                            for sign in self._signs[:, 3]])
+        along = np.outer(axis, axis)
+        attitude = TILT_STD ** 2 * (np.eye(3) - along) + (STEP_STD * step) ** 2 * along
+        P = np.zeros((M, FIRST + m, FIRST + m))
+        for rows in (PHI, PHI0):
+            for columns in (PHI, PHI0):
+                P[:, rows, columns] = attitude
+        P[:, XI, XI], P[:, RHO, RHO] = (std ** 2 * np.eye(3)
+                                        for std in (OPEN_VELOCITY, OPEN_POSITION))
+        P[:, FIRST:, FIRST:] = [known.P for known in self._known]
+        epochs = [epoch for epoch, _ in self._waiting]
+        imu, self._waiting = self._together(), []
+        self._last = epochs[0]
+        track = self._track_of(epochs)
+        v_n = next((epoch.v_n for epoch in epochs if epoch.v_n is not None), np.zeros(3))
+        self._filters = filters = Filters(C, v_n, self._known[0].x, rival, P,
+                                          np.array([known.walk for known in self._known]))
+        for k in range(len(epochs)):
+            ids = filters.ids
+            point = filters.x[filters.lead]
+            model = self._model(point, ids, imu.take(slice(k, k + 1)))
+            one = slice(k, k + 1)
+            self._step(filters, model, 0, Track(track.s[one], track.covariance[one],
+                                                track.present[one], track.C_n0n[one]))
+        self._last = epochs[-1]
+        self._anchor(filters, len(epochs) - 1)
+
+    # Results
+
+    def _shares_of(self, filters: Filters) -> Array:
+        """Return the weight of each mean in the mixture."""
+        ids = filters.ids
+        evidence = np.where(self._wrong[ids], -np.inf, filters.evidence + self._prior[ids])
+        share = np.exp(evidence - evidence.max())
+        return (share / share.sum())[filters.place] * np.exp(filters.weight)
+
+    def _mixture(self, C: Array, block: slice) -> tuple[Array, Array]:
+        """Return the mean of attitudes and its covariance in the axes that they are in."""
+        filters = self._filters
+        assert filters is not None
+        share = self._shares_of(filters)
+        use = np.flatnonzero(share > 1e-6)
+        share, C = share[use], C[use]
+        covariance = C @ filters.P[filters.place[use], block, block] @ C.swapaxes(1, 2)
+        if len(use) == 1:
+            return C[0], covariance[0]
+        mean = C[np.argmax(share)]
+        for _ in range(2):
+            away = log_so3(C @ mean.T)
+            mean = exp_so3(share @ away / share.sum()) @ mean
+        away = log_so3(C @ mean.T)
+        total = covariance + away[:, :, None] * away[:, None]
+        return mean, np.sum(share[:, None, None] * total, axis=0) / share.sum()
+
+    def initial(self) -> tuple[Array, Array] | None:
+        if self._filters is None:
+            return None
+        C, P = self._mixture(self._filters.C0, PHI0)
+        return C, max(1.0, self._misfit) * P
+
+    def current(self) -> tuple[Array, Array] | None:
+        if self._filters is None:
+            return None
+        C, P = self._mixture(self._filters.C, PHI)
+        return (self._C_nn0 @ C,
+                max(1.0, self._misfit) * self._C_nn0 @ P @ self._C_nn0.T)
+
+    def fit(self) -> Fit:
+        if self._filters is None:
+            return no_fit(self._offered, self._config.gnss_delay)
+        x, _ = self._body()
+        rows = 3 * (self._offered - self._rejected[2])
+        return Fit(rows * self._misfit, rows, self._innovation, True, *self._rejected,
+                   self._offered, self._config.gnss_delay + float(x[DELAY]))
+
+    def settle(self):
+        pass
+
+    def renew(self):
+        """Move t0 to the last epoch."""
+        assert self._filters is not None
+        self._filters.clone(self._C_nn0.T)
+        self.moved += 1
+        self.t0_ns = self._last.stamp_ns
+
+    def judged(self, contradicted, state):
+        pass
+
+    def _ahead_of(self, filters: Filters) -> Array:
+        """Return how much likelier each rival that is wrong is than all levels, shape (M,)."""
+        wrong = self._wrong[filters.ids]
+        evidence = filters.evidence + self._prior[filters.ids]
+        ahead = np.where(wrong, evidence - log_sum(evidence[~wrong]), -np.inf)
+        return np.asarray(ahead / max(self._misfit, 1.0))
+
+    def unconfirmed(self) -> str:
+        """Return why a heading is not to be declared yet, in words, or ''."""
+        filters = self._filters
+        assert filters is not None
+        ahead = self._ahead_of(filters)
+        if not np.any(ahead > -MARGIN):
+            return ''
+        harm = np.zeros(len(ahead))
+        for C, block in ((filters.C, PHI), (filters.C0, PHI0)):
+            mean, P = self._mixture(C, block)
+            away = log_so3(C[filters.lead] @ mean.T) / np.sqrt(np.diag(P))
+            harm = np.maximum(harm, np.abs(away).max(axis=1))
+        worst = int(np.argmax(np.where(harm > HARMLESS, ahead, -np.inf)))
+        if harm[worst] <= HARMLESS or ahead[worst] <= -MARGIN:
+            return ''
+        if ahead[worst] > MARGIN:
+            return self._words(filters, worst)
+        return 'the signs of the IMU axes are not confirmed by the motion yet: turn'
+
+    def _words(self, filters: Filters, rival: int) -> str:
+        return in_words(self._rivals[filters.ids[rival]], filters.x[filters.lead[rival]],
+                        self._config.gnss_delay)
+
+    def _body(self) -> tuple[Array, Array]:
+        filters = self._filters
+        if filters is None:
+            return self._known[0].x, self._known[0].P
+        best = self._best(filters)
+        return filters.x[filters.lead[best]], filters.P[best, FIRST:, FIRST:]
+
+    def nuisance(self) -> Nuisance:
+        x, P = self._body()
+        std = np.sqrt(np.diag(P))
+        size = (x.size - GYRO) // 2
+        gyro, accel = slice(GYRO, GYRO + 3), slice(GYRO + size, GYRO + size + 3)
+        return Nuisance(x[gyro], std[gyro], x[accel], std[accel], x[:3], std[:3],
+                        float(self._config.gnss_delay + x[DELAY]), float(std[DELAY]))
+
+    def sensor_errors(self) -> SensorErrors:
+        x, _ = self._body()
+        size = (x.size - GYRO) // 2
+        full = np.zeros(24)
+        full[:size], full[12:12 + size] = x[GYRO:GYRO + size], x[GYRO + size:]
+        return SensorErrors.of(full)
+
+    def learnt(self) -> Learnt | None:
+        """Return what a fresh start may keep; None where the bank has gone astray."""
+        if self._filters is None or self._in_a_row:
+            return None
+        x, P = (array.copy() for array in self._body())
+        if self._mixture(self._filters.C, PHI)[1][2, 2] > RESOLVED_STD ** 2:
+            # Without a change of speed nothing shows lever arm and delay but the noise of the
+            # IMU, which feigns a swing that the GNSS does not see.
+            antenna = slice(0, GYRO)
+            P[antenna] = P[:, antenna] = 0.0
+            x[antenna], P[antenna, antenna] = (self._known[0].x[antenna],
+                                               self._known[0].P[antenna, antenna])
+        return Learnt(x, P, self._last.stamp_ns)
+
+
+def _solved(s: Array, a: Array, time: Array, places: Array,
+            kind: int) -> tuple[Array, float, Array]:
+    """Solve ``s = (free start) + C a`` for some epochs; see `AttitudeMoments.solve`."""
+    moments = AttitudeMoments(1 + kind)
+    for k in places.tolist():
+        moments.add(s[k], a[k], (1.0, time[k])[:1 + kind])
+    return moments.solve()

@@ -1,0 +1,494 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Error-state Kalman filters whose errors are the body's: many means, one covariance.
+
+A mean is the attitude ``C = C_n0b``, the velocity u and the position w of the IMU in n0, the
+attitude C0 at t0 and the parameters x of the body (lever arm, delay, errors of gyros and
+accelerometers). n0 is the local level frozen at the last epoch that was processed before; gravity
+and the rotation of the Earth are in the GNSS side s_v, s_p (`formula.InertialTrack`), so that
+propagation is pure integration of preintegrated intervals. u and w are those which a receiver
+whose measurements are late by its delay sees. Errors are
+
+    C_true = C exp(phi)    u_true = u + C xi    w_true = w + C rho    C0_true = C0 exp(phi0)
+
+Neither their propagation nor a measurement's derivative holds an attitude, so all means that
+differ in their heading share one covariance (docs, "Theory").
+"""
+
+from dataclasses import dataclass
+
+from ins_align.preintegration import Intervals
+from ins_align.recent import AGES, exact, smooth
+from ins_align.rotation import apply, Array, by_row, cross, exp_so3, Index, log_so3, skew
+import numpy as np
+
+# Places in the error state; the parameters follow from FIRST on: lever arm, delay, errors of the
+# gyros (bias, then matrix), errors of the accelerometers.
+PHI, XI, RHO, PHI0, FIRST = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12
+LEVER_ARM, DELAY, GYRO = slice(0, 3), 3, 4          # in the parameters
+# A delay within these (s) is followed along the recent motion, a larger one goes straight on.
+MIN_DELAY, MAX_DELAY = -0.1, AGES[-1]
+# Normalised innovation squared of three rows above which a measurement is an outlier: one good
+# one in 60 000 is (chi-square with three degrees of freedom).
+GATE = 25.0
+_EYE = np.eye(3)
+
+
+@dataclass
+class Track:
+    """
+    The GNSS side of K epochs in n0; see `formula.InertialTrack`.
+
+    Attributes
+    ----------
+    s : ndarray, shape (K, 2, 3)
+        s_v and s_p.
+    covariance : ndarray, shape (K, 2, 3, 3)
+    present : list of (bool, bool)
+        Whether there is a velocity, a position.
+    C_n0n : ndarray, shape (K, 3, 3)
+
+    """
+
+    s: Array
+    covariance: Array
+    present: list[tuple[bool, bool]]
+    C_n0n: Array
+
+
+@dataclass
+class Linearised:
+    """
+    Motion and measurements of K epochs, linearised at the parameters of each of M rivals.
+
+    Attributes
+    ----------
+    point : ndarray, shape (M, m)
+        The parameters x.
+    duration : list of float
+        Seconds.
+    R : ndarray, shape (K, M, 3, 3)
+        Rotation over the interval before each epoch, corrected for the point's sensor errors.
+    moved : ndarray, shape (K, M, 6)
+        Velocity and position gained in it.
+    J : ndarray, shape (K, M, 9, m)
+        Derivatives of rotation, velocity and position to x.
+    F : ndarray, shape (K, M, 9, n)
+        Transition of phi, xi, rho.
+    Q : ndarray, shape (K, M, 9, 9)
+        What the noise of the IMU adds to their covariance.
+    H : ndarray, shape (K, 2, M, 3, n)
+        Derivatives of velocity and position, in the body frame, to the errors.
+    expected : ndarray, shape (K, 2, M, 3)
+        What C u and C w lack, in the body frame, of the measurements.
+
+    """
+
+    point: Array
+    duration: list[float]
+    R: Array
+    moved: Array
+    J: Array
+    F: Array
+    Q: Array
+    H: Array
+    expected: Array
+
+
+def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool) -> Linearised:
+    """
+    Linearise K epochs.
+
+    Parameters
+    ----------
+    point : ndarray, shape (M, m)
+        Parameters to linearise at; their delays are alike.
+    interval : Intervals
+        Before each epoch, as each of the rivals has them: leading axes (K, M).
+    Q : ndarray, shape (K, M, 9, 9)
+        Covariance of (rotation, velocity, position), in the frame at the start.
+    use_position : bool
+        Whether positions are measurements.
+
+    """
+    M, m = point.shape
+    K = interval.duration.size
+    size = (m - GYRO) // 2                      # errors of a triad: its bias, or its matrix too
+    gyro, accel = slice(GYRO, GYRO + size), slice(GYRO + size, m)
+    J = np.zeros((K, M, 9, m))
+    J[:, :, PHI, gyro], J[:, :, XI, gyro] = interval.J_Rg[..., :size], interval.J_vg[..., :size]
+    J[:, :, RHO, gyro], J[:, :, XI, accel] = interval.J_pg[..., :size], interval.J_va[..., :size]
+    J[:, :, RHO, accel] = interval.J_pa[..., :size]
+    change = apply(J, point)
+    R = exp_so3(change[..., PHI]) @ interval.R
+    moved = np.concatenate([interval.v, interval.p], axis=-1) + change[..., 3:]
+    T = R.swapaxes(-1, -2)
+    F = np.zeros((K, M, 9, FIRST + m))
+    F[..., PHI, PHI] = F[..., XI, XI] = F[..., RHO, RHO] = T
+    F[..., XI, PHI], F[..., RHO, PHI] = -T @ skew(moved[..., :3]), -T @ skew(moved[..., 3:])
+    F[..., RHO, XI] = interval.duration[:, None, None, None] * T
+    J[..., RHO, DELAY] -= moved[..., :3]
+    for rows in (PHI, XI, RHO):
+        F[..., rows, FIRST:] = T @ J[..., rows, :]
+    J[..., RHO, DELAY] = 0.0                    # bilinear in the means: `propagate` has it
+    turn = np.zeros((K, M, 9, 9))
+    turn[..., PHI, PHI] = turn[..., XI, XI] = turn[..., RHO, RHO] = T
+    seen = _Seen(point, interval, size)
+    H, expected = np.zeros((K, 2, M, 3, FIRST + m)), np.zeros((K, 2, M, 3))
+    H[:, 0], expected[:, 0] = seen.velocity()
+    if use_position:
+        H[:, 1], expected[:, 1] = seen.position()
+    return Linearised(point.copy(), interval.duration.tolist(), R, moved, J, F,
+                      turn @ Q @ turn.swapaxes(-1, -2), H, expected)
+
+
+class _Seen:
+    """What a receiver sees whose measurements are late, in the body frame; K epochs, M rivals."""
+
+    def __init__(self, point: Array, interval: Intervals, size: int) -> None:
+        """Lead back from the epochs to the moments that were measured."""
+        self.size, self.shape = size, interval.R.shape[:2] + (3, FIRST + point.shape[1])
+        gyro, accel = (point[:, GYRO + k * size:GYRO + (k + 1) * size] for k in (0, 1))
+        self.lever = np.broadcast_to(point[:, LEVER_ARM], interval.omega.shape)
+        self.delay = delay = float(min(max(point[0, DELAY], MIN_DELAY), MAX_DELAY))
+        force, self.gained, self.gained_p = exact(interval.gained, delay)
+        rate, self.turned, _ = exact(interval.turned, delay)
+        # A lever arm swings with the vibration too.
+        vibration = interval.omega - exact(interval.turned, 0.0)[0]
+
+        def corrected(measured: Array, errors: Array, biases: float) -> Array:
+            """Return what a triad measured without its errors."""
+            true = measured - biases * errors[:, :3]
+            if size > 3:
+                true = true - apply(errors[:, 3:].reshape(-1, 3, 3), measured)
+            return true
+
+        turn = corrected(self.turned, gyro, delay)
+        calm = corrected(rate, gyro, 1.0)
+        calm = calm + 0.5 * cross(turn, calm)
+        self.rate = rate + vibration
+        self.omega = calm + corrected(vibration, gyro, 0.0)
+        self.back = exp_so3(-turn)
+        self.swing = apply(self.back, cross(self.omega, self.lever))
+        self.fallen = corrected(self.gained, accel, delay)
+        self.fallen_p = corrected(self.gained_p, accel, delay ** 2 / 2)
+        # Vibration is no use in a derivative. The rate changes with time as it does not with age.
+        calm_force = corrected(smooth(interval.gained, delay)[0], accel, 1.0)
+        change = corrected(smooth(interval.turned, delay)[1], gyro, 0.0)
+        whirled = cross(calm, cross(self.omega, self.lever)) - cross(change, self.lever)
+        self.acceleration = calm_force + apply(self.back, whirled)
+
+    def velocity(self) -> tuple[Array, Array]:
+        """Return its derivatives, shape (K, M, 3, n), and what u lacks of it, (K, M, 3)."""
+        swing = skew(self.swing)
+        arm = self.back @ skew(self.lever)
+        H = self._derivatives(skew(self.fallen) - swing, self.back @ skew(self.omega),
+                              -self.acceleration, arm, arm - self.delay * swing, -swing,
+                              self.delay, self.gained)
+        H[..., XI] = _EYE
+        return H, self.fallen - self.swing
+
+    def position(self) -> tuple[Array, Array]:
+        """Return its derivatives, shape (K, M, 3, n), and what w lacks of it, (K, M, 3)."""
+        arm = apply(self.back, self.lever)
+        H = self._derivatives(-skew(self.fallen_p + arm), self.back, self.fallen - self.swing,
+                              np.zeros(arm.shape + (3,)), -self.delay * skew(arm), -skew(arm),
+                              -self.delay ** 2 / 2, -self.gained_p)
+        H[..., RHO] = _EYE
+        return H, -self.fallen_p - arm
+
+    def _derivatives(self, to_phi: Array, to_lever: Array, to_delay: Array, to_rate: Array,
+                     to_gyro_bias: Array, to_turn: Array, to_accel_bias: float,
+                     force: Array) -> Array:
+        """Put derivatives in their places; those to matrices follow from rates and forces."""
+        H = np.zeros(self.shape)
+        x = H[..., FIRST:]
+        H[..., PHI], x[..., LEVER_ARM], x[..., DELAY] = to_phi, to_lever, to_delay
+        gyro, accel = x[..., GYRO:GYRO + self.size], x[..., GYRO + self.size:]
+        gyro[..., :3], accel[..., :3] = to_gyro_bias, to_accel_bias * _EYE
+        if self.size > 3:
+            gyro[..., 3:] = by_row(to_rate, self.rate) + by_row(to_turn, self.turned)
+            accel[..., 3:] = by_row(np.broadcast_to(_EYE, to_turn.shape), force)
+        return H
+
+
+class Filters:
+    """
+    B means under M rivals: hypotheses of how the sensors are, each with one covariance.
+
+    Parameters
+    ----------
+    C : ndarray, shape (B, 3, 3)
+        Attitudes.
+    u : ndarray, shape (3,)
+        Velocity of all.
+    x : ndarray, shape (m,)
+        Parameters of all.
+    rival : ndarray of int, shape (B,)
+        To which each belongs, increasing.
+    P : ndarray, shape (M, n, n)
+    walk : ndarray, shape (M, n)
+        What a second adds to the diagonal of P.
+
+    Attributes
+    ----------
+    weight : ndarray, shape (B,)
+        Log weight among the means of the same rival.
+    evidence : ndarray, shape (M,)
+        Log likelihood of all that was measured, under each rival.
+    ids : ndarray of int, shape (M,)
+        The rivals that are left.
+    lead : ndarray of int, shape (M,)
+        The likeliest mean of each.
+    feigned : ndarray, shape (M, 3, 3)
+        Covariance of what the IMU's noise has made of u and no measurement has taken back.
+
+    """
+
+    _OF_MEANS = 'C', 'u', 'w', 'x', 'C0', 'rival', 'weight'
+    _OF_RIVALS = 'P', 'walk', 'evidence', 'ids', 'feigned'
+
+    def __init__(self, C: Array, u: Array, x: Array, rival: Index, P: Array,
+                 walk: Array) -> None:
+        """Start at t0."""
+        B, M = len(C), len(P)
+        self.C, self.C0 = C, C.copy()
+        self.u, self.w, self.x = np.tile(u, (B, 1)), np.zeros((B, 3)), np.tile(x, (B, 1))
+        self.rival, self.ids = rival, np.arange(M)
+        self.weight = -np.log(np.bincount(rival))[rival]
+        self.evidence = np.zeros(M)
+        self.P, self.walk = P, walk
+        self.feigned = np.zeros((M, 3, 3))
+        self._find_places()
+
+    def _find_places(self) -> None:
+        self.place = np.searchsorted(self.ids, self.rival)
+        self.first = np.searchsorted(self.rival, self.ids)
+        self._find_leads()
+
+    def _find_leads(self) -> None:
+        if len(self.C) == len(self.ids):
+            self.lead = self.first
+        else:
+            order = np.lexsort((-self.weight, self.rival))
+            self.lead = order[self.first]
+
+    def keep(self, means: np.ndarray) -> None:
+        """Keep some of the means, and the rivals that have any."""
+        for name in self._OF_MEANS:
+            setattr(self, name, getattr(self, name)[means])
+        left = np.isin(self.ids, self.rival)
+        if not left.all():
+            for name in self._OF_RIVALS:
+                setattr(self, name, getattr(self, name)[left])
+        self._find_places()
+
+    def propagate(self, model: Linearised, k: int) -> None:
+        """Go over the interval before epoch k of K; the model has those rivals that are left."""
+        q, duration = self.place, model.duration[k]
+        change = apply(model.J[k][q], self.x - model.point[q])
+        moved = model.moved[k][q] + change[:, 3:]
+        v, p = moved[:, :3], moved[:, 3:]
+        self.w = self.w + duration * self.u + apply(self.C, p - self.x[:, GYRO - 1:GYRO] * v)
+        self.u = self.u + apply(self.C, v)
+        self.C = self.C @ exp_so3(change[:, PHI]) @ model.R[k][q]
+        F, Q, P = model.F[k], model.Q[k], self.P
+        rows = F @ P
+        P[:, :9, 9:] = rows[:, :, 9:]
+        P[:, 9:, :9] = rows[:, :, 9:].swapaxes(1, 2)
+        P[:, :9, :9] = rows @ F.swapaxes(1, 2) + Q
+        M, n = self.walk.shape
+        P.reshape(M, -1)[:, ::n + 1] += duration * self.walk
+        T = F[:, PHI, PHI]
+        self.feigned = T @ self.feigned @ T.swapaxes(1, 2) + Q[:, XI, XI]
+
+    def update(self, model: Linearised, k: int, kind: int, track: Track,
+               noise: float) -> 'Innovation':
+        """
+        Take the velocity (kind 0) or the position (1) of epoch k.
+
+        Parameters
+        ----------
+        model : Linearised
+        k, kind : int
+        track : Track
+        noise : float
+            Factor on the covariance that the receiver states.
+
+        """
+        q, lead = self.place, self.lead
+        H = model.H[k, kind]
+        C_lead = self.C[lead]
+        PH = self.P @ H.swapaxes(1, 2)
+        S = H @ PH + noise * (C_lead.swapaxes(1, 2) @ track.covariance[k, kind] @ C_lead)
+        inverse = np.linalg.inv(S)
+        gain = PH @ inverse
+        missing = track.s[k, kind] - (self.w if kind else self.u)
+        innovation = (apply(self.C.swapaxes(1, 2), missing) + model.expected[k, kind][q]
+                      - apply(H[q][..., FIRST:], self.x - model.point[q]))
+        weighted = apply(inverse[q], innovation)
+        nis = np.sum(innovation * weighted, axis=1)
+        good = nis < GATE
+        # By the means before the measurement, which an outlier must not choose.
+        share = np.exp(self.weight)
+        taken = np.bincount(q, share * good, len(self.ids)) > 0.5
+        log_likelihood = -0.5 * (np.minimum(nis, GATE) + np.log(np.linalg.det(S))[q])
+        self._weigh(log_likelihood)
+        result = Innovation(nis[lead], apply(C_lead, innovation[lead]), C_lead @ S
+                            @ C_lead.swapaxes(1, 2), taken)
+        if not taken.all():
+            gain, good = gain * taken[:, None, None], good & taken[q]
+        self.P = self.P - gain @ PH.swapaxes(1, 2)
+        if kind == 0:
+            self._forget_feigned(gain, inverse, C_lead[:, 2])
+        self._move(apply(gain[q], innovation) * good[:, None])
+        return result
+
+    def _weigh(self, log_likelihood: Array) -> None:
+        """Weigh means within rivals, and rivals."""
+        weight = self.weight + log_likelihood
+        if len(weight) == len(self.ids):
+            self.evidence = self.evidence + weight
+            return
+        largest = np.maximum.reduceat(weight, self.first)
+        total = largest + np.log(np.add.reduceat(np.exp(weight - largest[self.place]), self.first))
+        self.evidence = self.evidence + total
+        self.weight = weight - total[self.place]
+        self._find_leads()
+
+    def _forget_feigned(self, gain: Array, inverse: Array, up: Array) -> None:
+        """
+        Take off again the information on the heading that the noise of the IMU feigns.
+
+        What the accelerometers' noise adds to u looks like motion, and motion that the GNSS does
+        not see in this direction speaks against the heading: in expectation by the trace of
+        ``S^-1 V`` over horizontal axes, V the covariance of that noise (errors in variables).
+        """
+        V = self.feigned
+        weighted = inverse @ V
+        feigned = (np.trace(weighted, axis1=1, axis2=2) - np.sum(up * apply(weighted, up), axis=1))
+        feigned = feigned * (np.abs(gain[:, 3, 0]) > 0)
+        to_heading = apply(self.P[:, :, PHI], up)
+        variance = np.sum(up * to_heading[:, PHI], axis=1)
+        feigned = np.minimum(feigned, 0.5 / variance)
+        factor = feigned / (1 - feigned * variance)
+        self.P += factor[:, None, None] * to_heading[:, :, None] * to_heading[:, None]
+        left = 1 - np.clip(np.trace(gain[:, XI], axis1=1, axis2=2) / 3, 0.0, 1.0)
+        self.feigned = (left ** 2)[:, None, None] * V
+        if len(self.C) > len(self.ids):
+            self.weight = self.weight * (1 - np.minimum(feigned, 1.0))[self.place]
+            self._weigh_evenly()
+
+    def _weigh_evenly(self) -> None:
+        """Make the weights of each rival's means add up to one."""
+        total = np.log(np.add.reduceat(np.exp(self.weight), self.first))
+        self.weight = self.weight - total[self.place]
+
+    def _move(self, d: Array) -> None:
+        """Correct the means, and turn the covariances' frames with the likeliest of them."""
+        C = self.C
+        self.u = self.u + apply(C, d[:, XI])
+        self.w = self.w + apply(C, d[:, RHO])
+        self.C = C @ exp_so3(d[:, PHI])
+        self.C0 = self.C0 @ exp_so3(d[:, PHI0])
+        self.x = self.x + d[:, FIRST:]
+        phi, phi0 = d[self.lead, PHI], d[self.lead, PHI0]
+        if max(np.abs(phi).max(), np.abs(phi0).max()) > 1e-4:
+            lead = self.lead
+            start = apply(C[lead].swapaxes(1, 2) @ self.C0[lead], phi0)
+            G = np.zeros((len(phi), 12, 12))
+            G[:, PHI, PHI] = exp_so3(0.5 * start - phi)
+            G[:, XI, XI] = G[:, RHO, RHO] = exp_so3(-phi)
+            G[:, PHI0, PHI0] = exp_so3(-0.5 * phi0)
+            rows = G @ self.P[:, :FIRST]
+            self.P[:, :FIRST] = rows
+            self.P[:, FIRST:, :FIRST] = rows[:, :, FIRST:].swapaxes(1, 2)
+            self.P[:, :FIRST, :FIRST] = rows[:, :, :FIRST] @ G.swapaxes(1, 2)
+        self.P = 0.5 * (self.P + self.P.swapaxes(1, 2))     # or rounding grows
+
+    # What does not depend on a measurement
+
+    def turned(self, C_nn0: Array, s_v: Array, s_p: Array) -> None:
+        """Go on in another n0; its axes, and what an antenna that rests has there of s."""
+        self.C = C_nn0 @ self.C
+        self.u, self.w = (self.u - s_v) @ C_nn0.T, (self.w - s_p) @ C_nn0.T
+
+    def clone(self, C_n0n: Array) -> None:
+        """Let t0 be now: the attitude at t0 is in the axes of n then, without an error."""
+        self.C0 = C_n0n.T @ self.C
+        self.P[:, PHI0] = self.P[:, PHI]
+        self.P[:, :, PHI0] = self.P[:, :, PHI]
+
+    def open_position(self, position: Array, std: float) -> None:
+        """Forget the position."""
+        self.w[:] = position
+        self.P[:, RHO] = self.P[:, :, RHO] = 0.0
+        self.P[:, RHO, RHO] = std ** 2 * _EYE
+
+    def merge(self, alike: float) -> None:
+        """Merge the means of each rival that are all within so many sigmas of the likeliest."""
+        if len(self.C) == len(self.ids):
+            return
+        lead = self.lead[self.place]
+        C, C0 = self.C[lead].swapaxes(1, 2), self.C0[lead].swapaxes(1, 2)
+        away = np.hstack([log_so3(C @ self.C), apply(C, self.u - self.u[lead]),
+                          apply(C, self.w - self.w[lead]), log_so3(C0 @ self.C0),
+                          self.x - self.x[lead]])
+        variance = np.diagonal(self.P, axis1=1, axis2=2)[self.place]
+        near = np.all(away[:, np.r_[PHI, PHI0]] ** 2
+                      < alike ** 2 * variance[:, np.r_[PHI, PHI0]], axis=1)
+        near = np.minimum.reduceat(near, self.first)
+        if not near.any():
+            return
+        share = np.exp(self.weight)[:, None]
+        mean = np.add.reduceat(share * away, self.first)
+        spread = away - mean[self.place]
+        P = np.add.reduceat(share[..., None] * spread[:, :, None] * spread[:, None], self.first)
+        lead = self.lead
+        self.P[near] += P[near]
+        d = np.where(near[:, None], mean, 0.0)
+        C = self.C[lead]
+        self.u[lead] += apply(C, d[:, XI])
+        self.w[lead] += apply(C, d[:, RHO])
+        self.C[lead], self.C0[lead] = C @ exp_so3(d[:, PHI]), self.C0[lead] @ exp_so3(d[:, PHI0])
+        self.x[lead] += d[:, FIRST:]
+        kept = ~near[self.place]
+        kept[lead] = True
+        self.weight[lead[near]] = 0.0
+        self.keep(kept)
+
+
+@dataclass
+class Innovation:
+    """
+    What was new in a measurement, to the likeliest mean of each rival.
+
+    Attributes
+    ----------
+    nis : ndarray, shape (M,)
+        Normalised and squared, of three rows.
+    residual : ndarray, shape (M, 3)
+        In n0.
+    covariance : ndarray, shape (M, 3, 3)
+    taken : ndarray of bool, shape (M,)
+        Whether it was taken.
+
+    """
+
+    nis: Array
+    residual: Array
+    covariance: Array
+    taken: np.ndarray

@@ -1,0 +1,193 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+What else may be true: a table of rivals, each a change to the filter, a likelihood and a sentence.
+
+A rival is a bank of its own on the same data. One that is `wrong` must not be aligned with: while
+it is as likely as the configuration and would give another attitude, no heading is declared. The
+others are levels of the same configuration: what they say counts by their likelihood.
+"""
+
+from dataclasses import dataclass
+import math
+
+from ins_align.config import Config, PRESETS
+from ins_align.estimation.filter import DELAY, FIRST, GYRO, LEVER_ARM
+from ins_align.rotation import Array
+import numpy as np
+
+# Over the error of the gyros' scale factors: their misalignment; scale factors and misalignment of
+# the accelerometers.
+GYRO_MISALIGNMENT, ACCEL_ERRORS = 0.3, 0.3
+# In this time (s) the biases of the accelerometers change by the first share of their sigma, as
+# temperatures do, and the delay by the second: clocks of IMU and GNSS that nothing keeps together.
+WANDER_TIME, ACCEL_WANDER, DELAY_WANDER = 100.0, 0.1, 0.1
+# Share of the IMU's measured noise beyond the stated one that is believed at first: vibration
+# looks white from sample to sample and is less than that over seconds.
+SHARE = 1 / 27
+
+
+@dataclass(frozen=True)
+class Rival:
+    """
+    Another assumption about the body.
+
+    Attributes
+    ----------
+    better : str
+        What the data fit better with, in words, where the body's parameters can be put in; empty:
+        a level of the configuration.
+    advice : str
+        What to do then.
+    signs : tuple of float
+        Of the gyros x, y, z and of the accelerometers.
+    gyro : float
+        Factor on the gyros' bias and rate random walk.
+    share : float
+        Of the IMU's measured noise beyond the stated one that is believed.
+    lever_arm_std, gnss_delay_std, gyro_bias_std, accel_bias_std : float
+        At least so much (SI).
+    prior : float
+        Log of how likely it is before the data, over the configuration.
+
+    """
+
+    better: str = ''
+    advice: str = 'check the IMU axes'
+    signs: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
+    gyro: float = 1.0
+    share: float = SHARE
+    lever_arm_std: float = 0.0
+    gnss_delay_std: float = 0.0
+    gyro_bias_std: float = 0.0
+    accel_bias_std: float = 0.0
+    prior: float = 0.0
+
+    @property
+    def wrong(self) -> bool:
+        """Whether it must not be aligned with."""
+        return bool(self.better)
+
+
+CONFIGURED = Rival()
+LEVELS = (Rival(gyro=3.0, prior=-5.5), Rival(gyro=10.0, prior=-11.0))
+SIGNS = (
+    Rival('the accelerations reversed (sign of gravity instead of specific force?)',
+          signs=(1.0, 1.0, 1.0, -1.0)),
+    Rival('the angular rates reversed', signs=(-1.0, -1.0, -1.0, 1.0)),
+    Rival('one IMU axis reversed (left-handed axes?)', signs=(-1.0, -1.0, -1.0, -1.0)),
+    Rival('the angular rate about x reversed', signs=(-1.0, 1.0, 1.0, 1.0)),
+    Rival('the angular rate about y reversed', signs=(1.0, -1.0, 1.0, 1.0)),
+    Rival('the angular rate about z reversed', signs=(1.0, 1.0, -1.0, 1.0)))
+# What is configured as known better than a sigma is doubted: the parameter, the sigma (SI), and
+# what else it may be.
+TOLD = (
+    ('lever_arm_std', 0.3, Rival(
+        'a lever arm of [{lever}] m',
+        'check lever_arm (its signs, the axes of the IMU), or raise lever_arm_std',
+        lever_arm_std=2.0)),
+    ('gnss_delay_std', 0.03, Rival(
+        'GNSS stamps that are {delay:.2f} s late',
+        'check the clocks, set gnss_delay, or raise gnss_delay_std', gnss_delay_std=0.1)),
+    ('gyro_bias_std', 0.3 * PRESETS['mems'].gyro_bias_std, Rival(
+        'biases of [{gyro}] deg/s and [{accel}] m/s^2, more than the grade of the IMU expects',
+        'set imu_grade, or raise gyro_bias_std and accel_bias_std',
+        gyro_bias_std=PRESETS['mems'].gyro_bias_std,
+        accel_bias_std=PRESETS['mems'].accel_bias_std)))
+
+
+def rivals_of(config: Config) -> tuple[Rival, ...]:
+    """Return the rivals of a configuration, which itself comes first."""
+    stated = vars(config) | config.imu_noise._asdict()
+    told = tuple(rival for name, std, rival in TOLD if stated[name] < std)
+    return (CONFIGURED, *LEVELS, *(() if config.trust_imu_axes else SIGNS), *told)
+
+
+@dataclass
+class Parameters:
+    """
+    What is known of the body's parameters before the data, under a rival.
+
+    Attributes
+    ----------
+    x : ndarray, shape (m,)
+    P : ndarray, shape (m, m)
+    walk : ndarray, shape (m,)
+        What a second adds to the diagonal of P.
+
+    """
+
+    x: Array
+    P: Array
+    walk: Array
+
+    @staticmethod
+    def of(config: Config, rival: Rival, force: Array) -> 'Parameters':
+        """
+        Return those of a configuration.
+
+        Parameters
+        ----------
+        config : Config
+        rival : Rival
+        force : ndarray, shape (3,)
+            Specific force, m/s^2, at which all errors of the accelerometers together are as large
+            as their biases are said to be.
+
+        """
+        noise = config.imu_noise
+        size = 12 if noise.gyro_scale_std > 0 else 3
+        accel = GYRO + size
+        x, std, walk = np.zeros((3, GYRO + 2 * size))
+        x[LEVER_ARM] = config.lever_arm
+        std[LEVER_ARM] = max(config.lever_arm_std, rival.lever_arm_std)
+        std[DELAY] = max(config.gnss_delay_std, rival.gnss_delay_std)
+        std[GYRO:GYRO + 3] = max(rival.gyro * noise.gyro_bias_std, rival.gyro_bias_std)
+        std[accel:accel + 3] = accel_std = max(noise.accel_bias_std, rival.accel_bias_std)
+        walk[DELAY] = (DELAY_WANDER * config.gnss_delay_std) ** 2 / WANDER_TIME
+        walk[GYRO:GYRO + 3] = (rival.gyro * noise.rate_random_walk) ** 2
+        walk[accel:accel + 3] = (ACCEL_WANDER * noise.accel_bias_std) ** 2 / WANDER_TIME
+        P = np.diag(std ** 2)
+        if size > 3:
+            matrix = noise.gyro_scale_std * np.where(np.eye(3) > 0, 1.0, GYRO_MISALIGNMENT)
+            P[GYRO + 3:accel, GYRO + 3:accel] = np.diag(matrix.ravel() ** 2)
+            # A force f makes b + M f of bias and matrix, which has the sigma of the bias.
+            scale = ACCEL_ERRORS * noise.gyro_scale_std
+            told = np.eye(12)
+            told[:3, 3:] = -np.kron(np.eye(3), force)
+            sigmas = np.repeat([accel_std, scale], [3, 9])
+            P[accel:, accel:] = told @ np.diag(sigmas ** 2) @ told.T
+        return Parameters(x, P, np.concatenate([np.zeros(FIRST), walk]))
+
+
+def in_words(rival: Rival, x: Array, gnss_delay: float) -> str:
+    """Return a sentence on a rival that the data fit better, with its parameters x."""
+    size = (x.size - GYRO) // 2
+
+    def listed(vector: Array, digits: str) -> str:
+        return ', '.join(format(number, digits) for number in vector.tolist())
+
+    better = rival.better.format(
+        lever=listed(x[LEVER_ARM], '.2f'), delay=gnss_delay + float(x[DELAY]),
+        gyro=listed(np.degrees(x[GYRO:GYRO + 3]), '.2g'),
+        accel=listed(x[GYRO + size:GYRO + size + 3], '.2g'))
+    return f'the data fit better with {better}: {rival.advice}'
+
+
+def log_sum(values: Array) -> float:
+    """Return the log of the sum of exponentials."""
+    largest = float(np.max(values))
+    return largest + math.log(float(np.sum(np.exp(values - largest))))
