@@ -28,7 +28,7 @@ from typing import NamedTuple
 from ins_align.antenna import AntennaEpoch
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimation.filter import (
-    DELAY, Filters, FIRST, GATE, GYRO, Linearised, linearised, PHI, PHI0, RHO, Track, XI)
+    DELAY, Filters, FIRST, GYRO, Linearised, linearised, PHI, PHI0, RHO, Track, XI)
 from ins_align.estimation.rivals import in_words, log_sum, Parameters, rivals_of
 from ins_align.fit import Fit, Innovation, no_fit, NOTHING_NEW
 from ins_align.formula import AttitudeMoments, InertialTrack
@@ -49,14 +49,17 @@ OPEN_VELOCITY, OPEN_POSITION = 1e3, 1e4
 # wrong; levels stay, for what they assume may become true.
 UNLIKELY, HOPELESS, LEAST = 14.0, 25.0, 13.0
 # Means of a rival that agree to so many sigmas are merged.
-ALIKE = 0.5
+ALIKE = 2.0
 # A wrong rival has to be less likely by this (log likelihood) or to give the same attitude, to so
 # many sigmas.
-MARGIN, HARMLESS = 6.0, 2.0
+MARGIN, HARMLESS = 6.0, 1.0
 # The receiver's noise is taken to be larger than stated when innovations are so many times as
 # large in the mean square; it follows at this rate for each epoch, a single epoch counting up to
 # the last.
 LOUD, FOLLOW, CLIP = 2.0, 0.02, 5.0
+# A mean of innovations over some epochs, which forgets this share with each, shows errors that
+# last; so much more than white noise makes of it is chance.
+LASTING, CHANCE = 0.2, 0.5
 # Epochs over which the mean square of innovations is taken, and those it is believed to be 1 for.
 MEMORY, BELIEVED = 300, 30
 # Parameters are linearised anew when the likeliest mean has gone so far from the point: lever arm
@@ -73,6 +76,8 @@ ASTRAY = 10
 RESOLVED_STD = 0.35
 # A start takes so many epochs, fewer leave the formula no redundancy, and waits for no more.
 FIRST_EPOCHS, MAX_WAITING = 4, 64
+# The residuals of the others are so many times smaller without an outlier.
+OUTLYING = 10.0
 
 
 class Learnt(NamedTuple):
@@ -130,8 +135,10 @@ class Bank:
         self._last = epoch                          # the last epoch that was processed
         self._C_nn0 = np.eye(3)
         self._innovation = NOTHING_NEW
-        self._noise = [0.0, 0.0]                    # log factors
-        self._misfit, self._heard = 1.0, BELIEVED
+        # Log of factors on variances: of velocity and position, horizontal and vertical.
+        self._noise = np.zeros((2, 2))
+        self._misfit = self._lasting = 1.0
+        self._heard, self._mean = BELIEVED, np.zeros((2, 3))
         self._in_a_row = 0                          # epochs that were rejected
         self._ahead = 1
         self._wait(epoch, imu)
@@ -247,20 +254,22 @@ class Bank:
         for kind, present in enumerate(track.present[k]):
             if not present:
                 continue
-            new = filters.update(model, k, kind, track, math.exp(self._noise[kind]))
+            noise = np.exp(0.5 * self._noise[kind, [0, 0, 1]])
+            new = filters.update(model, k, kind, track, noise)
             best = self._best(filters)
             square = float(new.nis[best]) / 3
-            self._hear(kind, square)
+            normalised = new.residual[best] / np.sqrt(np.diagonal(new.covariance[best]))
+            self._hear(kind, square, normalised)
             rejected = not new.taken[best]
             self._rejected[kind] += rejected
             bad |= rejected
             astray |= not new.taken[np.argmax(filters.evidence)]
             if not nis:
-                normalised = new.residual[best] / np.sqrt(np.diagonal(new.covariance[best]))
+                first = normalised
             nis.append(square)
         self._rejected[2] += bad
         self._in_a_row = self._in_a_row + 1 if astray else 0
-        self._innovation = Innovation(sum(nis) / len(nis), normalised)
+        self._innovation = Innovation(sum(nis) / len(nis), first)
         self._select(filters)
 
     def _best(self, filters: Filters) -> int:
@@ -268,12 +277,25 @@ class Bank:
         return int(np.argmax(np.where(self._wrong[filters.ids], -np.inf,
                                       filters.evidence + self._prior[filters.ids])))
 
-    def _hear(self, kind: int, square: float) -> None:
-        """Follow the noise of the receiver."""
-        square = min(square, CLIP)
-        self._noise[kind] = max(self._noise[kind] + FOLLOW * (square - LOUD), 0.0)
+    def _hear(self, kind: int, square: float, normalised: Array) -> None:
+        """Follow the noise of the receiver: how large it is, and how long errors last."""
+        east, north, up = np.square(normalised).tolist()
+        noise = self._noise[kind]
+        noise += FOLLOW * (np.minimum([0.5 * (east + north), up], CLIP) - LOUD)
+        np.maximum(noise, 0.0, out=noise)
         self._heard += 1
-        self._misfit += (square - self._misfit) / min(self._heard, MEMORY)
+        share = 1 / min(self._heard, MEMORY)
+        self._misfit += share * (min(square, CLIP) - self._misfit)
+        # Of large ones the direction counts: they are outliers, or the heading is being found.
+        mean = self._mean[kind]
+        mean += LASTING * (normalised / max(1.0, math.sqrt(square / CLIP)) - mean)
+        long_run = float(mean @ mean) / 3 * (2 - LASTING) / LASTING
+        self._lasting += share * (long_run - self._lasting)
+
+    @property
+    def factor(self) -> float:
+        """Factor on variances: innovations are larger than they should be, or last."""
+        return max(1.0, self._misfit, self._lasting - CHANCE)
 
     def _select(self, filters: Filters) -> None:
         """Drop means and rivals that are unlikely, merge means that agree."""
@@ -357,32 +379,39 @@ class Bank:
                                     for epoch in epochs]))
             a = v + apply(C[1:], cross(imu.omega, np.broadcast_to(lever, imu.omega.shape)))
             covariance = [epoch.velocity_covariance for epoch in epochs]
-        variance = np.array([float(np.trace(matrix)) / 3 for matrix in covariance])
+        # A vertical that is not measured is taken for steady: good enough for a start.
+        variance = np.array([min(float(np.trace(matrix)) / 3, float(np.trace(matrix[:2, :2])))
+                             for matrix in covariance])
         places = np.flatnonzero(use)
-        while len(places) >= FIRST_EPOCHS + kind:
-            solved = _solved(s, a, time, places, kind)
+        while True:
+            C, residual, moments = _solved(s, a, time, places, kind)
             usual = float(np.mean(variance[places]))
-            values, vectors = np.linalg.eigh(solved[2])
-            if values[-1] < START_RATIO ** 2 * usual:
+            noise = residual / (3 * (len(places) - 2 - kind) * usual)
+            values, vectors = np.linalg.eigh(moments)
+            if values[-1] < START_RATIO ** 2 * usual * max(noise, 1.0):
                 return None
-            if solved[1] < GATE * usual * (len(places) - 1):
-                for k in np.setdiff1d(np.flatnonzero(use), places):
-                    self._leave_out(int(k), kind)
-                if not use[places[0]] or places[0] > 0:
-                    self._begin_later()
-                    return self._rough_attitude()
-                return solved[0], vectors[:, -1]
-            # One of them may be an outlier: without which do the others agree best?
+            if noise < LOUD or len(places) <= FIRST_EPOCHS + kind:
+                break
+            # If one of them is an outlier, the others agree much better without it.
             left = [_solved(s, a, time, np.delete(places, i), kind)[1]
                     for i in range(len(places))]
+            if min(left) > residual / OUTLYING:
+                break
             places = np.delete(places, int(np.argmin(left)))
-        return None
+        self._noise[kind] = math.log(noise) if noise > LOUD else 0.0
+        for k in np.setdiff1d(np.flatnonzero(use), places).tolist():
+            self._leave_out(k, kind)
+        if places[0] > 0:
+            self._begin_later()
+            return self._rough_attitude()
+        return C, vectors[:, -1]
 
     def _leave_out(self, k: int, kind: int) -> None:
         """Forget what was measured at an epoch that waits."""
         epoch, imu = self._waiting[k]
         changes = {'position_measured': False} if kind else {'v_n': None}
         self._waiting[k] = replace(epoch, **changes), imu
+        self._offered += 1
         self._rejected[kind] += 1
         self._rejected[2] += 1
 
@@ -459,22 +488,24 @@ class Bank:
         if self._filters is None:
             return None
         C, P = self._mixture(self._filters.C0, PHI0)
-        return C, max(1.0, self._misfit) * P
+        return C, self.factor * P
 
     def current(self) -> tuple[Array, Array] | None:
         if self._filters is None:
             return None
         C, P = self._mixture(self._filters.C, PHI)
         return (self._C_nn0 @ C,
-                max(1.0, self._misfit) * self._C_nn0 @ P @ self._C_nn0.T)
+                self.factor * self._C_nn0 @ P @ self._C_nn0.T)
 
     def fit(self) -> Fit:
         if self._filters is None:
             return no_fit(self._offered, self._config.gnss_delay)
         x, _ = self._body()
         rows = 3 * (self._offered - self._rejected[2])
+        words, contradicted = self.rival()
         return Fit(rows * self._misfit, rows, self._innovation, True, *self._rejected,
-                   self._offered, self._config.gnss_delay + float(x[DELAY]))
+                   self._offered, self._config.gnss_delay + float(x[DELAY]),
+                   objection=words if contradicted else '')
 
     def settle(self):
         pass
@@ -496,13 +527,24 @@ class Bank:
         ahead = np.where(wrong, evidence - log_sum(evidence[~wrong]), -np.inf)
         return np.asarray(ahead / max(self._misfit, 1.0))
 
-    def unconfirmed(self) -> str:
-        """Return why a heading is not to be declared yet, in words, or ''."""
+    def rival(self) -> tuple[str, bool]:
+        """
+        Hear the rivals that are wrong.
+
+        Returns
+        -------
+        words : str
+            Why a heading is not to be declared, or ''.
+        contradicted : bool
+            Whether the data fit better with one of them.
+
+        """
         filters = self._filters
-        assert filters is not None
+        if filters is None:
+            return '', False
         ahead = self._ahead_of(filters)
         if not np.any(ahead > -MARGIN):
-            return ''
+            return '', False
         harm = np.zeros(len(ahead))
         for C, block in ((filters.C, PHI), (filters.C0, PHI0)):
             mean, P = self._mixture(C, block)
@@ -510,10 +552,13 @@ class Bank:
             harm = np.maximum(harm, np.abs(away).max(axis=1))
         worst = int(np.argmax(np.where(harm > HARMLESS, ahead, -np.inf)))
         if harm[worst] <= HARMLESS or ahead[worst] <= -MARGIN:
-            return ''
+            return '', False
         if ahead[worst] > MARGIN:
-            return self._words(filters, worst)
-        return 'the signs of the IMU axes are not confirmed by the motion yet: turn'
+            return self._words(filters, worst), True
+        return 'the signs of the IMU axes are not confirmed by the motion yet: turn', False
+
+    def unconfirmed(self) -> str:
+        return self.rival()[0]
 
     def _words(self, filters: Filters, rival: int) -> str:
         return in_words(self._rivals[filters.ids[rival]], filters.x[filters.lead[rival]],

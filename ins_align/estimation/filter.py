@@ -316,7 +316,7 @@ class Filters:
         self.feigned = T @ self.feigned @ T.swapaxes(1, 2) + Q[:, XI, XI]
 
     def update(self, model: Linearised, k: int, kind: int, track: Track,
-               noise: float) -> 'Innovation':
+               noise: Array) -> 'Innovation':
         """
         Take the velocity (kind 0) or the position (1) of epoch k.
 
@@ -325,36 +325,34 @@ class Filters:
         model : Linearised
         k, kind : int
         track : Track
-        noise : float
-            Factor on the covariance that the receiver states.
+        noise : ndarray, shape (3,)
+            Factors on the sigmas that the receiver states, east, north and up.
 
         """
-        q, lead = self.place, self.lead
+        q, lead, C = self.place, self.lead, self.C
         H = model.H[k, kind]
-        C_lead = self.C[lead]
         PH = self.P @ H.swapaxes(1, 2)
-        S = H @ PH + noise * (C_lead.swapaxes(1, 2) @ track.covariance[k, kind] @ C_lead)
+        # What the receiver states is about axes of n0, which the means see in different ways.
+        stated = C.swapaxes(1, 2) @ (track.covariance[k, kind] * noise * noise[:, None]) @ C
+        S = (H @ PH)[q] + stated
         inverse = np.linalg.inv(S)
-        gain = PH @ inverse
         missing = track.s[k, kind] - (self.w if kind else self.u)
-        innovation = (apply(self.C.swapaxes(1, 2), missing) + model.expected[k, kind][q]
+        innovation = (apply(C.swapaxes(1, 2), missing) + model.expected[k, kind][q]
                       - apply(H[q][..., FIRST:], self.x - model.point[q]))
-        weighted = apply(inverse[q], innovation)
+        weighted = apply(inverse, innovation)
         nis = np.sum(innovation * weighted, axis=1)
         good = nis < GATE
         # By the means before the measurement, which an outlier must not choose.
-        share = np.exp(self.weight)
-        taken = np.bincount(q, share * good, len(self.ids)) > 0.5
-        log_likelihood = -0.5 * (np.minimum(nis, GATE) + np.log(np.linalg.det(S))[q])
-        self._weigh(log_likelihood)
-        result = Innovation(nis[lead], apply(C_lead, innovation[lead]), C_lead @ S
-                            @ C_lead.swapaxes(1, 2), taken)
-        if not taken.all():
-            gain, good = gain * taken[:, None, None], good & taken[q]
+        taken = np.bincount(q, np.exp(self.weight) * good, len(self.ids)) > 0.5
+        C_lead, S_lead, inverse = C[lead], S[lead], inverse[lead]
+        result = Innovation(nis[lead], apply(C_lead, innovation[lead]),
+                            C_lead @ S_lead @ C_lead.swapaxes(1, 2), taken)
+        self._weigh(-0.5 * (np.minimum(nis, GATE) + np.log(np.linalg.det(S))))
+        gain = (PH @ inverse) * taken[:, None, None]
         self.P = self.P - gain @ PH.swapaxes(1, 2)
         if kind == 0:
             self._forget_feigned(gain, inverse, C_lead[:, 2])
-        self._move(apply(gain[q], innovation) * good[:, None])
+        self._move(apply(PH[q], weighted) * (good & taken[q])[:, None])
         return result
 
     def _weigh(self, log_likelihood: Array) -> None:

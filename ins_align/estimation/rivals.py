@@ -98,15 +98,16 @@ TOLD = (
     ('lever_arm_std', 0.3, Rival(
         'a lever arm of [{lever}] m',
         'check lever_arm (its signs, the axes of the IMU), or raise lever_arm_std',
-        lever_arm_std=2.0)),
+        lever_arm_std=2.0, prior=-6.0)),
     ('gnss_delay_std', 0.03, Rival(
         'GNSS stamps that are {delay:.2f} s late',
-        'check the clocks, set gnss_delay, or raise gnss_delay_std', gnss_delay_std=0.1)),
+        'check the clocks, set gnss_delay, or raise gnss_delay_std', gnss_delay_std=0.1,
+        prior=-6.0)),
     ('gyro_bias_std', 0.3 * PRESETS['mems'].gyro_bias_std, Rival(
         'biases of [{gyro}] deg/s and [{accel}] m/s^2, more than the grade of the IMU expects',
         'set imu_grade, or raise gyro_bias_std and accel_bias_std',
         gyro_bias_std=PRESETS['mems'].gyro_bias_std,
-        accel_bias_std=PRESETS['mems'].accel_bias_std)))
+        accel_bias_std=PRESETS['mems'].accel_bias_std, prior=-6.0)))
 
 
 def rivals_of(config: Config) -> tuple[Rival, ...]:
