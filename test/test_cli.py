@@ -30,7 +30,7 @@ import termios
 from ins_align.cli import _labels, main, SCENARIOS
 from ins_align.trajectory import trajectory_of
 import pytest
-from recordings import FIX, IMU, real_recording, TWIST, write_recording
+from recordings import FIX, IMU, messages_of, real_recording, TWIST, write_recording
 
 COMMAND = [sys.executable, '-m', 'ins_align.cli']
 
@@ -386,11 +386,11 @@ def test_what_to_install(tmp_path, capsys, monkeypatch, module, package):
 
 
 def test_simulate_passes_its_options_on(tmp_path, capsys):
-    from ins_align.bags import Bag
+    from ins_align.recordings.bag import Bag
     assert main(['simulate', str(tmp_path / 'a'), '--duration', '10', '--imu-rate', '50',
                  '--gnss-rate', '2', '--outage', '2', '8', '--storage', 'sqlite3']) == 0
     with Bag(tmp_path / 'a') as bag:
-        names = [topic.name for topic, _, _ in bag.messages(bag.topics)]
+        names = [topic.name for topic, _, _ in messages_of(bag)]
     assert names.count('/imu/data_raw') in (500, 501)
     assert names.count('/fix') == 8
 
