@@ -131,7 +131,8 @@ def test_files_that_metadata_lists(recordings, tmp_path):
     assert by_bag(path) == (recordings['mcap'][1], ['mcap.mcap is empty'])
 
 
-@pytest.mark.parametrize('name', ('a b', 'a?mode=rw.db3', 'a#b.db3', '50%25.db3', "a'b.db3"))
+@pytest.mark.parametrize('name', (
+    'a b', 'a?mode=rw.db3', 'a#b.db3', '50%25.db3', "a'b.db3", 'ü.db3', 'a\udcff.db3'))
 def test_a_database_may_have_any_name(recordings, tmp_path, name):
     path, expected = recordings['sqlite3']
     shutil.copy(storage_file(path), tmp_path / name)

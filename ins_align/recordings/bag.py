@@ -42,6 +42,8 @@ SQLITE_MAGIC, ROSBAG1_MAGIC = b'SQLite format 3\x00', b'#ROSBAG V'
 STORAGE_NAME = re.compile(r'\.(mcap|db3|bag)(\.zstd)?$')  # of the files of a recording
 LISTED_NAME = re.compile(  # of such a file, in a line of metadata.yaml
     rb'(?m)^[ \t]*-[ \t]+["\']?([^\s:][^:\n]*?\.(?:mcap|db3)(?:\.zstd)?)["\']?[ \t]*\r?$')
+# Of a database that rosbags can open: it is put into a URI as it is.
+DATABASE_PATH = re.compile(r'[\w/. ~+=@,-]*\.db3', re.ASCII)
 # What may mend a file that rosbags cannot open.
 COMMANDS = {'.bag': 'rosbag reindex {0}', '.mcap': 'mcap recover {0} -o mended.mcap',
             '.db3': 'sqlite3 {0} .recover | sqlite3 mended.db3'}
@@ -272,7 +274,7 @@ class Bag:
         if log.exists() and log.stat().st_size:
             self.warn(f'{log.name} holds messages that are not read: sqlite3 {path.name} '
                       "'PRAGMA wal_checkpoint' puts them into the recording")
-        if path.suffix != '.db3' or set('?#%') & set(str(path)):  # which rosbags cannot open
+        if not DATABASE_PATH.fullmatch(str(path)):
             link = Path(stack.enter_context(TemporaryDirectory()), 'recording.db3')
             link.symlink_to(path.resolve())
             path = link
