@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import lru_cache
 from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
@@ -117,6 +118,7 @@ class Refused(NamedTuple):
 
 
 Columns = TypeVar('Columns', ImuSamples, Orientations)
+Key = TypeVar('Key', int, str)
 
 
 def joined(parts: Sequence[Columns]) -> Columns:
@@ -141,27 +143,37 @@ def _decode(messages: Sequence[bytes], encoding: str, *names: str) -> list[np.nd
     columns = [np.zeros(count, np.int64), *(np.zeros((count, IMU_FIELDS[name][1]))
                                             for name in names)]
     decoded = np.zeros(count, bool)
-    for length in set(map(len, messages)):
+    alike = _places_by(list(map(len, messages)))
+    for length, places in alike.items():
         start = length - 8 * IMU_NUMBERS
         if start < HEADER_BYTES:
             continue
-        alike = [data for data in messages if len(data) == length]
+        data = b''.join([messages[place] for place in places])
         for order, mark in BYTE_ORDERS[encoding].items():
-            rows = np.frombuffer(b''.join(alike), _layout(length, order, len(mark), names))
+            rows = np.frombuffer(data, _layout(length, order, len(mark), names))
             end = HEADER_BYTES + rows['frame_length'].astype(np.int64)
             if encoding == 'cdr':  # numbers of eight bytes are aligned, counted from byte 4
                 end += -(end - 4) % 8
             good = (end == start) & (rows['mark'] == np.void(mark) if mark else True)
             stamps = rows['sec'].astype(np.int64) * 1_000_000_000 + rows['nanosec']
             found = [stamps, *(rows[name].astype(float) for name in names)]
-            if len(alike) == count and good.all():  # as usual: nothing has to be sorted out
+            if len(alike) == 1 and good.all():  # as usual: nothing has to be sorted out
                 return [*found, good]
-            places = np.array([place for place, data in enumerate(messages)
-                               if len(data) == length])[good]
-            decoded[places] = True
+            chosen = np.array(places)[good]
+            decoded[chosen] = True
             for column, values in zip(columns, found):
-                column[places] = values[good]
+                column[chosen] = values[good]
     return [column[decoded] for column in columns] + [decoded]
+
+
+def _places_by(keys: Sequence[Key]) -> dict[Key, Sequence[int]]:
+    """Return where each key is."""
+    if len(set(keys)) == 1:  # as usual
+        return {keys[0]: range(len(keys))}
+    places: dict[Key, list[int]] = {}
+    for place, key in enumerate(keys):
+        places.setdefault(key, []).append(place)
+    return {**places}
 
 
 @lru_cache(maxsize=64)
@@ -209,15 +221,12 @@ def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config,
     read = attrgetter('header.stamp.sec', 'header.stamp.nanosec',
                       *f'{values} {more} {covariance}'.split())
     decoded: list[Fix | Velocity | Refused] = [Refused(f'{kind}_undecodable')] * len(messages)
-    rows: dict[Any, list[Any]] = {}  # by frame: that of a velocity
+    rows: list[tuple[Any, ...]] = []
     for place, data in enumerate(messages):
-        try:
-            row = place, *read(deserialize(data, topic))
-        except MessageError:
-            continue
-        rows.setdefault(row[6] if kind == 'velocity' else None, []).append(row)
-    for frame, alike in rows.items():
-        places, seconds, nanoseconds, x, y, z, *rest = zip(*alike)
+        with suppress(MessageError):
+            rows.append((place, *read(deserialize(data, topic))))
+    for frame, alike in _places_by([row[6] if kind == 'velocity' else '' for row in rows]).items():
+        places, seconds, nanoseconds, x, y, z, *rest = zip(*(rows[place] for place in alike))
         stamps = np.array(seconds) * 1_000_000_000 + np.array(nanoseconds)
         numbers = np.array([x, y, z], float).T
         covariances = np.array(rest[-1]) if covariance else None
