@@ -21,7 +21,7 @@ import struct
 from hypothesis import given, settings, strategies as st
 from ins_align.config import Config
 from ins_align.messages import fix_from_msg, imu_from_msg, MessageError, velocity_from_msg
-from ins_align.recordings import BagError, Topic
+from ins_align.recordings import bag as bags, BagError, Topic
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import (
     decode_gnss, decode_imu, decode_orientations, deserialize, GNSS_TYPES, Refused)
@@ -258,6 +258,12 @@ def test_index_of_a_ros1_file_that_counts_a_part_many_times(copy):
     path, _ = copy('ros1', edit)
     with pytest.raises(BagError, match='index larger.*rosbag reindex'):
         Bag(path)
+
+
+def test_ros1_file_that_is_unpacked_time_and_again(recordings, monkeypatch):
+    monkeypatch.setattr(bags, 'MAX_PASSES', 0)
+    with pytest.raises(BagError, match='time and again'):
+        by_bag(recordings['ros1 lz4'][0])
 
 
 def test_too_many_topics(tmp_path):
