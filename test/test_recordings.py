@@ -141,6 +141,17 @@ def test_a_database_may_have_any_name(recordings, tmp_path, name):
     assert records == expected and 'PRAGMA wal_checkpoint' in warning
 
 
+def test_rows_of_a_database_that_are_no_messages(copy):
+    path, expected = copy('sqlite3')
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("UPDATE messages SET data = 'text' WHERE id % 7 = 0")
+        database.execute('UPDATE messages SET data = 0.5 WHERE id % 11 = 0')
+        database.commit()
+    records, _ = by_bag(path)
+    assert [record[:2] for record in records] == [record[:2] for record in expected]
+    assert {data for _, _, data in records} - {data for _, _, data in expected} == {b''}
+
+
 # Cut off, damaged, hostile
 
 @pytest.mark.parametrize('kind', ['mcap', 'mcap chunks', 'mcap messages', 'mcap file'])

@@ -356,13 +356,15 @@ class _Rosbag1Reader(rosbag1.Reader):
             raise ValueError('index larger than the file')
 
 
-def _short(records: Iterable[tuple[Any, int, bytes]]) -> Iterator[tuple[Any, int, bytes]]:
-    """Let messages pass until one is too long."""
-    for record in records:
-        if len(record[2]) > MAX_MESSAGE_BYTES:
-            raise BagError(f'has a message of {len(record[2])} bytes or more on '
-                           f'{record[0].topic}, where {MAX_MESSAGE_BYTES} are allowed')
-        yield record
+def _short(records: Iterable[tuple[Any, int, Any]]) -> Iterator[tuple[Any, int, bytes]]:
+    """Let messages pass until one is too long; a database may hold what is none."""
+    for connection, time_ns, data in records:
+        if type(data) is not bytes:
+            data = b''
+        elif len(data) > MAX_MESSAGE_BYTES:
+            raise BagError(f'has a message of {len(data)} bytes or more on {connection.topic}, '
+                           f'where {MAX_MESSAGE_BYTES} are allowed')
+        yield connection, time_ns, data
 
 
 def _without_compression(messages: list[bytes]) -> list[bytes]:

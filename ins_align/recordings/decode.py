@@ -42,26 +42,12 @@ BYTE_ORDERS = {'cdr': {'<': b'\x00\x01', '>': b'\x00\x00'}, 'ros1': {'<': b''}}
 
 
 class GnssFields(NamedTuple):
-    """
-    Where a GNSS message has what an alignment reads, as paths of attributes.
+    """Where a GNSS message has what an alignment reads, as paths of attributes."""
 
-    Attributes
-    ----------
-    kind : str
-        ``fix`` or ``velocity``: how it is counted.
-    values : str
-        Paths of three numbers: latitude and longitude, degrees, and altitude, m; or x, y, z, m/s.
-    covariance : str
-        Path of (9,), m^2, or of that of a twist, (36,), m^2/s^2; '': there is none.
-    more : str
-        Of a fix the type of its covariance and its status, of a velocity the name of its frame.
-
-    """
-
-    kind: str
-    values: str
-    covariance: str
-    more: str
+    kind: str  # fix or velocity
+    values: str  # latitude and longitude, degrees, and altitude, m; or x, y, z, m/s
+    covariance: str  # (9,), m^2, or that of a twist, (36,), m^2/s^2; '': there is none
+    more: str  # of a fix the type of its covariance and its status, of a velocity its frame
 
 
 GNSS_TYPES = {
@@ -195,15 +181,7 @@ def _typestore(encoding: str) -> Any:
 
 
 def deserialize(data: bytes, topic: Topic) -> Any:
-    """
-    Deserialise one message with rosbags.
-
-    Raises
-    ------
-    MessageError
-        If the bytes are no message of the topic's type.
-
-    """
+    """Deserialise one message with rosbags; a MessageError says that the bytes are none."""
     store = _typestore(topic.encoding)
     try:
         if topic.encoding == 'ros1':

@@ -35,6 +35,7 @@ FIX_TYPES, VELOCITY_TYPES = ([name for name, fields in GNSS_TYPES.items() if fie
                              for kind in ('fix', 'velocity'))
 REFERENCE_NAMESPACE = '/reference/'
 REFERENCE_TOPIC = '/reference/imu'  # truth or the best that is known: to compare with, never input
+OPTIONS = {'IMU': '--imu-topic', 'position': '--fix-topic', 'velocity': '--velocity-topic'}
 LISTED_TOPICS = 20  # in an error
 
 
@@ -179,30 +180,28 @@ def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | N
         the option that chooses one.
 
     """
-    imu_topic = _required(bag, 'IMU', '--imu-topic', [IMU_TYPE], imu)
-    fix_topic = _required(bag, 'position', '--fix-topic', FIX_TYPES, fix)
+    imu_topic = _required(bag, 'IMU', [IMU_TYPE], imu)
+    fix_topic = _required(bag, 'position', FIX_TYPES, fix)
     velocity_topic = None
-    option = 'velocity', '--velocity-topic'
     if velocity is not None:
-        velocity_topic = _named(bag, *option, VELOCITY_TYPES, velocity)
+        velocity_topic = _named(bag, 'velocity', VELOCITY_TYPES, velocity)
         _measures(bag, velocity_topic)  # for the warning: it is read as the user wishes
     elif config.use_velocity is not False:
         preferred = [name for name in VELOCITY_TYPES if _short(name) == config.velocity_type]
         others = [name for name in VELOCITY_TYPES if name not in preferred]
-        velocity_topic = _only(bag, *option, preferred)
+        velocity_topic = _only(bag, 'velocity', preferred)
         if velocity_topic is not None:
             _warn_of_others(bag, velocity_topic, others)
         else:
-            velocity_topic = _only(bag, *option, others)
+            velocity_topic = _only(bag, 'velocity', others)
     reference = next((topic for topic in bag.topics if topic.name == REFERENCE_TOPIC
                       and topic.msgtype == IMU_TYPE), None)
     return Topics(imu_topic, fix_topic, velocity_topic,
                   None if velocity_topic is None else _short(velocity_topic.msgtype), reference)
 
 
-def _required(bag: Bag, what: str, option: str, types: list[str], name: str | None) -> Topic:
-    topic = (_only(bag, what, option, types) if name is None
-             else _named(bag, what, option, types, name))
+def _required(bag: Bag, what: str, types: list[str], name: str | None) -> Topic:
+    topic = _only(bag, what, types) if name is None else _named(bag, what, types, name)
     if topic is None:
         raise BagError(f'{bag.path} has no {what} topic ({_in_words(types)}); {_listing(bag)}')
     return topic
@@ -213,7 +212,7 @@ def _candidates(bag: Bag, types: list[str]) -> list[Topic]:
             and REFERENCE_NAMESPACE not in topic.name]
 
 
-def _only(bag: Bag, what: str, option: str, types: list[str]) -> Topic | None:
+def _only(bag: Bag, what: str, types: list[str]) -> Topic | None:
     """Return the one topic of some types; where there are more the one that measures."""
     candidates = _candidates(bag, types)
     if what == 'velocity' or len(candidates) > 1:
@@ -221,20 +220,20 @@ def _only(bag: Bag, what: str, option: str, types: list[str]) -> Topic | None:
     if len(candidates) > 1:
         names = ', '.join(sorted(topic.name for topic in candidates))
         raise BagError(f'{bag.path} has more than one {what} topic ({names}): '
-                       f'choose one with {option}')
+                       f'choose one with {OPTIONS[what]}')
     return candidates[0] if candidates else None
 
 
-def _named(bag: Bag, what: str, option: str, types: list[str], name: str) -> Topic:
+def _named(bag: Bag, what: str, types: list[str], name: str) -> Topic:
     full_name = '/' + name.strip('/')
     if REFERENCE_NAMESPACE in full_name:
-        raise BagError(f'{option} {full_name} is a reference to compare with: '
+        raise BagError(f'{OPTIONS[what]} {full_name} is a reference to compare with: '
                        'an alignment must not read it')
     topic = next((topic for topic in bag.topics if topic.name == full_name), None)
     if topic is None:
         raise BagError(f'{bag.path} has no topic {full_name}; {_listing(bag)}')
     if topic.msgtype not in types:
-        raise BagError(f'{option} {full_name} is of type {_in_words([topic.msgtype])}, '
+        raise BagError(f'{OPTIONS[what]} {full_name} is of type {_in_words([topic.msgtype])}, '
                        f'but {what} needs {_in_words(types)}')
     return topic
 
