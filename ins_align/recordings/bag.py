@@ -90,8 +90,11 @@ class Bag:
             with _bag_errors(self.path):
                 self._readers.sort(key=lambda reader: reader.start_time)
                 filled = [reader for reader in self._readers if reader.end_time]
-                self.start_ns = min((reader.start_time for reader in filled), default=None)
-                self.end_ns = max((reader.end_time - 1 for reader in filled), default=None)
+                # Of whatever type and size they are in a file, here they fit into 64 bits.
+                times_ns = np.array([(reader.start_time, reader.end_time - 1)
+                                     for reader in filled], np.int64).reshape(-1, 2)
+                self.start_ns = int(times_ns[:, 0].min()) if filled else None
+                self.end_ns = int(times_ns[:, 1].max()) if filled else None
                 self.topics = self._listed_topics()
             self._stack = stack.pop_all()
 
