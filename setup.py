@@ -19,8 +19,8 @@ from setuptools import find_packages, setup
 package_name = 'ins_align'
 
 # The robot needs numpy and PyYAML (parameter files of replay); ROS brings rclpy and messages.
-replay = ['rosbags>=0.10.11', 'backports.zstd; python_version < "3.14"', 'lz4', 'tqdm']
-simulation = ['python-ins>=1.0', 'rosbags>=0.10.11', 'scipy>=1.11']
+replay = ['rosbags>=0.11', 'backports.zstd; python_version < "3.14"', 'lz4', 'tqdm']
+simulation = ['python-ins>=1.0', 'rosbags>=0.11', 'scipy>=1.11']
 extras = {
     'replay': replay,
     'dask': ['distributed>=2024.1'],

@@ -33,8 +33,8 @@ import threading
 from typing import Any
 
 from ins_align.ahead import ProcessDied
-from ins_align.bag_files import BagError
 from ins_align.config import Config
+from ins_align.recordings import BagError
 from ins_align.replay import replay
 from ins_align.report import plot, save_figure, summary, write_whole
 

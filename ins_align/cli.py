@@ -336,7 +336,7 @@ def _add_experiment(commands: Any) -> None:
 def run_info(arguments: argparse.Namespace) -> int:
     """Run ``ins_align info``."""
     _check_writable(arguments.json, arguments.bags)
-    from ins_align.bag_files import BagError
+    from ins_align.recordings import BagError
     from ins_align.info import describe, inspect
 
     several = len(arguments.bags) > 1
@@ -412,7 +412,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
 
 def _of(bag: str, text: str) -> str:
     """Let a sentence on a recording begin with the path as it was given."""
-    from ins_align.bag_files import one_line
+    from ins_align.recordings import one_line
 
     path = Path(bag)
     name, last = one_line(str(path)), one_line(path.name)
@@ -508,7 +508,7 @@ def _check_writable(path: str | None, inputs: Sequence[str]) -> None:
 
 def _spoilt(target: Path, inputs: Sequence[str]) -> str:
     """Say what would be lost if something were written there; both without links."""
-    from ins_align.bags import begins_like_a_recording, STORAGE_NAME
+    from ins_align.recordings.bag import begins_like_a_recording, STORAGE_NAME
 
     if str(target) in inputs:
         return 'it is to be read'

@@ -22,11 +22,11 @@ from collections.abc import Sequence
 import struct
 from typing import NamedTuple
 
-from ins_align.decoding import body_start
 from ins_align.messages import imu_from_msg
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu
 
+_CDR_LITTLE_ENDIAN = b'\x00\x01'  # OMG DDSI-RTPS 2.3, 10.2: encapsulation of plain CDR
 _STAMP = struct.Struct('<iI')  # behind the encapsulation
 _STAMP_OFFSET = 4
 _FRAME_OFFSET = 16
@@ -35,6 +35,7 @@ _ORIENTATION = struct.Struct('<13d')
 _VECTOR = struct.Struct('<3d')
 _RATE_OFFSET = 8 * 13
 _FORCE_OFFSET = 8 * 25
+_BODY_BYTES = 8 * 37
 
 _NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0, -1.0) + (0.0,) * 8  # as sensor_msgs/Imu marks it
 
@@ -48,9 +49,23 @@ class ImuSample(NamedTuple):
     frame_id: str
 
 
+def body_start(data: bytes) -> int | None:
+    """
+    Return where the numbers of a sensor_msgs/Imu start, behind its header.
+
+    None: this is not the known layout, by its encapsulation or because header and numbers do not
+    add up to its length.
+    """
+    frame_length = int.from_bytes(data[_FRAME_OFFSET - 4:_FRAME_OFFSET], 'little')
+    start = _FRAME_OFFSET + frame_length
+    start += -(start - 4) % 8  # numbers of eight bytes are aligned behind the encapsulation
+    known = data[:2] == _CDR_LITTLE_ENDIAN and len(data) == start + _BODY_BYTES
+    return start if known else None
+
+
 def read_imu(data: bytes) -> ImuSample:
     """Read one serialised sensor_msgs/Imu; its orientation is not looked at."""
-    start = body_start(data, 'cdr')
+    start = body_start(data)
     if start is None:  # a middleware with another serialisation
         msg = deserialize_message(data, Imu)
         stamp_ns, gyro, accel = imu_from_msg(msg)
@@ -81,7 +96,7 @@ def with_orientation(data: bytes, quaternion_xyzw: Sequence[float] | None = None
     orientation: tuple[float, ...] = _NO_ORIENTATION
     if quaternion_xyzw is not None and covariance is not None:
         orientation = (*quaternion_xyzw, *covariance)
-    start = body_start(data, 'cdr')
+    start = body_start(data)
     if start is None:
         msg = deserialize_message(data, Imu)
         turn = msg.orientation

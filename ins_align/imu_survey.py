@@ -19,10 +19,10 @@ from dataclasses import dataclass
 import math
 
 from ins_align.config import PRESETS
-from ins_align.decoding import ImuSamples
 from ins_align.earth import EARTH_RATE
 from ins_align.motion_survey import GRID, Series
 from ins_align.plausibility import FORCE_RANGE, RangeCheck
+from ins_align.recordings.decode import ImuSamples
 from ins_align.rotation import Array
 import numpy as np
 

@@ -23,16 +23,17 @@ import os
 import shlex
 from typing import Any
 
-from ins_align.bag_files import BagError
-from ins_align.bags import Bag
 from ins_align.buffers import MAX_AHEAD_NS, MAX_GAP_NS
 from ins_align.config import Config, config_from_mapping, parse_override
-from ins_align.decoding import ImuSamples
 from ins_align.earth import normal_gravity
 from ins_align.imu_survey import ImuFacts, survey_imu
 from ins_align.motion_survey import (
     find_manoeuvres, MANOEUVRE_SPEED, MANOEUVRE_TIME, Manoeuvres, on_grid, Series, track,
     velocity_frame, velocity_from_positions, VelocityFrame, WEAK_SPEED, without_wild_positions)
+from ins_align.recordings import BagError
+from ins_align.recordings.bag import Bag
+from ins_align.recordings.decode import ImuSamples
+from ins_align.recordings.reader import choose_topics
 from ins_align.report import format_table
 from ins_align.topic_survey import KINDS, MAX_ASTRAY, read_candidates, Recorded, Timing
 import numpy as np
@@ -346,7 +347,7 @@ class _Survey:
             arguments += ['--set', setting]
         config = config_from_mapping(dict(map(parse_override, self._settings)))
         try:
-            self._bag.choose_topics(config, names['imu'], names['fix'], names['velocity'])
+            choose_topics(self._bag, config, names['imu'], names['fix'], names['velocity'])
         except BagError as error:
             self._obstacles.append(str(error))
         return None if self._obstacles else shlex.join(arguments)

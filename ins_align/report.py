@@ -24,7 +24,7 @@ from pathlib import Path
 import sys
 from typing import Any, IO, TYPE_CHECKING
 
-from ins_align.bag_files import one_line
+from ins_align.recordings import one_line
 from ins_align.results import Epoch, State
 import numpy as np
 

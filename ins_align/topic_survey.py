@@ -16,17 +16,20 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
 
-from ins_align.bag_files import BagError, Messages, Topic
-from ins_align.bags import Bag, FIX_TYPE, IMU_TYPE, REFERENCE_NAMESPACE, VELOCITY_TYPES
 from ins_align.buffers import (
     fault_of_fix, MAX_ACCELERATION, MAX_RATE, usable_velocity, with_an_altitude)
 from ins_align.config import Config
-from ins_align.decoding import decode_imu, deserialize
-from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
+from ins_align.messages import Fix, MessageError, Velocity
+from ins_align.recordings import Topic
+from ins_align.recordings.bag import Bag
+from ins_align.recordings.decode import (
+    decode_gnss, decode_imu, deserialize, GNSS_TYPES, IMU_TYPE, Refused)
+from ins_align.recordings.reader import REFERENCE_NAMESPACE
 from ins_align.rotation import Array
 import numpy as np
 
@@ -87,30 +90,25 @@ class Recorded:
         self.refusals: Counter[str] = Counter()  # why messages cannot be used, in words
         self.unmeasured: list[str] = []  # what an IMU says that it does not measure
         self._rows: list[tuple[Any, ...]] = []
-        self._config = Config(velocity_type=topic.msgtype.rsplit('/', 1)[-1]
-                              if kind == 'velocity' else Config.velocity_type)
 
-    def add(self, times_ns: np.ndarray, messages: Messages) -> None:
+    def add(self, times_ns: np.ndarray, messages: Sequence[bytes]) -> None:
         """Decode messages."""
         if self.kind == 'imu':
             if not self._rows:
                 self._look_at(messages[0])
-            samples = decode_imu(messages, self.topic)
+            samples = decode_imu(messages, self.topic.encoding)
             self.undecodable += int(np.count_nonzero(~samples.decoded))
             self._rows.append((times_ns[samples.decoded], samples.stamps_ns,
                                np.hstack([samples.gyro, samples.accel])))
             return
-        for time_ns, data in zip(times_ns.tolist(), messages):
-            try:
-                message = deserialize(data, self.topic)
-            except MessageError:
+        for time_ns, message in zip(times_ns.tolist(),
+                                    decode_gnss(messages, self.topic, Config())):
+            if not isinstance(message, Refused):
+                self._add_gnss(time_ns, message)
+            elif message.why:
+                self.refusals[message.why] += 1
+            else:
                 self.undecodable += 1
-                continue
-            try:
-                self._add_gnss(time_ns, fix_from_msg(message) if self.kind == 'fix'
-                               else velocity_from_msg(message, self._config))
-            except MessageError as error:
-                self.refusals[str(error)] += 1
 
     def finish(self) -> None:
         """Turn what has been added into arrays."""
@@ -221,13 +219,10 @@ def read_candidates(bag: Bag) -> list[Recorded]:
                          if (kind := _kind(topic)) and REFERENCE_NAMESPACE not in topic.name),
                         key=lambda data: (KINDS.index(data.kind), data.topic.name))
     topics = [data.topic for data in candidates]
-    try:
-        for block in bag.blocks(topics) if topics else ():
-            for index in np.unique(block.topics).tolist():
-                chosen = np.flatnonzero(block.topics == index)
-                candidates[index].add(block.times_ns[chosen], block.messages.take(chosen))
-    except OSError as error:
-        raise BagError(f'{bag.path} cannot be read: {error.strerror}') from None
+    for block in bag.blocks(topics):
+        for number, messages in enumerate(block.messages):
+            if messages:
+                candidates[number].add(block.times_ns[block.topics == number], messages)
     for data in candidates:
         data.finish()
     return candidates
@@ -236,6 +231,4 @@ def read_candidates(bag: Bag) -> list[Recorded]:
 def _kind(topic: Topic) -> str:
     if topic.msgtype == IMU_TYPE:
         return 'imu'
-    if topic.msgtype == FIX_TYPE:
-        return 'fix'
-    return 'velocity' if topic.msgtype in VELOCITY_TYPES.values() else ''
+    return GNSS_TYPES[topic.msgtype].kind if topic.msgtype in GNSS_TYPES else ''

@@ -25,14 +25,16 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped, TwistWithCovarianceStamped
-from ins_align.bags import Bag
 from ins_align.config import Config
+from ins_align.recordings.bag import Bag
+from ins_align.recordings.reader import choose_topics
 from ins_align.rotation import log_so3, matrix_from_quaternion
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
+from recordings import messages_of
 from sensor_msgs.msg import Imu, NavSatFix
 
 PLAYER = Path(__file__).with_name('node_player.py')
@@ -179,10 +181,10 @@ def bag_script(path, start_s=0.0, duration_s=float('inf')):
     store = get_typestore(Stores.ROS2_JAZZY)
     script = []
     with Bag(path) as bag:
-        topics = bag.choose_topics(Config())
+        topics = choose_topics(bag, Config())
         wanted = {topic: TOPICS[role] for role, topic in topics._asdict().items()
                   if role in TOPICS and topic is not None}
-        for topic, time_ns, data in bag.messages(list(wanted)):
+        for topic, time_ns, data in messages_of(bag, list(wanted)):
             if not 0.0 <= (time_ns - bag.start_ns) * 1e-9 - start_s < duration_s:
                 continue
             if topic.encoding == 'ros1':

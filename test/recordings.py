@@ -23,6 +23,7 @@ import pytest
 IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
 TWIST = 'geometry_msgs/msg/TwistWithCovarianceStamped'
 START_NS = 1_700_000_000_000_000_000
+MCAP = b'\x89MCAP0\r\n'
 
 FORMATS = ('mcap', 'mcap chunks', 'mcap messages', 'mcap file', 'sqlite3', 'sqlite3 messages',
            'sqlite3 file', 'ros1', 'ros1 lz4', 'ros1 bz2')
@@ -135,6 +136,15 @@ def write_recording(path, kind, duration=4.0, topics=None, seed=0):
     return write_messages(path, kind, messages, topics)
 
 
+def messages_of(bag, topics=None):
+    """Yield topic, recorded time and message of a recording that is open."""
+    topics = bag.topics if topics is None else topics
+    for block in bag.blocks(topics):
+        streams = [iter(messages) for messages in block.messages]
+        for time_ns, number in zip(block.times_ns.tolist(), block.topics.tolist()):
+            yield topics[number], time_ns, next(streams[number])
+
+
 def mcap_record(op, content):
     """Return one record of an mcap file."""
     return struct.pack('<BQ', op, len(content)) + content
@@ -142,3 +152,50 @@ def mcap_record(op, content):
 
 def mcap_string(text):
     return struct.pack('<I', len(text)) + text.encode()
+
+
+def mcap_of(*records, closed=True):
+    """Return an mcap file without an index that describes topics /0 and /1."""
+    described = mcap_record(3, struct.pack('<H', 1) + mcap_string(IMU) + mcap_string('ros2msg')
+                            + mcap_string('definition'))
+    described += b''.join(mcap_record(4, struct.pack('<HH', key, 1) + mcap_string(
+        f'/{key}') + mcap_string('cdr') + mcap_string('')) for key in (0, 1))
+    end = mcap_record(15, bytes(4)) + mcap_record(2, bytes(20)) + MCAP
+    return MCAP + described + b''.join(records) + (end if closed else b'')
+
+
+def mcap_message(channel, time_ns, data):
+    return mcap_record(5, struct.pack('<HIQQ', channel, 0, time_ns, time_ns) + data)
+
+
+def mcap_chunk(data, size=None, compression=''):
+    """Return a chunk that claims a size."""
+    return mcap_record(6, struct.pack('<QQQI', 0, 1 << 40, len(data) if size is None else size, 0)
+                       + mcap_string(compression) + struct.pack('<Q', len(data)) + data)
+
+
+def indexed_mcap(times, data, size, compression=''):
+    """Return a whole mcap file with the same chunk at each of some times (start, end)."""
+    content = MCAP + mcap_record(1, mcap_string('ros2') + mcap_string(''))
+    index = mcap_of(closed=False)[len(MCAP):]
+    for start, end in times:
+        chunk = mcap_chunk(data, size, compression)
+        index += mcap_record(8, struct.pack('<QQQQI', start, end, len(content), len(chunk), 10)
+                             + struct.pack('<HQQ', 0, len(content) + len(chunk), 31)
+                             + mcap_string(compression) + struct.pack('<QQ', len(data), size))
+        content += chunk + mcap_record(7, bytes(22))
+    index += mcap_record(11, struct.pack('<QHIIIIQQI', 1, 1, 2, 0, 0, 1, 0, 1 << 40, 0))
+    footer = mcap_record(2, struct.pack('<QQI', len(content), 0, 0))
+    return content + index + footer + MCAP
+
+
+def ros1_records(content):
+    """Return kind, start and end of each record of a ROS 1 file."""
+    position, records = 13, []
+    while position < len(content):
+        start = position
+        position += 4 + struct.unpack_from('<I', content, position)[0]
+        kind = content[content.index(b'op=', start, position) + 3]
+        position += 4 + struct.unpack_from('<I', content, position)[0]
+        records.append((kind, start, position))
+    return records

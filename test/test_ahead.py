@@ -21,7 +21,7 @@ import sys
 import time
 
 from ins_align.ahead import PIPE_BYTES, ProcessDied, run_ahead
-from ins_align.bag_files import BagError
+from ins_align.recordings import BagError
 import numpy as np
 import pytest
 

@@ -30,7 +30,7 @@ import termios
 from ins_align.cli import _labels, main, SCENARIOS
 from ins_align.trajectory import trajectory_of
 import pytest
-from recordings import FIX, IMU, real_recording, TWIST, write_recording
+from recordings import FIX, IMU, messages_of, real_recording, TWIST, write_recording
 
 COMMAND = [sys.executable, '-m', 'ins_align.cli']
 
@@ -325,13 +325,14 @@ def test_reference_alone_is_no_imu(tmp_path, capsys):
     assert 'no IMU topic' in one_sentence(capsys)
 
 
-@pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
-def test_cut_off_to_nothing(tmp_path, capsys, kind):
+@pytest.mark.parametrize('kind, reason', [
+    ('mcap', 'cut off'), ('sqlite3', '.recover'), ('ros1', 'rosbag reindex a.bag')])
+def test_cut_off_to_nothing(tmp_path, capsys, kind, reason):
     path = write_recording(tmp_path / 'a.bag', kind, 5.0)
     file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix != '.yaml')
     file.write_bytes(file.read_bytes()[:64])
     assert main(['replay', str(path)]) == 2
-    assert 'cut off' in one_sentence(capsys)
+    assert reason in one_sentence(capsys)
 
 
 def test_cut_off_is_used_as_far_as_it_goes(flight, tmp_path, capsys):
@@ -340,8 +341,8 @@ def test_cut_off_is_used_as_far_as_it_goes(flight, tmp_path, capsys):
     status = main(['replay', str(tmp_path / 'cut.mcap'), '--set', 'lever_arm=[1,1,1]'])
     captured = capsys.readouterr()
     assert status == 0
-    assert captured.err == (f'ins_align replay: warning: {tmp_path}/cut.mcap was cut off or not '
-                            'closed: it is read as far as it goes\n')
+    assert captured.err == (f'ins_align replay: warning: {tmp_path}/cut.mcap was cut off or is '
+                            'damaged: it is read as far as it goes\n')
 
 
 @pytest.mark.parametrize('name', ['uav_thor75', 'car_drive0708', 'quad_dot08.bag'])
@@ -386,11 +387,11 @@ def test_what_to_install(tmp_path, capsys, monkeypatch, module, package):
 
 
 def test_simulate_passes_its_options_on(tmp_path, capsys):
-    from ins_align.bags import Bag
+    from ins_align.recordings.bag import Bag
     assert main(['simulate', str(tmp_path / 'a'), '--duration', '10', '--imu-rate', '50',
                  '--gnss-rate', '2', '--outage', '2', '8', '--storage', 'sqlite3']) == 0
     with Bag(tmp_path / 'a') as bag:
-        names = [topic.name for topic, _, _ in bag.messages(bag.topics)]
+        names = [topic.name for topic, _, _ in messages_of(bag)]
     assert names.count('/imu/data_raw') in (500, 501)
     assert names.count('/fix') == 8
 

@@ -41,7 +41,7 @@ def message(frame_id, seconds=1_700_000_000, nanoseconds=999_999_999):
 def way(request, monkeypatch):
     """Take the layout that is known, and one of a middleware with another serialisation."""
     if request.param == 'library':
-        monkeypatch.setattr('ins_align.imu_bytes.body_start', lambda data, encoding: None)
+        monkeypatch.setattr('ins_align.imu_bytes.body_start', lambda data: None)
 
 
 @pytest.mark.parametrize('frame_id', FRAMES)

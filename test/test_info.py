@@ -18,19 +18,20 @@ import json
 import math
 import shlex
 
-from ins_align.bag_files import BagError
-from ins_align.bags import Bag
 from ins_align.cli import main
 from ins_align.config import Config
-from ins_align.decoding import deserialize
 from ins_align.info import describe, inspect
 from ins_align.motion_survey import (
     find_manoeuvres, Series, track, velocity_frame, without_wild_positions)
+from ins_align.recordings import BagError
+from ins_align.recordings.bag import Bag
+from ins_align.recordings.decode import deserialize
 from ins_align.replay import replay
 from ins_align.simulation import simulate, write_bag
 import numpy as np
 import pytest
-from recordings import FIX, IMU, real_recording, TWIST, typestore, write_messages, write_recording
+from recordings import (
+    FIX, IMU, messages_of, real_recording, TWIST, typestore, write_messages, write_recording)
 
 TOPICS = {'/imu/data_raw': IMU, '/fix': FIX, '/fix_velocity': TWIST}
 
@@ -42,7 +43,7 @@ def drive(tmp_path_factory):
     write_bag(simulate('car', seed=1, duration=60.0, stand_still=15.0, imu_grade='tactical'), path)
     with Bag(path) as bag:
         topics = [topic for topic in bag.topics if topic.name in TOPICS]
-        messages = [(topic, time, data) for topic, time, data in bag.messages(topics)]
+        messages = [*messages_of(bag, topics)]
     return path, messages
 
 
@@ -431,10 +432,9 @@ def test_positions_without_an_altitude(changed):
     assert by_name(info, '/fix_velocity').frame.frame == 'enu'
 
 
-@pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
-def test_half_of_a_recording(tmp_path, kind):
-    path = write_recording(tmp_path / 'a', kind, 20.0)
-    file = path if path.is_file() else next(path.glob('a.*'))
+def test_half_of_a_recording(tmp_path):
+    path = write_recording(tmp_path / 'a', 'mcap', 20.0)
+    file, = path.glob('a.*')
     file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
     info = inspect(file)
     assert 'as far as it goes' in info.warnings[0]
@@ -507,7 +507,7 @@ def test_wild_fixes_are_no_manoeuvres(tmp_path):
     with Bag(tmp_path / 'a') as bag:
         topics = [topic for topic in bag.topics if topic.name in ('/imu/data_raw', '/fix')]
         messages = [(topic.name, time, deserialize(data, topic))
-                    for topic, time, data in bag.messages(topics)]
+                    for topic, time, data in messages_of(bag, topics)]
     path = write_messages(tmp_path / 'b', 'mcap', messages, {'/imu/data_raw': IMU, '/fix': FIX})
     assert inspect(path).manoeuvres.starts == ()
 

@@ -123,7 +123,7 @@ def test_no_output_takes_the_place_of_a_recording(standing, tmp_path, capsys, mo
     Path('empty').touch()
     Path('p.yaml').write_text('/**: {ros__parameters: {}}')
     before = {path: path.read_bytes() for path in Path().rglob('*') if path.is_file()}
-    monkeypatch.setattr('ins_align.bags.Bag.__init__', None)  # nothing is read
+    monkeypatch.setattr('ins_align.recordings.bag.Bag.__init__', None)  # nothing is read
     assert main(arguments) == 2
     error = capsys.readouterr().err
     assert reason in error and error.count('\n') == 1

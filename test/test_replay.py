@@ -20,11 +20,10 @@ import re
 import sqlite3
 
 import ins_align
-from ins_align import sqlite_file
 from ins_align.aligner import Aligner, Attitude
-from ins_align.bag_files import BagError
 from ins_align.config import Config
-from ins_align.decoding import Attitudes, Orientations
+from ins_align.recordings import bag, BagError
+from ins_align.recordings.decode import Attitudes, Orientations
 from ins_align.replay import CSV_HEADER, Reference, replay
 from ins_align.rotation import exp_so3, matrix_from_rpy, quaternion_from_matrix
 from ins_align.simulation import feed, simulate, Simulation, write_bag
@@ -68,7 +67,7 @@ def test_same_as_the_messages_without_a_recording(simulation, result):
 
 @pytest.mark.parametrize('block', [1, 7, 1000])
 def test_blocks_do_not_matter(flight, result, monkeypatch, block):
-    monkeypatch.setattr(sqlite_file, 'BLOCK', block)
+    monkeypatch.setattr(bag, 'BLOCK', block)
     assert numbers(replay(flight, CONFIG)) == numbers(result)
 
 

@@ -21,13 +21,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ins_align.aligner import Aligner
-from ins_align.bag_files import BagError
-from ins_align.bags import Bag
 from ins_align.config import Config
-from ins_align.decoding import ImuSamples, joined, Orientations, Refused
 from ins_align.earth import ecef_from_lla, matrix_en
 from ins_align.experiments.common import Error, error_of
-from ins_align.reading import read, Request
+from ins_align.recordings import BagError
+from ins_align.recordings.bag import Bag
+from ins_align.recordings.decode import ImuSamples, joined, Orientations, Refused
+from ins_align.recordings.reader import choose_topics, read, Request
 from ins_align.replay import Reference
 from ins_align.results import Epoch
 from ins_align.rotation import Array
@@ -70,7 +70,7 @@ def recordings_in(folder: Path) -> list[Path]:
             continue
         try:
             with Bag(path) as bag:
-                if bag.choose_topics(Config()).reference is not None:
+                if choose_topics(bag, Config()).reference is not None:
                     paths.append(path)
         except BagError as error:
             print(f'{path.name}: left out: {error}')

@@ -1,0 +1,409 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Recordings of every format, opened with rosbags: their topics, and messages as recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager, ExitStack, suppress
+from functools import partial
+import heapq
+import importlib
+import itertools
+from operator import itemgetter
+import os
+from pathlib import Path, PurePath
+import re
+import sqlite3
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+from ins_align.recordings import BagError, one_line, Topic
+from ins_align.recordings.limits import (
+    MAX_CHUNK_BYTES, MAX_HELD_BYTES, MAX_MESSAGE_BYTES, MAX_METADATA_BYTES, MAX_TOPICS,
+    max_unpacked_bytes, unpack, ZSTD_MAGIC, ZSTD_MODULE)
+from ins_align.recordings.salvage import MAGIC as MCAP_MAGIC, SalvagedMcap
+import numpy as np
+from rosbags import rosbag1, rosbag2
+from rosbags.rosbag2 import storage_mcap
+
+SQLITE_MAGIC, ROSBAG1_MAGIC = b'SQLite format 3\x00', b'#ROSBAG V'
+STORAGE_NAME = re.compile(r'\.(mcap|db3|bag)(\.zstd)?$')  # of the files of a recording
+LISTED_NAME = re.compile(  # of such a file, in a line of metadata.yaml
+    rb'(?m)^[ \t]*-[ \t]+["\']?([^\s:][^:\n]*?\.(?:mcap|db3)(?:\.zstd)?)["\']?[ \t]*\r?$')
+# Of a database that rosbags can open: it is put into a URI as it is.
+DATABASE_PATH = re.compile(r'[\w/. ~+=@,-]*\.db3', re.ASCII)
+# What may mend a file that rosbags cannot open.
+COMMANDS = {'.bag': 'rosbag reindex {0}', '.mcap': 'mcap recover {0} -o mended.mcap',
+            '.db3': 'sqlite3 {0} .recover | sqlite3 mended.db3'}
+BLOCK = 4096  # messages yielded at a time
+GROUP = 256  # messages taken at a time, so few that they stay in the processor's cache
+PIECE_BYTES = 1 << 20  # of a file, unpacked at a time
+INDEX_ENTRY_BYTES = 12  # of a message in the index of a ROS 1 file
+MAX_PASSES = 20  # over a ROS 1 file, parts of which are read again where its chunks overlap
+SQLITE_LIMIT_LENGTH = 0  # sqlite.org/c3ref/c_limit_attached.html
+
+
+class Block(NamedTuple):
+    """Consecutive messages."""
+
+    times_ns: np.ndarray  # (N,) int64, recorded time
+    topics: np.ndarray  # (N,) int64, index into the topics that were asked for
+    messages: Sequence[Sequence[bytes]]  # of each of these topics
+
+
+class Bag:
+    """
+    A recording: a rosbag2 directory, one of its files, a ROS 1 bag or a directory of these.
+
+    Attributes
+    ----------
+    topics : tuple of Topic
+        Those whose messages can be decoded.
+    start_ns, end_ns : int or None
+        Times at which the first and the last message were recorded; None: there is none.
+
+    Raises
+    ------
+    BagError
+        If it cannot be read at all. What can be read in part is, with `warnings`.
+
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self.warnings: list[str] = []  # sentences on what could not be read or used
+        self._topics: dict[int, Topic] = {}  # by id() of a connection
+        with ExitStack() as stack:
+            self._readers = self._opened(stack)
+            with _bag_errors(self.path):
+                self._readers.sort(key=lambda reader: reader.start_time)
+                filled = [reader for reader in self._readers if reader.end_time]
+                # Of whatever type and size they are in a file, here they fit into 64 bits.
+                times_ns = np.array([(reader.start_time, reader.end_time - 1)
+                                     for reader in filled], np.int64).reshape(-1, 2)
+                self.start_ns = int(times_ns[:, 0].min()) if filled else None
+                self.end_ns = int(times_ns[:, 1].max()) if filled else None
+                self.topics = self._listed_topics()
+            self._stack = stack.pop_all()
+
+    def __enter__(self) -> Bag:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files and delete what was unpacked."""
+        self._stack.close()
+
+    def warn(self, text: str) -> None:
+        """Add a warning once."""
+        if one_line(text) not in self.warnings:
+            self.warnings.append(one_line(text))
+
+    def blocks(self, topics: Sequence[Topic], start_ns: int | None = None,
+               stop_ns: int | None = None) -> Iterator[Block]:
+        """
+        Yield the messages of some topics in recorded order, many at a time.
+
+        Parameters
+        ----------
+        topics : sequence of Topic
+            What to read.
+        start_ns, stop_ns : int, optional
+            First recorded time and the one to stop before.
+
+        """
+        numbers = {key: topics.index(topic) for key, topic in self._topics.items()
+                   if topic in topics}
+        with _bag_errors(self.path):
+            records = self._records(numbers, start_ns, stop_ns)
+            while True:
+                columns: tuple[list[Any], ...] = [], [], []
+                while len(columns[0]) < BLOCK and (
+                        group := list(itertools.islice(records, min(GROUP, BLOCK)))):
+                    for column, values in zip(columns, zip(*group)):
+                        column += values
+                connections, times_ns, messages = columns
+                if not messages:
+                    return
+                places = np.fromiter(map(numbers.__getitem__, map(id, connections)), np.int64)
+                yield Block(np.array(times_ns, np.int64), places, [
+                    _without_compression([messages[place] for place in chosen.tolist()])
+                    for chosen in (np.flatnonzero(places == number)
+                                   for number in range(len(topics)))])
+
+    def _records(self, chosen: Container[int], start_ns: int | None, stop_ns: int | None,
+                 ) -> Iterator[tuple[Any, int, bytes]]:
+        """Return connections, times and messages of all files in the order of time."""
+        streams, starts, ends = [], [], [0]
+        for reader in self._readers:
+            connections = [connection for connection in reader.connections
+                           if id(connection) in chosen]
+            if connections:
+                streams.append(_short(reader.messages(connections, start_ns, stop_ns)))
+                starts.append(reader.start_time)
+                ends.append(reader.end_time)
+        if all(end <= start for end, start in zip(ends, starts)):
+            return itertools.chain(*streams)
+        return heapq.merge(*streams, key=itemgetter(1))
+
+    def first_message(self, topic: Topic) -> bytes | None:
+        """Return the first message of a topic, where there is one."""
+        chosen = [key for key, other in self._topics.items() if other == topic]
+        with _bag_errors(self.path):
+            for _, _, data in self._records(chosen, None, None):
+                return _without_compression([data])[0]
+        return None
+
+    def _listed_topics(self) -> tuple[Topic, ...]:
+        known: dict[tuple[str, str, str], list[Any]] = {}
+        for reader in self._readers:
+            for connection in reader.connections:
+                encoding = getattr(connection.ext, 'serialization_format', 'ros1')
+                parts = connection.msgtype.split('/')
+                msgtype = '/msg/'.join(parts) if len(parts) == 2 else connection.msgtype
+                key = '/' + connection.topic.strip('/'), msgtype, encoding
+                if encoding in ('cdr', 'ros1'):
+                    known.setdefault(key, []).append(connection)
+        _check_topics(len(known))
+        for key, connections in known.items():
+            count = sum(connection.msgcount for connection in connections)
+            topic = Topic(*key, count, connections[0].msgdef.data)
+            self._topics.update((id(connection), topic) for connection in connections)
+        return tuple(dict.fromkeys(self._topics.values()))
+
+    def _opened(self, stack: ExitStack) -> list[Any]:
+        """Open those files that can be; an error only if there is none."""
+        readers, errors = [], []
+        with _bag_errors(self.path):
+            files = self._storage_files()
+        for path in files:
+            try:
+                with _bag_errors(path):
+                    readers.append(self._open_file(path, stack))
+                    stack.callback(readers[-1].close)
+            except BagError as error:
+                errors.append(str(error))
+        if not readers:
+            raise BagError(errors[0])
+        self.warnings += errors
+        return readers
+
+    def _storage_files(self) -> list[Path]:
+        """List the files of the recording."""
+        path = self.path
+        if not path.exists():
+            raise BagError(f'{path} does not exist')
+        if path.is_file():
+            return [path]
+        if not path.is_dir():
+            raise BagError(f'{path} is a pipe or a device, from which no recording can be read: '
+                           'give a file')
+        listed = []
+        with suppress(OSError), open(path / 'metadata.yaml', 'rb') as file:
+            # The last part only: a recording names its own files, not others on this machine.
+            listed = [PurePath(os.fsdecode(name)).name
+                      for name in LISTED_NAME.findall(file.read(MAX_METADATA_BYTES))]
+        files = sorted(file for file in path.iterdir() if STORAGE_NAME.search(file.name))
+        if not files:
+            raise BagError(f'{path} holds no recording (.mcap, .db3 or .bag)')
+        if missing := sorted(set(listed).difference(file.name for file in files)):
+            self.warn(f'{", ".join(missing)} is missing from {path}')
+        return [file for file in files if file.name in listed] or files
+
+    def _open_file(self, path: Path, stack: ExitStack) -> Any:
+        """Open one storage file, its format told by its first bytes."""
+        if _magic(path).startswith(ZSTD_MAGIC):
+            path = self._unpacked(path, stack)
+        magic = _magic(path)
+        if not magic:
+            raise BagError('is empty')
+        if magic.startswith(MCAP_MAGIC):
+            return self._open_mcap(path)
+        if magic.startswith(SQLITE_MAGIC):
+            return self._open_sqlite(path, stack)
+        if magic.startswith(ROSBAG1_MAGIC):
+            reader = _Rosbag1Reader(path)
+            reader.open()
+            return reader
+        raise BagError('is no recording: neither mcap, sqlite3 nor ROS 1 bag')
+
+    def _unpacked(self, path: Path, stack: ExitStack) -> Path:
+        """Unpack a file that is compressed as a whole."""
+        folder = stack.enter_context(TemporaryDirectory(prefix='ins_align_'))
+        target = Path(folder, path.name.removesuffix('.zstd'))
+        zstd = importlib.import_module(ZSTD_MODULE)
+        left = limit = max_unpacked_bytes(path.stat().st_size)
+        with zstd.open(path, 'rb') as packed, open(target, 'wb') as output:
+            try:
+                while piece := packed.read1(PIECE_BYTES):
+                    left -= len(piece)
+                    if left < 0:
+                        raise BagError(f'unpacks to more than {limit >> 20} MiB, which no '
+                                       'recording of its size does')
+                    output.write(piece)
+            except (EOFError, zstd.ZstdError):
+                self.warn(f'{path.name} was cut off or is damaged: it is read as far as it goes')
+        return target
+
+    def _open_mcap(self, path: Path) -> Any:
+        """Open an mcap file with rosbags, or as far as it goes."""
+        try:
+            return _open_whole_mcap(path)
+        except BagError:
+            raise
+        except Exception:  # rosbags runs into whatever damaged bytes lead it to
+            reader = SalvagedMcap(path)
+        if not reader.complete:
+            self.warn(f'{path.name} was cut off or is damaged: it is read as far as it goes')
+        return reader
+
+    def _open_sqlite(self, path: Path, stack: ExitStack) -> Any:
+        """Open a sqlite3 file with rosbags."""
+        log = path.with_name(path.name + '-wal')
+        if log.exists() and log.stat().st_size:
+            self.warn(f'{log.name} holds messages that are not read: sqlite3 {path.name} '
+                      "'PRAGMA wal_checkpoint' puts them into the recording")
+        if not DATABASE_PATH.fullmatch(str(path)):
+            link = Path(stack.enter_context(TemporaryDirectory()), 'recording.db3')
+            link.symlink_to(path.resolve())
+            path = link
+        with closing(sqlite3.connect(f'file:{path}?immutable=1', uri=True)) as database:
+            for table in ('topics', 'message_definitions'):  # rosbags compares all with all
+                with suppress(sqlite3.OperationalError):  # there is none
+                    _check_topics(*database.execute(f'SELECT count(*) FROM {table}').fetchone())
+        reader: Any = rosbag2.Reader(path)
+        reader.open()
+        with suppress(AttributeError):  # before rosbags had apsw: messages are checked anyway
+            reader.storage.dbconn.limit(SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
+        return reader
+
+
+def _open_whole_mcap(path: Path) -> Any:
+    """Open an mcap file with rosbags, whose decompression is bounded here."""
+    for name in ('lz4', 'zstd'):
+        storage_mcap.DECOMPRESSORS[name] = partial(_unpacked_chunk, name)
+    reader: Any = rosbag2.Reader(path)
+    reader.open()
+    try:
+        _check_chunks(reader.storage.chunks, max_unpacked_bytes(path.stat().st_size))
+    except BaseException:
+        reader.close()
+        raise
+    return reader
+
+
+def _unpacked_chunk(compression: str, data: bytes, size: int = MAX_CHUNK_BYTES) -> bytes:
+    return unpack(data, compression, min(size, MAX_CHUNK_BYTES))
+
+
+def _check_chunks(chunks: Sequence[Any], limit: int) -> None:
+    """Refuse chunks that take more memory or time than a limit to all of them lets expect."""
+    if not chunks or not all(chunk.message_index_offsets for chunk in chunks):
+        raise ValueError('rosbags leaves out chunks without an index')
+    sizes = [chunk.uncompressed_size for chunk in chunks]
+    changes = []  # of what is held in memory, since chunks of the same time are
+    for chunk, size in zip(chunks, sizes):
+        end_ns = max(chunk.message_start_time, chunk.message_end_time) + 1
+        changes += [(chunk.message_start_time, size), (end_ns, -size)]
+    held = max(itertools.accumulate(change for _, change in sorted(changes)))
+    if max(sizes) > MAX_CHUNK_BYTES or sum(sizes) > limit or held > MAX_HELD_BYTES:
+        raise BagError(f'claims a chunk of {max(sizes)} bytes, {sum(sizes)} in all and {held} of '
+                       'the same time, which no recording of its size has')
+
+
+def _check_topics(count: int) -> None:
+    if count > MAX_TOPICS:
+        raise BagError(f'describes {count} topics, where {MAX_TOPICS} are allowed')
+
+
+class _Rosbag1Reader(rosbag1.Reader):
+    """A reader of ROS 1 files that takes bounded memory and time."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._size = path.stat().st_size
+        self._left = MAX_PASSES * max_unpacked_bytes(self._size)
+
+    def read_chunk(self) -> Any:
+        """Bound the size to which a chunk unpacks, and all of them together."""
+        chunk = super().read_chunk()
+        names = {function: name for name, function in rosbag1.reader.decompressors.items()}
+        return chunk._replace(decompressor=partial(self._unpacked, names[chunk.decompressor]))
+
+    def _unpacked(self, compression: str, data: bytes) -> bytes:
+        unpacked = unpack(data, compression, MAX_CHUNK_BYTES)
+        self._left -= len(unpacked)
+        if self._left < 0:
+            raise BagError('has chunks that are unpacked time and again, since they have messages '
+                           'of the same time')
+        return unpacked
+
+    def read_index_data(self, pos: int, indexes: dict[int, list[Any]]) -> None:
+        """Stop where more messages are listed than the file has room for."""
+        super().read_index_data(pos, indexes)
+        if INDEX_ENTRY_BYTES * sum(map(len, indexes.values())) > self._size:
+            raise ValueError('index larger than the file')
+
+
+def _short(records: Iterable[tuple[Any, int, Any]]) -> Iterator[tuple[Any, int, bytes]]:
+    """Let messages pass until one is too long; a database may hold what is none."""
+    for connection, time_ns, data in records:
+        if type(data) is not bytes:
+            data = b''
+        elif len(data) > MAX_MESSAGE_BYTES:
+            raise BagError(f'has a message of {len(data)} bytes or more on {connection.topic}, '
+                           f'where {MAX_MESSAGE_BYTES} are allowed')
+        yield connection, time_ns, data
+
+
+def _without_compression(messages: list[bytes]) -> list[bytes]:
+    """Unpack messages where they are compressed: all or none. Of damaged ones nothing is left."""
+    if not messages or not messages[0].startswith(ZSTD_MAGIC):
+        return messages
+    return [unpack(message, 'zstd', MAX_MESSAGE_BYTES, damaged=b'') for message in messages]
+
+
+def _magic(path: Path) -> bytes:
+    with open(path, 'rb') as file:
+        return file.read(16)
+
+
+def begins_like_a_recording(path: Path) -> bool:
+    """Whether there is a file that a recording may lie in, whole or damaged."""
+    try:
+        return _magic(path).startswith((MCAP_MAGIC, SQLITE_MAGIC, ROSBAG1_MAGIC, ZSTD_MAGIC))
+    except OSError:
+        return False
+
+
+@contextmanager
+def _bag_errors(path: Path) -> Iterator[None]:
+    """Turn whatever rosbags and its libraries raise into a sentence."""
+    try:
+        yield
+    except ImportError:
+        raise
+    except BagError as error:
+        named = str(error).startswith(str(path))
+        raise BagError(str(error) if named else f'{path.name or path} {error}') from None
+    except Exception as error:  # damaged bytes lead the libraries to errors of every kind
+        if isinstance(error, OSError) and error.strerror:
+            raise BagError(f'{path} cannot be read: {error.strerror}') from None
+        text = str(error).rstrip('.') or type(error).__name__
+        command = COMMANDS.get(path.suffix, '').format(path.name)
+        raise BagError(f'{path.name or path} cannot be read ({text})'
+                       + (f'; this may mend it: {command}' if command else '')) from None

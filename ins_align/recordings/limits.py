@@ -1,0 +1,72 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Limits that a recording keeps to, so that a damaged or hostile one takes little memory."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from typing import Any
+
+from ins_align.recordings import BagError
+
+MAX_CHUNK_BYTES = 1 << 28  # of a chunk, unpacked
+MAX_HELD_BYTES = 1 << 30  # of chunks, unpacked, that have messages of the same time
+MAX_MESSAGE_BYTES = 1 << 16  # of an IMU or GNSS message, which has some hundred bytes
+MAX_DEFINITION_BYTES = 1 << 24  # of the description of a topic
+MAX_TOPICS = 10_000
+MAX_METADATA_BYTES = 1 << 24  # of metadata.yaml
+# A file may unpack to this much, or to more at no more than this ratio.
+UNPACKED_BYTES_FREE = 1 << 30
+MAX_UNPACK_RATIO = 200
+
+ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+ZSTD_MODULE = 'compression.zstd' if sys.version_info >= (3, 14) else 'backports.zstd'
+DECOMPRESSORS = {'bz2': ('bz2', 'BZ2Decompressor'), 'lz4': ('lz4.frame', 'LZ4FrameDecompressor'),
+                 'zstd': (ZSTD_MODULE, 'ZstdDecompressor')}
+
+
+def max_unpacked_bytes(size: int) -> int:
+    """Return to how much a file of a size, bytes, may unpack."""
+    return max(UNPACKED_BYTES_FREE, MAX_UNPACK_RATIO * size)
+
+
+def unpack(data: bytes, compression: str, limit: int, damaged: bytes | None = None) -> bytes:
+    """
+    Unpack data; of those that were cut off the front, of those that are damaged what is given.
+
+    Raises
+    ------
+    BagError
+        If the compression is not known or there are more than `limit` bytes.
+    Exception
+        Of many kinds, if the data are damaged and nothing is given for that.
+
+    """
+    if compression in ('', 'none'):
+        return data
+    if compression not in DECOMPRESSORS:
+        raise BagError(f'is compressed with {compression[:40]!r}, which is not supported')
+    module, name = DECOMPRESSORS[compression]
+    decompressor: Any = getattr(importlib.import_module(module), name)()
+    try:
+        unpacked: bytes = decompressor.decompress(data, limit + 1)
+    except Exception:  # each library has its own kind of error for damaged data
+        if damaged is None:
+            raise
+        return damaged
+    if len(unpacked) > limit:
+        raise BagError(f'unpacks, in a part, to more than the {limit} bytes that are allowed or '
+                       'claimed')
+    return unpacked
