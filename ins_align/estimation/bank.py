@@ -177,9 +177,8 @@ class Bank:
         assert filters is not None
         track = self._track_of(epochs)
         ids = filters.ids
-        point = filters.x[filters.lead]
-        point[:, DELAY] = point[0, DELAY]
-        model = self._model(point, ids, imu)
+        model = self._model(filters, imu)
+        point = model.point
         self._C_nn0 = np.eye(3)
         for k, epoch in enumerate(epochs):
             self._step(filters, model, k, track)
@@ -232,7 +231,10 @@ class Bank:
                      [(epoch.v_n is not None, epoch.position_measured and self._use_position)
                       for epoch in epochs], track.C_n0n)
 
-    def _model(self, point: Array, ids: Array, imu: Intervals) -> Linearised:
+    def _model(self, filters: Filters, imu: Intervals) -> Linearised:
+        """Linearise epochs at the likeliest mean of each rival, at one delay for all."""
+        ids, point = filters.ids, filters.x[filters.lead]
+        point[:, DELAY] = point[self._best(filters), DELAY]
         shares = self._share_of[ids, None, None]
         return linearised(point, imu.mirrored(self._signs[ids]),
                           imu.Q[:, None] + shares * imu.Q_excess[:, None], self._use_position)
@@ -448,10 +450,8 @@ class Bank:
         self._filters = filters = Filters(C, v_n, self._known[0].x, rival, P,
                                           np.array([known.walk for known in self._known]))
         for k in range(len(epochs)):
-            ids = filters.ids
-            point = filters.x[filters.lead]
-            model = self._model(point, ids, imu.take(slice(k, k + 1)))
             one = slice(k, k + 1)
+            model = self._model(filters, imu.take(one))
             self._step(filters, model, 0, Track(track.s[one], track.covariance[one],
                                                 track.present[one], track.C_n0n[one]))
         self._last = epochs[-1]
