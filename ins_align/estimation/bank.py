@@ -43,8 +43,9 @@ HEADINGS, STEP_STD = 180, 0.6
 TILT_STD = math.radians(10.0)
 # The bank starts when the vector from which it does is so many times its noise.
 START_RATIO = 20.0
-# What is not known of velocity and position at first (m/s, m).
-OPEN_VELOCITY, OPEN_POSITION = 1e3, 1e4
+# What is not known of velocity and position at first (m/s, m); of a velocity whose horizontal
+# part is measured, the vertical is known better.
+OPEN_VELOCITY, OPEN_POSITION, STEADY_VELOCITY = 1e3, 1e4, 10.0
 # Means whose log weight is so much below the likeliest's are dropped, and so are rivals that are
 # wrong; levels stay, for what they assume may become true.
 UNLIKELY, HOPELESS, LEAST = 14.0, 25.0, 13.0
@@ -439,14 +440,15 @@ class Bank:
         for rows in (PHI, PHI0):
             for columns in (PHI, PHI0):
                 P[:, rows, columns] = attitude
-        P[:, XI, XI], P[:, RHO, RHO] = (std ** 2 * np.eye(3)
-                                        for std in (OPEN_VELOCITY, OPEN_POSITION))
-        P[:, FIRST:, FIRST:] = [known.P for known in self._known]
         epochs = [epoch for epoch, _ in self._waiting]
+        measured = [epoch.v_n for epoch in epochs if epoch.v_n is not None]
+        P[:, XI, XI] = (STEADY_VELOCITY if measured else OPEN_VELOCITY) ** 2 * np.eye(3)
+        P[:, RHO, RHO] = OPEN_POSITION ** 2 * np.eye(3)
+        P[:, FIRST:, FIRST:] = [known.P for known in self._known]
         imu, self._waiting = self._together(), []
         self._last = epochs[0]
         track = self._track_of(epochs)
-        v_n = next((epoch.v_n for epoch in epochs if epoch.v_n is not None), np.zeros(3))
+        v_n = measured[0] if measured else np.zeros(3)
         self._filters = filters = Filters(C, v_n, self._known[0].x, rival, P,
                                           np.array([known.walk for known in self._known]))
         for k in range(len(epochs)):
