@@ -116,7 +116,8 @@ class AlignmentNode(Node):
 
     A thread of its own takes the messages and aligns, several times a second. If somebody listens
     to `~/imu`, the executor takes the IMU's messages instead and answers each at once, with the
-    attitude that the thread knew last, carried on with the gyros since.
+    attitude that the thread knew last, carried on with the gyros since. While there is no such
+    attitude it answers none.
 
     Attributes
     ----------
@@ -200,13 +201,15 @@ class AlignmentNode(Node):
             self._adopted = outlook
             self._follower.adopt(
                 outlook.prediction if outlook.starts == self._starts else None)
-        now = None
         # What was learnt is about the axes of another IMU when the frame is another one.
-        if outlook.frame_id in (None, sample.frame_id):
-            now = self._follower.follow(sample.stamp_ns, sample.gyro)
-        self._imu_publisher.publish(
-            with_orientation(data) if now is None else
-            with_orientation(data, now.quaternion_xyzw, now.covariance))
+        if outlook.frame_id not in (None, sample.frame_id):
+            return
+        now = self._follower.follow(sample.stamp_ns, sample.gyro)
+        # Without an attitude nothing is published: navsat_transform takes the quaternion of the
+        # first message that it gets for the heading, for good, whatever its covariance says.
+        if now is not None:
+            self._imu_publisher.publish(
+                with_orientation(data, now.quaternion_xyzw, now.covariance))
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._starts += 1  # from here on, what the worker knew before does not hold
