@@ -152,7 +152,7 @@ class _Survey:
 
     def _topic(self, data: Recorded, faults: list[str], **more: Any) -> TopicInfo:
         count = data.stamps_ns.size
-        if not count and not data.refusals:
+        if not count:
             faults = [*faults, 'it has no messages' if not data.undecodable
                       else 'its messages cannot be decoded']
         return TopicInfo(
@@ -173,11 +173,11 @@ class _Survey:
         faults = []
         if 'cmd' in data.topic.name.rsplit('/', 1)[-1]:
             faults.append('its name is that of a command, not of a measurement')
-        if data.refusals and data.refusals.total() > data.stamps_ns.size:
-            faults.append(data.refusals.most_common(1)[0][0])
         frame = absent = None
         if data.usable.any():
             frame = velocity_frame(self._series(data), positions)
+            if _is_refused(data) and frame.frame not in FRAMES_THAT_FIT:
+                faults.append(data.refusals.most_common(1)[0][0])
             faults += _frame_faults(frame)
             values = data.values[data.usable]
             absent = bool((values[:, 2] == 0.0).all() and (values[:, :2] != 0.0).any())
@@ -290,8 +290,8 @@ class _Survey:
         if frame is None or frame.frame == 'unknown':
             self._notes.append('nothing tells the frame of the velocity (too little motion): '
                                'it is taken as east-north-up')
-        elif frame.frame == 'ned':
-            self._settings.append('velocity_frame=ned')
+        elif frame.frame == 'ned' or _is_refused(self._data[velocity.name]):
+            self._settings.append(f'velocity_frame={frame.frame}')
         if frame is not None and frame.upside_down:
             self._notes.append('the vertical velocity has the wrong sign')
         if velocity.vertical_absent:
@@ -472,6 +472,11 @@ def _stated(data: Recorded) -> dict[str, Any]:
         return {'covariance_share': 0.0 if stated.size else None}
     horizontal, vertical = np.median(data.sigmas[stated], axis=0).tolist()
     return {'covariance_share': float(np.mean(stated)), 'sigma': (horizontal, vertical)}
+
+
+def _is_refused(data: Recorded) -> bool:
+    """Whether an alignment refuses most velocities of a topic for their frame_id."""
+    return data.refusals.total() > 0.5 * data.stamps_ns.size
 
 
 def _says_unmeasured(data: Recorded) -> str:
