@@ -30,6 +30,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import (
     QuaternionStamped, TwistStamped, TwistWithCovarianceStamped, Vector3Stamped)
 from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
+from ins_align.checks import InputChecks
 from ins_align.config import (
     Config, config_from_mapping, ConfigError, no_effect, NODE_NAME, parameters)
 from ins_align.diagnostics import (
@@ -37,12 +38,13 @@ from ins_align.diagnostics import (
     vector_msg)
 from ins_align.imu_bytes import ImuSample, read_imu, with_orientation
 from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
+from ins_align.on_demand import OnDemand, queued
 from ins_align.prediction import Follower, Prediction
 from ins_align.results import Severity
 from ins_align.worker import Worker
 from nav_msgs.msg import Odometry
+import numpy as np
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -75,28 +77,6 @@ IMU_SILENT = 1.0
 MAX_OTHER_FRAMES = 8
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.5)
 RCLPY_PARAMETERS = {'use_sim_time', 'start_type_description_service'}  # it declares them itself
-
-
-class OnDemand(CallbackGroup):
-    """
-    Keeps a subscription from its executor until it is opened.
-
-    A turn of the executor takes longer than all that is done with a message. Where nothing has
-    to be done at once, messages wait in the subscription's queue and are taken many at a time.
-    """
-
-    is_open = False
-
-    def can_execute(self, entity: Any) -> bool:
-        """Whether the executor may take messages."""
-        return self.is_open
-
-    def beginning_execution(self, entity: Any) -> bool:
-        """Allow it."""
-        return True
-
-    def ending_execution(self, entity: Any) -> None:
-        """Do nothing."""
 
 
 class _Reset(NamedTuple):
@@ -151,6 +131,7 @@ class AlignmentNode(Node):
         self._starts = 0  # how often it was told to start over
         # The worker's:
         self._aligner = Aligner(self._config)
+        self._checks = InputChecks(self._config)
         self._declared: Attitude | None = None
         self._imu_frame: str | None = None
         self._started = 0  # how often it has started over
@@ -242,6 +223,7 @@ class AlignmentNode(Node):
         items.sort(key=itemgetter(0))
         for received_ns, item in items:
             self._feed(received_ns, item)
+        self._check([item for _, item in items])
         self._align()
         newest_ns = self._aligner.newest_imu_ns
         if newest_ns is not None and newest_ns != self._newest_imu_ns:
@@ -251,7 +233,7 @@ class AlignmentNode(Node):
         events = self._aligner.take_events()
         for event in events:
             self._log(event.severity, event.text)
-            self._reasons.is_due(event.text, time.monotonic(), True)
+            self._reasons.due(event.text.split('; '), time.monotonic(), True)
         # By a clock that goes on when simulated time stands still.
         if events or time.monotonic() >= self._next_status:
             self._publish_status()
@@ -280,6 +262,19 @@ class AlignmentNode(Node):
             self._started += 1
             self._start_over('requested by service')
 
+    def _check(self, items: list[Any]) -> None:
+        """Let the checks see what has come from the IMU in use and from the GNSS."""
+        samples: list[ImuSample] = []
+        gnss = []
+        for item in items:
+            if isinstance(item, ImuSample) and item.frame_id == self._imu_frame:
+                samples.append(item)
+            elif isinstance(item, (Fix, Velocity)):
+                gnss.append((len(samples), item))
+        stamps, gyro, accel, _ = zip(*samples) if samples else ((), (), (), ())
+        self._checks.add(np.array(stamps, np.int64), np.array(gyro).reshape(-1, 3),
+                         np.array(accel).reshape(-1, 3), gnss)
+
     def _align(self) -> None:
         """Process what can be processed."""
         for epoch in self._aligner.update():
@@ -291,6 +286,7 @@ class AlignmentNode(Node):
     def _start_over(self, why: str) -> None:
         self._align()  # what came before counts, whenever it was taken in
         self._aligner.reset(why)
+        self._checks = InputChecks(self._config)
 
     def _velocity(self, msg: Any) -> Velocity | None:
         try:
@@ -376,11 +372,12 @@ class AlignmentNode(Node):
         self._next_status = now + STATUS_PERIOD
         status = self._aligner.status()
         level = LEVELS.get(status.state, DiagnosticStatus.WARN)
-        more = [] if first else self._input_faults(status)
         silent = 0.0 if self._imu_heard is None else now - self._imu_heard
+        more = [] if first else self._input_faults(status, silent > IMU_SILENT)
         if silent > IMU_SILENT:
             # The aligner goes by stamps: it learns of a gap when the next sample comes.
             more.append(f'no IMU sample for {silent:.0f} s')
+        reason = f'{status.state.value}: {status.reason}'
         if more:
             level = max(level, DiagnosticStatus.WARN)
             status = dataclasses.replace(status, reason='; '.join([status.reason, *more]))
@@ -392,24 +389,28 @@ class AlignmentNode(Node):
             publisher.publish(msg)
         self._state_publisher.publish(UInt8(data=STATE_NUMBERS[status.state]))
         if not first:
-            self._log_reason(msg.status[0], now, more)
+            self._log_reason(reason.split('; '), more, status.state, now)
 
-    def _input_faults(self, status: Status) -> list[str]:
-        """Say what is wrong with the topics: nobody there, or another type."""
-        expected = {State.WAITING_FOR_IMU: [IMU_TOPIC], State.WAITING_FOR_GNSS: [FIX_TOPIC]}
-        topics = expected.get(status.state, [])
-        if self._config.use_velocity is True and not status.counts.get('velocity'):
-            topics = [*topics, VELOCITY_TOPIC]
-        return list(topic_faults(self, self._inputs, topics, VELOCITY_TYPES))
+    def _input_faults(self, status: Status, silent: bool) -> list[str]:
+        """Say what is wrong with topics (nobody there, another type) and what they carry."""
+        expected = [topic for topic, wanted in (
+            (IMU_TOPIC, silent or status.state is State.WAITING_FOR_IMU),
+            (FIX_TOPIC, status.state is State.WAITING_FOR_GNSS),
+            (VELOCITY_TOPIC, self._config.use_velocity is True
+             and not status.counts.get('velocity'))) if wanted]
+        return [*topic_faults(self, self._inputs, expected, VELOCITY_TYPES),
+                *([] if status.state is State.ALIGNED else self._checks.faults())]
 
-    def _log_reason(self, status: DiagnosticStatus, now: float, more: list[str]) -> None:
-        """Log the reason when its kind has changed, and every 10 s what is not as it should be."""
-        stays = self._reasons.stays(status.message)
-        if self._reasons.is_due(status.message, now, status.level != DiagnosticStatus.OK):
-            severity = Severity.WARNING if stays or more else Severity.INFO
-            if status.level == DiagnosticStatus.ERROR:
-                severity = Severity.ERROR
-            self._log(severity, status.message)
+    def _log_reason(self, reason: list[str], more: list[str], state: State, now: float) -> None:
+        """Log what is new in the reason, and every 10 s what stays and is not as it should be."""
+        again = bool(more) or state is not State.ALIGNED
+        for part, stays in self._reasons.due([*reason, *more], now, again):
+            if part == reason[0] and state is State.FAULT:
+                self._log(Severity.ERROR, part)
+            elif part in more or (stays and state is not State.ALIGNED):
+                self._log(Severity.WARNING, part)
+            else:
+                self._log(Severity.INFO, part)
 
     # Topics and parameters
 
@@ -476,18 +477,6 @@ class AlignmentNode(Node):
     def _change_parameters(self, changes: list[Parameter]) -> None:
         self._config = self._changed_config(changes)
         self._worker.put((self._now_ns(), self._config))
-
-
-def queued(subscription: Subscription, most: int) -> list[tuple[Any, int]]:
-    """Take up to so many waiting messages, each with the time at which it was received, ns."""
-    messages = []
-    with subscription.handle:
-        for _ in range(most):
-            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-            if taken is None:
-                break
-            messages.append((taken[0], taken[1]['received_timestamp']))
-    return messages
 
 
 def _nothing(*_: Any) -> None:

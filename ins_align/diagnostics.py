@@ -36,38 +36,35 @@ _NUMBER = re.compile(r'[-+]?\d[\d.]*(?:e[-+]?\d+)?')
 
 
 class ReasonLog:
-    """Decides when a reason is worth a line in the log: when its kind is new or it has stayed."""
+    """Decides which parts of a reason are worth a line in the log: new ones, and those that stay."""
 
     def __init__(self) -> None:
         """Start with nothing logged."""
-        self._logged: dict[str, float] = {}  # kinds of the last seconds
-        self._last = ''
+        self._logged: dict[str, float] = {}  # kinds of the last seconds, and when
+        self._present: set[str] = set()
 
-    def is_due(self, text: str, now: float, wanted: bool) -> bool:
+    def due(self, parts: Sequence[str], now: float, again: bool) -> list[tuple[str, bool]]:
         """
-        Tell whether to log a reason, and take it for logged if so.
+        Return the parts to log, and whether they were there before; they are taken for logged.
 
         Parameters
         ----------
-        text : str
-            State and reason; other numbers in it make no other kind.
+        parts : sequence of str
+            Other numbers in a part make no other kind.
         now : float
             s.
-        wanted : bool
-            Whether it is to be logged again and again while it stays.
+        again : bool
+            Whether what stays is logged again and again.
 
         """
-        kind = _NUMBER.sub('#', text)
-        self._logged = {other: when for other, when in self._logged.items()
+        self._logged = {kind: when for kind, when in self._logged.items()
                         if now - when < LOG_AGAIN}
-        if kind in self._logged or (kind == self._last and not wanted):
-            return False
-        self._logged[kind], self._last = now, kind
-        return True
-
-    def stays(self, text: str) -> bool:
-        """Whether this kind of reason was the last one that was logged."""
-        return _NUMBER.sub('#', text) == self._last
+        before, kinds = self._present, [_NUMBER.sub('#', part) for part in parts]
+        self._present = set(kinds)
+        found = [(part, kind in before) for part, kind in zip(parts, kinds)
+                 if kind not in self._logged and (again or kind not in before)]
+        self._logged.update((_NUMBER.sub('#', part), now) for part, _ in found)
+        return found
 
 
 def type_name(msg_type: type) -> str:
@@ -96,6 +93,7 @@ def topic_faults(node: Node, inputs: Mapping[str, type], expected: Iterable[str]
     Parameters
     ----------
     node : Node
+        That reads them.
     inputs : mapping
         Message types by topic, as they are named in the node.
     expected : iterable of str

@@ -86,6 +86,7 @@ def with_orientation(data: bytes, quaternion_xyzw: Sequence[float],
     data : bytes
         The message.
     quaternion_xyzw : four floats
+        IMU frame to ENU.
     covariance : nine floats
         rad^2, row by row.
 

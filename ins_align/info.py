@@ -24,6 +24,8 @@ import shlex
 from typing import Any
 
 from ins_align.buffers import MAX_AHEAD_NS, MAX_GAP_NS
+from ins_align.checks import (
+    BEYOND_THE_POLES, beyond_the_poles, exchange_fault, lateness_advice, MAX_LATENESS)
 from ins_align.config import Config, config_from_mapping, parse_override
 from ins_align.earth import normal_gravity
 from ins_align.imu_survey import ImuFacts, survey_imu
@@ -38,7 +40,6 @@ from ins_align.report import format_table
 from ins_align.topic_survey import KINDS, MAX_ASTRAY, read_candidates, Recorded, Timing
 import numpy as np
 
-MAX_LATENESS = 60.0  # s, the limit of the parameter gnss_lateness
 MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
 MIN_AHEAD = 0.3  # s: GNSS stamps this far ahead of the IMU's are no jitter
 MIN_START = 5.0  # s that an alignment starts before a manoeuvre
@@ -118,6 +119,9 @@ class _Survey:
         """Return everything that is known."""
         fixes = [self._fix(data) for data in self._of('fix')]
         fix = _best(fixes)
+        if fix is not None and (fault := self._exchanged(fix)):
+            fixes = [dataclasses.replace(topic, faults=(fault,)) if topic is fix else topic
+                     for topic in fixes]
         positions = self._positions(fix)
         velocities = [self._velocity(data, positions) for data in self._of('velocity')]
         velocity = _best(velocities)
@@ -128,7 +132,7 @@ class _Survey:
         gravity = float(normal_gravity(math.radians(latitude), altitude))
         imus = [self._imu(data, motion, gravity) for data in self._of('imu')]
         imu = _best(imus)
-        chosen = {'imu': imu or _first(imus), 'fix': fix or _first(fixes), 'velocity': velocity}
+        chosen = {'imu': imu or _first(imus), 'fix': _best(fixes) or _first(fixes), 'velocity': velocity}
         lateness = self._lateness(chosen)
         found = find_manoeuvres(motion)
         self._advise_imu(chosen['imu'])
@@ -164,10 +168,22 @@ class _Survey:
         faults = []
         count = data.stamps_ns.size
         if count and not data.usable.any():
+            beyond = [beyond_the_poles(*place) for place in data.values[:, :2].tolist()]
             faults.append('no message has a fix' if data.no_fix == count else
+                          BEYOND_THE_POLES if np.mean(beyond) > 0.5 else
                           'no message has a fix and numbers that can be used')
         return self._topic(data, faults, **_stated(data),
                            no_fix_share=data.no_fix / count if count else None)
+
+    def _exchanged(self, fix: TopicInfo) -> str:
+        """Say that latitude and longitude are exchanged, and exchange them for the rest."""
+        data = self._data[fix.name]
+        fault = next(filter(None, (
+            exchange_fault(self._series(data), self._series(velocity))
+            for velocity in self._of('velocity') if velocity.usable.any())), '')
+        if fault:
+            data.values = data.values[:, [1, 0, 2]]
+        return fault
 
     def _velocity(self, data: Recorded, positions: Series) -> TopicInfo:
         faults = []
@@ -314,10 +330,9 @@ class _Survey:
             return
         self._advise_delay(chosen, imu.timing.stamp_age_s)
         if lateness is not None and Config.gnss_lateness < lateness < MAX_LATENESS:
-            self._settings.append(f'gnss_lateness={math.ceil(2.0 * lateness) / 2.0 + 0.5:g}')
-            self._notes.append(f'GNSS messages come up to {lateness:.1f} s later than newer IMU '
-                               'samples; if it is their clock that is behind, and not the '
-                               f'messages, set gnss_delay={-lateness:.1f} instead')
+            advice, value = lateness_advice(lateness)
+            self._settings.append(f'gnss_lateness={value}')
+            self._notes.append(advice)
 
     def _advise_delay(self, chosen: dict[str, TopicInfo | None], imu_age: float | None) -> None:
         """See whether GNSS messages are recorded before they could have been measured."""

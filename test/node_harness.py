@@ -112,7 +112,8 @@ class Listener:
                 (DiagnosticArray, '/diagnostics', self.diagnostics, 100)):
             self.node.create_subscription(msg_type, topic, store.append, qos)
         if imu:
-            self.node.create_subscription(Imu, f'{namespace}/ins_align/imu', self.imus.append, 10000)
+            self.node.create_subscription(
+                Imu, f'{namespace}/ins_align/imu', self.imus.append, 10000)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._spin, daemon=True)

@@ -13,6 +13,8 @@
 # limitations under the License.
 """What others make of the topics: navsat_transform, plots, two robots, types that do not match."""
 
+from dataclasses import replace
+
 from geometry_msgs.msg import TwistStamped, Vector3Stamped
 from ins_align.diagnostics import ReasonLog
 from ins_align.rotation import matrix_from_quaternion, roll_pitch_yaw
@@ -126,16 +128,31 @@ def test_what_is_missing_is_said_in_the_log_with_the_names_of_its_namespace():
             'lever_arm [1.0, 2.0, 3.0] m, imu_grade tactical' in node.output)
 
 
+def test_wrong_units_and_late_messages_are_said_as_replay_says_them(tmp_path):
+    simulation = simulate('car', seed=1, duration=40.0, stand_still=5.0, imu_grade='tactical')
+    simulation = replace(simulation, gyro=np.degrees(simulation.gyro),
+                         gnss_arrival_ns=simulation.gnss_stamps_ns + 1_720_000_000)
+    with Listener() as listener, running_node(RELIABLE) as node:
+        with playing(script_of(simulated_messages(simulation)), tmp_path, 10.0):
+            listener.wait_for(lambda: 'look like deg/s' in listener.status.get('reason', ''))
+            listener.wait_for(lambda: 'set gnss_lateness to 2.5' in listener.status['reason'])
+    for sentence in ('the angular rates look like deg/s: they must be rad/s',
+                     'GNSS messages come up to 1.7 s later than newer IMU samples'):
+        assert sentence in node.output
+
+
 def test_a_reason_is_logged_when_its_kind_changes_and_when_it_stays():
     log = ReasonLog()
 
-    def logged(text, seconds, wanted=True):
-        return [now for now in seconds if log.is_due(text, now, wanted)]
+    def logged(text, seconds, again=True):
+        return [now for now in seconds if log.due([text], now, again)]
 
     assert logged('ALIGNING: heading sigma 3.1 deg', range(8)) == [0]
     assert logged('ALIGNING: heading sigma 1e+02 deg', range(8, 25)) == [10, 20]
     assert logged('ALIGNED: heading sigma 0.9 deg', range(25, 60), False) == [25]
-    assert logged('ALIGNED: no IMU sample for 3 s', range(60, 65)) == [60]
+    # Of several parts those that are new.
+    parts = ['ALIGNED: heading sigma 0.8 deg', 'no GNSS for 3 s']
+    assert log.due(parts, 60, False) == [(parts[1], False)]
     # What comes and goes is not logged each time.
     for now in range(65, 100):
-        assert log.is_due(f'ALIGNING: {"ab"[now % 2]}', now, True) == (now % 10 in (5, 6))
+        assert bool(log.due([f'ALIGNING: {"ab"[now % 2]}'], now, True)) == (now % 10 in (5, 6))
