@@ -233,7 +233,7 @@ class AlignmentNode(Node):
         events = self._aligner.take_events()
         for event in events:
             self._log(event.severity, event.text)
-            self._reasons.due(event.text.split('; '), time.monotonic(), True)
+            self._reasons.note(event.text, time.monotonic())
         # By a clock that goes on when simulated time stands still.
         if events or time.monotonic() >= self._next_status:
             self._publish_status()

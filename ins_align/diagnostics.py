@@ -43,6 +43,12 @@ class ReasonLog:
         self._logged: dict[str, float] = {}  # kinds of the last seconds, and when
         self._present: set[str] = set()
 
+    def note(self, text: str, now: float) -> None:
+        """Take a state with its reason for logged."""
+        kinds = [_NUMBER.sub('#', part) for part in text.split('; ')]
+        self._present.update(kinds)
+        self._logged.update(dict.fromkeys(kinds, now))
+
     def due(self, parts: Sequence[str], now: float, again: bool) -> list[tuple[str, bool]]:
         """
         Return the parts to log, and whether they were there before; they are taken for logged.

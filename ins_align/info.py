@@ -385,7 +385,7 @@ def describe(info: Info) -> str:
     if info.command is None:
         lines += ['', '  it cannot be aligned', *(f'    - {text}' for text in info.obstacles)]
     else:
-        lines += ['', '  to align it, with the lever arm added: --set lever_arm=[X,Y,Z]',
+        lines += ['', '  to align it, with the lever arm added: --lever-arm X Y Z',
                   f'    {info.command}']
     return '\n'.join(printable(line) for text in lines for line in text.split('\n'))
 

@@ -130,6 +130,23 @@ class ReplayResult:
         """Whether the recording ends with a declared alignment."""
         return self.status.state is State.ALIGNED
 
+    @property
+    def declared(self) -> Attitude | None:
+        """The initial attitude as the node publishes it at the last declaration."""
+        declared, before = None, None
+        for epoch in self.epochs:
+            if epoch.state is State.ALIGNED and before is not State.ALIGNED:
+                declared = epoch.initial
+            before = epoch.state
+        return declared
+
+    @property
+    def first_t0_ns(self) -> int | None:
+        """Stamp from which `Epoch.t_s` is counted; None: there is no epoch."""
+        if not self.epochs:
+            return None
+        return self.epochs[0].stamp_ns - round(self.epochs[0].t_s * 1e9)
+
     def to_json(self) -> dict[str, Any]:
         """Return the object that ``--json`` writes; numbers that are not finite are None."""
         status = self.status
