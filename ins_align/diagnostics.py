@@ -36,7 +36,7 @@ _NUMBER = re.compile(r'[-+]?\d[\d.]*(?:e[-+]?\d+)?')
 
 
 class ReasonLog:
-    """Decides which parts of a reason are worth a line in the log: new ones, and those that stay."""
+    """Decides which parts of a reason are worth a line in the log: new ones, those that stay."""
 
     def __init__(self) -> None:
         """Start with nothing logged."""

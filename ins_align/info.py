@@ -132,7 +132,8 @@ class _Survey:
         gravity = float(normal_gravity(math.radians(latitude), altitude))
         imus = [self._imu(data, motion, gravity) for data in self._of('imu')]
         imu = _best(imus)
-        chosen = {'imu': imu or _first(imus), 'fix': _best(fixes) or _first(fixes), 'velocity': velocity}
+        chosen = {'imu': imu or _first(imus), 'fix': _best(fixes) or _first(fixes),
+                  'velocity': velocity}
         lateness = self._lateness(chosen)
         found = find_manoeuvres(motion)
         self._advise_imu(chosen['imu'])

@@ -132,7 +132,7 @@ class ReplayResult:
 
     @property
     def declared(self) -> Attitude | None:
-        """The initial attitude as the node publishes it at the last declaration."""
+        """Return the initial attitude as the node publishes it at the last declaration."""
         declared, before = None, None
         for epoch in self.epochs:
             if epoch.state is State.ALIGNED and before is not State.ALIGNED:
@@ -142,7 +142,7 @@ class ReplayResult:
 
     @property
     def first_t0_ns(self) -> int | None:
-        """Stamp from which `Epoch.t_s` is counted; None: there is no epoch."""
+        """Return the stamp from which `Epoch.t_s` is counted; None: there is no epoch."""
         if not self.epochs:
             return None
         return self.epochs[0].stamp_ns - round(self.epochs[0].t_s * 1e9)

@@ -192,8 +192,8 @@ def summary(result: ReplayResult) -> str:
         if result.reference is not None:
             header += ['error roll', 'pitch', 'yaw']
         lines += ['', format_table(rows, header, '  '),
-                  f'  all times since the first t0, stamp {start_ns * 1e-9:.3f} s; declared: at its '
-                  't0, as the node publishes it', '', _nuisance_table(result)]
+                  f'  all times since the first t0, stamp {start_ns * 1e-9:.3f} s; declared: '
+                  'at its t0, as the node publishes it', '', _nuisance_table(result)]
     counts = ', '.join(f'{name} {count}' for name, count in sorted(status.counts.items()) if count)
     return '\n'.join([*lines, '', f'  counts: {counts or "nothing read"}'])
 

@@ -69,13 +69,14 @@ def test_info_and_replay_say_the_same(drive, tmp_path, change, sentence):
         assert (other in info) == (other in result.status.reason) == (other == sentence)
 
 
-def test_nothing_is_said_of_what_is_right(drive, tmp_path):
+def test_nothing_is_said_of_what_is_right(drive):
     checks = checked(drive)
     assert checks.faults() == []
 
 
 def test_velocities_north_east_down_are_no_exchanged_positions(drive):
-    checks = checked(dataclasses.replace(drive, velocity=drive.velocity[:, [1, 0, 2]] * [1, 1, -1]))
+    velocity = drive.velocity[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    checks = checked(dataclasses.replace(drive, velocity=velocity))
     assert checks.faults() == []
 
 
