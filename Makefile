@@ -16,7 +16,7 @@ help:
 	@sed -n 's/^#: //p' Makefile
 
 #: make demo                   aligns a simulated flight: table of errors, picture
-#: make demo BAG=path          the same for a recording; ARGS='--set lever_arm=[1,0,0.5]'
+#: make demo BAG=path          the same for a recording; ARGS='--lever-arm 1 0 0.5'
 demo: $(VENV)/ready
 	@mkdir -p build/demo
 ifdef BAG
@@ -27,7 +27,7 @@ else
 	@rm -rf build/demo/flight
 	@$(BIN)/ins_align simulate build/demo/flight --scenario flight --imu mems --seed 1 \
 	    --lever-arm 1 1 1
-	@$(BIN)/ins_align replay build/demo/flight --set 'lever_arm=[1, 1, 1]' \
+	@$(BIN)/ins_align replay build/demo/flight --lever-arm 1 1 1 \
 	    --set lever_arm_std=0.02 $(ARGS) \
 	    --json build/demo/flight.json --csv build/demo/flight.csv --plot build/demo/flight.png
 	@echo 'Picture: build/demo/flight.png (the numbers are beside it: .json, .csv)'

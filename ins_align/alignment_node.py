@@ -20,27 +20,31 @@ Everything that decides anything is in the intake and the alignment that the ali
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable
 import dataclasses
 from operator import itemgetter
 import time
 from typing import Any, NamedTuple
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import QuaternionStamped, TwistStamped, TwistWithCovarianceStamped
-from ins_align.aligner import Aligner, Attitude, State, Status
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import (
+    QuaternionStamped, TwistStamped, TwistWithCovarianceStamped, Vector3Stamped)
+from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
+from ins_align.checks import InputChecks
 from ins_align.config import (
-    Config, config_from_mapping, ConfigError, no_effect, NODE_NAME, Parameter as ParameterInfo,
-    parameters)
+    Config, config_from_mapping, ConfigError, no_effect, NODE_NAME, parameters)
+from ins_align.diagnostics import (
+    diagnostic_status, in_words, LEVELS, parameter_descriptor, ReasonLog, topic_faults,
+    vector_msg)
 from ins_align.imu_bytes import ImuSample, read_imu, with_orientation
 from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
+from ins_align.on_demand import OnDemand, queued
 from ins_align.prediction import Follower, Prediction
-from ins_align.results import Event, Severity
+from ins_align.results import Severity
 from ins_align.worker import Worker
 from nav_msgs.msg import Odometry
 import numpy as np
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
-from rclpy.callback_groups import CallbackGroup
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -52,13 +56,17 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.time import Time
 from sensor_msgs.msg import Imu, NavSatFix
+from std_msgs.msg import UInt8
 from std_srvs.srv import Trigger
 
 VELOCITY_TYPES = {
     'TwistWithCovarianceStamped': TwistWithCovarianceStamped,
     'TwistStamped': TwistStamped,
     'Odometry': Odometry,
+    'Vector3Stamped': Vector3Stamped,
 }
+IMU_TOPIC, FIX_TOPIC, VELOCITY_TOPIC = 'imu/data_raw', 'fix', 'fix_velocity'
+STATE_NUMBERS = {state: number for number, state in enumerate(State)}
 IMU_DEPTH = 2000  # ten seconds at 200 Hz: the machine may be busy, no sample may be lost
 GNSS_DEPTH = 200
 IMU_BATCH = 100  # messages taken in a turn of the executor: more would hold up the others
@@ -69,33 +77,6 @@ IMU_SILENT = 1.0
 MAX_OTHER_FRAMES = 8
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.5)
 RCLPY_PARAMETERS = {'use_sim_time', 'start_type_description_service'}  # it declares them itself
-
-LEVELS = {
-    State.ALIGNED: DiagnosticStatus.OK,
-    State.FAULT: DiagnosticStatus.ERROR,
-}
-
-
-class OnDemand(CallbackGroup):
-    """
-    Keeps a subscription from its executor until it is opened.
-
-    A turn of the executor takes longer than all that is done with a message. Where nothing has
-    to be done at once, messages wait in the subscription's queue and are taken many at a time.
-    """
-
-    is_open = False
-
-    def can_execute(self, entity: Any) -> bool:
-        """Whether the executor may take messages."""
-        return self.is_open
-
-    def beginning_execution(self, entity: Any) -> bool:
-        """Allow it."""
-        return True
-
-    def ending_execution(self, entity: Any) -> None:
-        """Do nothing."""
 
 
 class _Reset(NamedTuple):
@@ -116,7 +97,8 @@ class AlignmentNode(Node):
 
     A thread of its own takes the messages and aligns, several times a second. If somebody listens
     to `~/imu`, the executor takes the IMU's messages instead and answers each at once, with the
-    attitude that the thread knew last, carried on with the gyros since.
+    attitude that the thread knew last, carried on with the gyros since. While there is no such
+    attitude it answers none.
 
     Attributes
     ----------
@@ -149,10 +131,12 @@ class AlignmentNode(Node):
         self._starts = 0  # how often it was told to start over
         # The worker's:
         self._aligner = Aligner(self._config)
+        self._checks = InputChecks(self._config)
         self._declared: Attitude | None = None
         self._imu_frame: str | None = None
         self._started = 0  # how often it has started over
         self._next_status = 0.0
+        self._reasons = ReasonLog()
         self._imu_received_ns = 0  # the last sample of that frame
         self._other_frames: set[str] = set()  # of IMUs that were there before
         self._newest_imu_ns: int | None = None
@@ -165,14 +149,20 @@ class AlignmentNode(Node):
         self._status_publishers = [
             self._publish_on(DiagnosticArray, topic, QoSProfile(depth=10))
             for topic in ('~/status', '/diagnostics')]
+        self._angles_publisher, self._sigma_publisher = (
+            self._publish_on(Vector3Stamped, topic, QoSProfile(depth=100))
+            for topic in ('~/roll_pitch_yaw_deg', '~/sigma_deg'))
+        self._state_publisher = self._publish_on(UInt8, '~/state', QoSProfile(depth=10))
+        velocity_type = VELOCITY_TYPES[self._config.velocity_type]
+        self._inputs = {IMU_TOPIC: Imu, FIX_TOPIC: NavSatFix, VELOCITY_TOPIC: velocity_type}
         self._imu_on_demand = OnDemand()
         self._imu_subscription = self._subscribe_to(
-            Imu, 'imu/data_raw', self._on_imu, IMU_DEPTH, self._imu_on_demand)
+            Imu, IMU_TOPIC, self._on_imu, IMU_DEPTH, self._imu_on_demand)
         self._fix_subscription = self._subscribe_to(
-            NavSatFix, 'fix', _nothing, GNSS_DEPTH, OnDemand())
+            NavSatFix, FIX_TOPIC, _nothing, GNSS_DEPTH, OnDemand())
         self._velocity_subscription = self._subscribe_to(
-            VELOCITY_TYPES[self._config.velocity_type], 'fix_velocity', _nothing, GNSS_DEPTH,
-            OnDemand())
+            velocity_type, VELOCITY_TOPIC, _nothing, GNSS_DEPTH, OnDemand())
+        self.get_logger().info(in_words(self, self._inputs, self._config))
         self.create_service(Trigger, '~/reset', self._on_reset)
         # A signal between two waits of the executor wakes it from neither: it has to look.
         self.create_timer(1.0, _nothing, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -200,13 +190,15 @@ class AlignmentNode(Node):
             self._adopted = outlook
             self._follower.adopt(
                 outlook.prediction if outlook.starts == self._starts else None)
-        now = None
         # What was learnt is about the axes of another IMU when the frame is another one.
-        if outlook.frame_id in (None, sample.frame_id):
-            now = self._follower.follow(sample.stamp_ns, sample.gyro)
-        self._imu_publisher.publish(
-            with_orientation(data) if now is None else
-            with_orientation(data, now.quaternion_xyzw, now.covariance))
+        if outlook.frame_id not in (None, sample.frame_id):
+            return
+        now = self._follower.follow(sample.stamp_ns, sample.gyro)
+        # Without an attitude nothing is published: navsat_transform takes the quaternion of the
+        # first message that it gets for the heading, for good, whatever its covariance says.
+        if now is not None:
+            self._imu_publisher.publish(
+                with_orientation(data, now.quaternion_xyzw, now.covariance))
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._starts += 1  # from here on, what the worker knew before does not hold
@@ -231,6 +223,7 @@ class AlignmentNode(Node):
         items.sort(key=itemgetter(0))
         for received_ns, item in items:
             self._feed(received_ns, item)
+        self._check([item for _, item in items])
         self._align()
         newest_ns = self._aligner.newest_imu_ns
         if newest_ns is not None and newest_ns != self._newest_imu_ns:
@@ -239,19 +232,20 @@ class AlignmentNode(Node):
         self._look_out()
         events = self._aligner.take_events()
         for event in events:
-            self._log(event)
+            self._log(event.severity, event.text)
+            self._reasons.note(event.text, time.monotonic())
         # By a clock that goes on when simulated time stands still.
         if events or time.monotonic() >= self._next_status:
             self._publish_status()
 
-    def _log(self, event: Event) -> None:
+    def _log(self, severity: Severity, text: str) -> None:
         # rclpy wants one line of code for each severity.
-        if event.severity is Severity.ERROR:
-            self.get_logger().error(event.text)
-        elif event.severity is Severity.WARNING:
-            self.get_logger().warning(event.text)
+        if severity is Severity.ERROR:
+            self.get_logger().error(text)
+        elif severity is Severity.WARNING:
+            self.get_logger().warning(text)
         else:
-            self.get_logger().info(event.text)
+            self.get_logger().info(text)
 
     def _feed(self, received_ns: int, item: Any) -> None:
         aligner = self._aligner
@@ -268,16 +262,31 @@ class AlignmentNode(Node):
             self._started += 1
             self._start_over('requested by service')
 
+    def _check(self, items: list[Any]) -> None:
+        """Let the checks see what has come from the IMU in use and from the GNSS."""
+        samples: list[ImuSample] = []
+        gnss = []
+        for item in items:
+            if isinstance(item, ImuSample) and item.frame_id == self._imu_frame:
+                samples.append(item)
+            elif isinstance(item, (Fix, Velocity)):
+                gnss.append((len(samples), item))
+        stamps, gyro, accel, _ = zip(*samples) if samples else ((), (), (), ())
+        self._checks.add(np.array(stamps, np.int64), np.array(gyro).reshape(-1, 3),
+                         np.array(accel).reshape(-1, 3), gnss)
+
     def _align(self) -> None:
         """Process what can be processed."""
         for epoch in self._aligner.update():
             self._declare(epoch.initial if epoch.state is State.ALIGNED else None)
+            self._publish_numbers(epoch)
         if self._aligner.declared is None:
             self._declare(None)
 
     def _start_over(self, why: str) -> None:
         self._align()  # what came before counts, whenever it was taken in
         self._aligner.reset(why)
+        self._checks = InputChecks(self._config)
 
     def _velocity(self, msg: Any) -> Velocity | None:
         try:
@@ -346,26 +355,62 @@ class AlignmentNode(Node):
         turn.x, turn.y, turn.z, turn.w = attitude.quaternion_xyzw.tolist()
         self._attitude_publisher.publish(msg)
 
+    def _publish_numbers(self, epoch: Epoch) -> None:
+        """Publish an epoch for plots."""
+        now = epoch.current
+        if now is None:
+            return
+        for publisher, values in (
+                (self._angles_publisher, (now.roll_deg, now.pitch_deg, now.yaw_deg)),
+                (self._sigma_publisher, now.sigma_deg)):
+            if publisher.get_subscription_count() > 0:
+                publisher.publish(vector_msg(now.stamp_ns, self._config.world_frame_id, values))
+
     def _publish_status(self) -> None:
         now = time.monotonic()
+        first = self._next_status == 0.0  # nobody is known yet who publishes anything
         self._next_status = now + STATUS_PERIOD
         status = self._aligner.status()
         level = LEVELS.get(status.state, DiagnosticStatus.WARN)
         silent = 0.0 if self._imu_heard is None else now - self._imu_heard
+        more = [] if first else self._input_faults(status, silent > IMU_SILENT)
         if silent > IMU_SILENT:
             # The aligner goes by stamps: it learns of a gap when the next sample comes.
+            more.append(f'no IMU sample for {silent:.0f} s')
+        reason = f'{status.state.value}: {status.reason}'
+        if more:
             level = max(level, DiagnosticStatus.WARN)
-            status = dataclasses.replace(
-                status, reason=f'{status.reason}; no IMU sample for {silent:.0f} s')
+            status = dataclasses.replace(status, reason='; '.join([status.reason, *more]))
         msg = DiagnosticArray()
         msg.header.stamp = self.get_clock().now().to_msg()
-        msg.status = [DiagnosticStatus(
-            level=level,
-            name=f'{self.get_name()}: alignment', message=f'{status.state.value}: {status.reason}',
-            hardware_id=self._imu_frame or '',
-            values=[KeyValue(key=key, value=value) for key, value in status_values(status)])]
+        msg.status = [diagnostic_status(
+            self.get_fully_qualified_name(), self._imu_frame or '', level, status)]
         for publisher in self._status_publishers:
             publisher.publish(msg)
+        self._state_publisher.publish(UInt8(data=STATE_NUMBERS[status.state]))
+        if not first:
+            self._log_reason(reason.split('; '), more, status.state, now)
+
+    def _input_faults(self, status: Status, silent: bool) -> list[str]:
+        """Say what is wrong with topics (nobody there, another type) and what they carry."""
+        expected = [topic for topic, wanted in (
+            (IMU_TOPIC, silent or status.state is State.WAITING_FOR_IMU),
+            (FIX_TOPIC, status.state is State.WAITING_FOR_GNSS),
+            (VELOCITY_TOPIC, self._config.use_velocity is True
+             and not status.counts.get('velocity'))) if wanted]
+        return [*topic_faults(self, self._inputs, expected, VELOCITY_TYPES),
+                *([] if status.state is State.ALIGNED else self._checks.faults())]
+
+    def _log_reason(self, reason: list[str], more: list[str], state: State, now: float) -> None:
+        """Log what is new in the reason, and every 10 s what stays and is not as it should be."""
+        again = bool(more) or state is not State.ALIGNED
+        for part, stays in self._reasons.due([*reason, *more], now, again):
+            if part == reason[0] and state is State.FAULT:
+                self._log(Severity.ERROR, part)
+            elif part in more or (stays and state is not State.ALIGNED):
+                self._log(Severity.WARNING, part)
+            else:
+                self._log(Severity.INFO, part)
 
     # Topics and parameters
 
@@ -434,66 +479,5 @@ class AlignmentNode(Node):
         self._worker.put((self._now_ns(), self._config))
 
 
-def queued(subscription: Subscription, most: int) -> list[tuple[Any, int]]:
-    """Take up to so many waiting messages, each with the time at which it was received, ns."""
-    messages = []
-    with subscription.handle:
-        for _ in range(most):
-            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-            if taken is None:
-                break
-            messages.append((taken[0], taken[1]['received_timestamp']))
-    return messages
-
-
 def _nothing(*_: Any) -> None:
     """Be a callback where nothing is to be done."""
-
-
-def parameter_descriptor(parameter: ParameterInfo) -> ParameterDescriptor:
-    """Describe one field of `Config` to ROS."""
-    unit = f' [{parameter.unit}]' if parameter.unit else ''
-    descriptor = ParameterDescriptor(
-        description=parameter.description + unit, read_only=parameter.read_only)
-    if parameter.choices:
-        descriptor.additional_constraints = 'one of: ' + ', '.join(
-            str(choice).lower() if isinstance(choice, bool) else choice
-            for choice in parameter.choices)
-    if parameter.minimum is not None and parameter.maximum is not None:
-        descriptor.floating_point_range = [FloatingPointRange(
-            from_value=parameter.minimum, to_value=parameter.maximum)]
-    return descriptor
-
-
-def status_values(status: Status) -> Iterator[tuple[str, str]]:
-    """List what a status says as names and values, angles in degrees."""
-    yield 'state', status.state.value
-    yield 'reason', status.reason
-    for name, value in (('stamp_ns', status.stamp_ns), ('t0_ns', status.t0_ns)):
-        yield name, '' if value is None else str(value)
-    yield 'time_to_align_s', _text(status.time_to_align_s)
-    for name, attitude in (('initial', status.initial), ('current', status.current)):
-        angles = sigma = None
-        if attitude is not None:
-            angles = attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg
-            sigma = attitude.sigma_deg
-        yield f'{name}_roll_pitch_yaw_deg', _text(angles)
-        yield f'{name}_sigma_east_north_up_deg', _text(sigma)
-    yield 'current_heading_deg', _text(
-        None if status.current is None else status.current.heading_deg)
-    for name, estimate, sigma, unit in (
-            ('gyro_bias', status.gyro_bias, status.gyro_bias_std, 'rad_s'),
-            ('accel_bias', status.accel_bias, status.accel_bias_std, 'm_s2'),
-            ('lever_arm', status.lever_arm, status.lever_arm_std, 'm'),
-            ('gnss_delay', status.gnss_delay, status.gnss_delay_std, 's')):
-        yield f'{name}_{unit}', _text(estimate)
-        yield f'{name}_std_{unit}', _text(sigma)
-    for name, count in status.counts.items():
-        yield name, str(count)
-
-
-def _text(value: float | Sequence[float] | np.ndarray | None) -> str:
-    """Write a number or several; nothing where nothing is known."""
-    if value is None:
-        return ''
-    return ' '.join(f'{number:.6g}' for number in np.atleast_1d(value))

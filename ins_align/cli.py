@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 # Everything else is imported where it is used: --help must not wait for numpy.
 
 ALIGNED, NOT_ALIGNED, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
+STANDARD_OUTPUT = '-'
 
 # Where the package to install has another name than the module.
 PACKAGES = {'backports': 'backports.zstd', 'PIL': 'pillow', 'pyins': 'python-ins',
@@ -82,7 +83,7 @@ With several recordings --json writes an array with an object for each, and --cs
 the recording's name before the suffix: out.csv becomes out_first.csv, out_second.csv.
 
 examples:
-  ins_align replay flight_1 --set lever_arm=[1.2,0.0,0.4] --json flight_1.json
+  ins_align replay flight_1 --lever-arm 1.2 0.0 0.4 --json flight_1.json
   ins_align replay drive.bag --params config/ins_align.yaml --start 30 --plot drive.png
 """
 
@@ -175,13 +176,19 @@ def parser() -> argparse.ArgumentParser:
                  formatter_class=argparse.RawDescriptionHelpFormatter)
     top.add_argument('--version', action=_Version, nargs=0, dest=argparse.SUPPRESS,
                      help='tell the version')
-    commands = top.add_subparsers(dest='command', metavar='COMMAND', required=True,
-                                  help=argparse.SUPPRESS)
+    top.set_defaults(run=_help, parser=top)  # without a command
+    commands = top.add_subparsers(dest='command', metavar='COMMAND', help=argparse.SUPPRESS)
     _add_info(commands)
     _add_replay(commands)
     _add_simulate(commands)
     _add_experiment(commands)
     return top
+
+
+def _help(arguments: argparse.Namespace) -> int:
+    """Say what there is to those who give no command."""
+    arguments.parser.print_help()
+    return UNUSABLE
 
 
 def _add_command(commands: Any, name: str, run: Callable[[argparse.Namespace], int],
@@ -231,7 +238,8 @@ def _add_info(commands: Any) -> None:
     command = _add_command(commands, 'info', run_info,
                            'Tell what recordings hold and how to align them.', INFO_EPILOG)
     _add_bags(command)
-    command.add_argument('--json', metavar='FILE', help='write what is known, for programs')
+    command.add_argument('--json', metavar='FILE', help='write what is known, for programs; '
+                         '-: to standard output, instead of the text')
 
 
 def _add_bags(command: argparse.ArgumentParser) -> None:
@@ -246,6 +254,8 @@ def _add_replay(commands: Any) -> None:
     group.add_argument('--params', metavar='FILE', help='parameter file of the node (YAML)')
     group.add_argument('--set', action='append', default=[], metavar='NAME=VALUE',
                        dest='overrides', help='set a parameter; repeatable, after --params')
+    group.add_argument('--lever-arm', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
+                       help='IMU to antenna in the IMU frame, m: sets the parameter lever_arm')
     group = command.add_argument_group('input')
     for name, what in (('imu', 'IMU'), ('fix', 'position'), ('velocity', 'velocity')):
         group.add_argument(f'--{name}-topic', metavar='TOPIC',
@@ -258,7 +268,8 @@ def _add_replay(commands: Any) -> None:
     group.add_argument('--dask', metavar='ADDRESS',
                        help='process the recordings on the Dask cluster with this scheduler')
     group = command.add_argument_group('output')
-    group.add_argument('--json', metavar='FILE', help='write the result')
+    group.add_argument('--json', metavar='FILE', help='write the result; '
+                       '-: to standard output, instead of the table')
     group.add_argument('--csv', metavar='FILE', help='write a row for every GNSS epoch')
     group.add_argument('--plot', metavar='FILE',
                        help='draw attitude, sigma, innovations, biases, error and track '
@@ -356,8 +367,9 @@ def run_info(arguments: argparse.Namespace) -> int:
         with _readers_may_leave(sys.stderr):
             for warning in info.warnings:
                 print(f'ins_align info: warning: {_of(bag, warning)}', file=sys.stderr)
-        with _readers_may_leave(sys.stdout):
-            print(describe(info) + '\n')
+        if arguments.json != STANDARD_OUTPUT:
+            with _readers_may_leave(sys.stdout):
+                print(describe(info) + '\n')
         objects.append(info.to_json())
     if arguments.json:
         _write_json(arguments.json, objects if several else objects[0])
@@ -370,6 +382,9 @@ def run_replay(arguments: argparse.Namespace) -> int:
     gc.set_threshold(100_000)  # rows and results by the thousand, none of which is garbage
     several = len(arguments.bags) > 1
     labels = _labels(arguments.bags) if several else ['']
+    for option in ('csv', 'plot'):
+        if getattr(arguments, option) == STANDARD_OUTPUT:
+            raise UsageError(f'--{option} needs the name of a file')
     outputs = [path for path in (arguments.json, arguments.csv, arguments.plot) if path]
     outputs += [_with_label(path, label) for path in (arguments.csv, arguments.plot) if path
                 for label in labels if label]
@@ -401,8 +416,9 @@ def run_replay(arguments: argparse.Namespace) -> int:
                 with _readers_may_leave(sys.stderr):
                     for warning in outcome.warnings:
                         progress.note(f'ins_align replay: warning: {_of(bag, warning)}')
-                with _readers_may_leave(sys.stdout):
-                    progress.say(outcome.summary + '\n')
+                if arguments.json != STANDARD_OUTPUT:
+                    with _readers_may_leave(sys.stdout):
+                        progress.say(outcome.summary + '\n')
                 statuses.append(ALIGNED if outcome.json['aligned'] else NOT_ALIGNED)
             objects.append(outcome.json)
     if arguments.json:
@@ -440,6 +456,10 @@ def _write_json(path: str, content: Any) -> None:
     from ins_align.report import write_whole
 
     text = json.dumps(content, indent=2, allow_nan=False) + '\n'
+    if path == STANDARD_OUTPUT:
+        with _readers_may_leave(sys.stdout):
+            sys.stdout.write(text)
+        return
     try:
         write_whole(path, lambda file: file.write(text.encode()))
     except OSError as error:
@@ -460,6 +480,8 @@ def _config(arguments: argparse.Namespace) -> Config:
                       f'{arguments.params} {no_effect(name)}', file=sys.stderr)
             del values[name]
         values.update(parse_override(text) for text in arguments.overrides)
+        if arguments.lever_arm is not None:
+            values['lever_arm'] = arguments.lever_arm
         return config_from_mapping(values)
     except ConfigError as error:
         raise UsageError(error) from None
@@ -486,7 +508,7 @@ def _with_label(path: str | None, label: str) -> str | None:
 
 def _check_writable(path: str | None, inputs: Sequence[str]) -> None:
     """Find out before the work whether its result can be written, and spoils no input."""
-    if path is None:
+    if path in (None, STANDARD_OUTPUT):
         return
     from ins_align.report import is_stream
 

@@ -101,10 +101,11 @@ class Config:
         'auto', 'align with GNSS positions; auto: when no velocity arrives', choices=AUTO_OR_BOOL)
     velocity_type: str = _parameter(
         'TwistWithCovarianceStamped', 'message type of the velocity topic',
-        choices=('TwistWithCovarianceStamped', 'TwistStamped', 'Odometry'))
+        choices=('TwistWithCovarianceStamped', 'TwistStamped', 'Odometry', 'Vector3Stamped'))
     velocity_frame: str = _parameter(
-        'enu', 'world frame in which the antenna velocity is given: east-north-up or '
-        'north-east-down', choices=('enu', 'ned'))
+        'auto', 'world frame in which the antenna velocity is given: east-north-up or '
+        'north-east-down, whatever its frame_id says; auto: enu, and a velocity with the frame_id '
+        'of a body is refused', choices=('auto', 'enu', 'ned'))
     velocity_vertical: str = _parameter(
         'measured', 'absent: the receiver does not measure the vertical velocity and sends 0, as '
         'NMEA drivers do', choices=('measured', 'absent'))

@@ -37,8 +37,6 @@ _RATE_OFFSET = 8 * 13
 _FORCE_OFFSET = 8 * 25
 _BODY_BYTES = 8 * 37
 
-_NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0, -1.0) + (0.0,) * 8  # as sensor_msgs/Imu marks it
-
 
 class ImuSample(NamedTuple):
     """What the alignment needs of one message."""
@@ -78,8 +76,8 @@ def read_imu(data: bytes) -> ImuSample:
                      frame.decode(errors='replace'))
 
 
-def with_orientation(data: bytes, quaternion_xyzw: Sequence[float] | None = None,
-                     covariance: Sequence[float] | None = None) -> bytes:
+def with_orientation(data: bytes, quaternion_xyzw: Sequence[float],
+                     covariance: Sequence[float]) -> bytes:
     """
     Return a serialised sensor_msgs/Imu with another orientation.
 
@@ -87,15 +85,13 @@ def with_orientation(data: bytes, quaternion_xyzw: Sequence[float] | None = None
     ----------
     data : bytes
         The message.
-    quaternion_xyzw : four floats, optional
-        None marks the orientation as not known: covariance[0] = -1.
-    covariance : nine floats, optional
+    quaternion_xyzw : four floats
+        IMU frame to ENU.
+    covariance : nine floats
         rad^2, row by row.
 
     """
-    orientation: tuple[float, ...] = _NO_ORIENTATION
-    if quaternion_xyzw is not None and covariance is not None:
-        orientation = (*quaternion_xyzw, *covariance)
+    orientation = (*quaternion_xyzw, *covariance)
     start = body_start(data)
     if start is None:
         msg = deserialize_message(data, Imu)

@@ -18,10 +18,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
+from ins_align.checks import degrees_fault, turn_ratio
 from ins_align.config import PRESETS
 from ins_align.earth import EARTH_RATE
 from ins_align.motion_survey import GRID, Series
-from ins_align.plausibility import FORCE_RANGE, RangeCheck
+from ins_align.plausibility import force_fault, RangeCheck
 from ins_align.recordings.decode import ImuSamples
 from ins_align.rotation import Array
 import numpy as np
@@ -34,11 +35,6 @@ BIAS_SIGMAS = 3.0
 REST_SPEED = 0.3  # m/s below which a vehicle may stand
 REST_RATE, REST_FORCE = math.radians(1.0), 0.3  # rad/s, m/s^2: scatter of half seconds at rest
 MIN_REST = 5.0  # s
-MIN_COURSE_SPEED = 2.0  # m/s above which a course means something
-MIN_COURSE_RATE = 0.05  # rad/s
-MIN_CORRELATION = 0.7
-DEGREES_RATIO = 15.0  # times the turn of the course: between 1 and 57, nearer to degrees
-ANY_GYRO_RATE = 70.0  # rad/s: more than the 4000 deg/s that any usual gyroscope measures
 
 
 @dataclass(frozen=True)
@@ -93,13 +89,10 @@ def survey_imu(samples: ImuSamples, times: Array, velocities: Series | None,
     rates = np.sqrt(np.sum(samples.gyro ** 2, axis=1))
     max_rate = float(np.quantile(rates, 0.999))
     grid, gyro, accel = _cells(samples, times)
-    ratio = _turn_ratio(grid, gyro, up, velocities)
-    faults = []
-    if not FORCE_RANGE[0] < mean_force < FORCE_RANGE[1]:
-        faults.append(f'the specific force averages {mean_force:.3g} m/s^2, gravity is 9.8: check '
-                      'the unit (g?) and that gravity is not taken out')
-    if max_rate > ANY_GYRO_RATE or (ratio is not None and ratio > DEGREES_RATIO):
-        faults.append('the angular rates look like deg/s: they must be rad/s')
+    ratio = turn_ratio(grid, gyro, up, velocities)
+    faults = [fault for fault in [force_fault(mean_force)] if fault]
+    if degrees := degrees_fault(max_rate, ratio):
+        faults.append(degrees)
     elif ratio is not None and ratio < 0.0:
         faults.append('in left turns the rate about the upward axis is negative: a sign of the '
                       'gyroscopes or of the specific force is wrong (+9.8 along up at rest)')
@@ -160,28 +153,6 @@ def _cells(samples: ImuSamples, times: Array) -> tuple[Array, Array, Array]:
     return (times[0] + (index[starts] + 0.5) * GRID,
             np.add.reduceat(samples.gyro, starts) / counts,
             np.add.reduceat(samples.accel, starts) / counts)
-
-
-def _turn_ratio(grid: Array, gyro: Array, up: Array, velocities: Series | None) -> float | None:
-    """Return the rate about the vertical over the turn of the course; None: nothing to tell."""
-    if velocities is None or velocities.times.size < 5:
-        return None
-    v = velocities.vectors[:, :2]
-    course = np.unwrap(np.arctan2(v[:, 1], v[:, 0]))
-    times = velocities.times
-    elapsed = times[2:] - times[:-2]
-    rate = (course[2:] - course[:-2]) / elapsed
-    moving = ((np.hypot(*v.T)[1:-1] > MIN_COURSE_SPEED) & (elapsed < 3.0 * GRID)
-              & (np.abs(rate) > MIN_COURSE_RATE))
-    turning = np.interp(times[1:-1], grid, gyro @ up)[moving]
-    rate = rate[moving]
-    energy = float(rate @ rate)
-    if rate.size < 10 or not turning.any():
-        return None
-    product = float(turning @ rate)
-    if abs(product) < MIN_CORRELATION * math.sqrt(energy * float(turning @ turning)):
-        return None
-    return product / energy
 
 
 def _longest_rest(grid: Array, gyro: Array, accel: Array, velocities: Series | None,

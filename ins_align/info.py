@@ -24,6 +24,8 @@ import shlex
 from typing import Any
 
 from ins_align.buffers import MAX_AHEAD_NS, MAX_GAP_NS
+from ins_align.checks import (
+    BEYOND_THE_POLES, beyond_the_poles, exchange_fault, lateness_advice, MAX_LATENESS)
 from ins_align.config import Config, config_from_mapping, parse_override
 from ins_align.earth import normal_gravity
 from ins_align.imu_survey import ImuFacts, survey_imu
@@ -38,7 +40,6 @@ from ins_align.report import format_table
 from ins_align.topic_survey import KINDS, MAX_ASTRAY, read_candidates, Recorded, Timing
 import numpy as np
 
-MAX_LATENESS = 60.0  # s, the limit of the parameter gnss_lateness
 MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
 MIN_AHEAD = 0.3  # s: GNSS stamps this far ahead of the IMU's are no jitter
 MIN_START = 5.0  # s that an alignment starts before a manoeuvre
@@ -118,6 +119,9 @@ class _Survey:
         """Return everything that is known."""
         fixes = [self._fix(data) for data in self._of('fix')]
         fix = _best(fixes)
+        if fix is not None and (fault := self._exchanged(fix)):
+            fixes = [dataclasses.replace(topic, faults=(fault,)) if topic is fix else topic
+                     for topic in fixes]
         positions = self._positions(fix)
         velocities = [self._velocity(data, positions) for data in self._of('velocity')]
         velocity = _best(velocities)
@@ -128,7 +132,8 @@ class _Survey:
         gravity = float(normal_gravity(math.radians(latitude), altitude))
         imus = [self._imu(data, motion, gravity) for data in self._of('imu')]
         imu = _best(imus)
-        chosen = {'imu': imu or _first(imus), 'fix': fix or _first(fixes), 'velocity': velocity}
+        chosen = {'imu': imu or _first(imus), 'fix': _best(fixes) or _first(fixes),
+                  'velocity': velocity}
         lateness = self._lateness(chosen)
         found = find_manoeuvres(motion)
         self._advise_imu(chosen['imu'])
@@ -152,7 +157,7 @@ class _Survey:
 
     def _topic(self, data: Recorded, faults: list[str], **more: Any) -> TopicInfo:
         count = data.stamps_ns.size
-        if not count and not data.refusals:
+        if not count:
             faults = [*faults, 'it has no messages' if not data.undecodable
                       else 'its messages cannot be decoded']
         return TopicInfo(
@@ -164,20 +169,32 @@ class _Survey:
         faults = []
         count = data.stamps_ns.size
         if count and not data.usable.any():
+            beyond = [beyond_the_poles(*place) for place in data.values[:, :2].tolist()]
             faults.append('no message has a fix' if data.no_fix == count else
+                          BEYOND_THE_POLES if np.mean(beyond) > 0.5 else
                           'no message has a fix and numbers that can be used')
         return self._topic(data, faults, **_stated(data),
                            no_fix_share=data.no_fix / count if count else None)
+
+    def _exchanged(self, fix: TopicInfo) -> str:
+        """Say that latitude and longitude are exchanged, and exchange them for the rest."""
+        data = self._data[fix.name]
+        fault = next(filter(None, (
+            exchange_fault(self._series(data), self._series(velocity))
+            for velocity in self._of('velocity') if velocity.usable.any())), '')
+        if fault:
+            data.values = data.values[:, [1, 0, 2]]
+        return fault
 
     def _velocity(self, data: Recorded, positions: Series) -> TopicInfo:
         faults = []
         if 'cmd' in data.topic.name.rsplit('/', 1)[-1]:
             faults.append('its name is that of a command, not of a measurement')
-        if data.refusals and data.refusals.total() > data.stamps_ns.size:
-            faults.append(data.refusals.most_common(1)[0][0])
         frame = absent = None
         if data.usable.any():
             frame = velocity_frame(self._series(data), positions)
+            if _is_refused(data) and frame.frame not in FRAMES_THAT_FIT:
+                faults.append(data.refusals.most_common(1)[0][0])
             faults += _frame_faults(frame)
             values = data.values[data.usable]
             absent = bool((values[:, 2] == 0.0).all() and (values[:, :2] != 0.0).any())
@@ -290,8 +307,8 @@ class _Survey:
         if frame is None or frame.frame == 'unknown':
             self._notes.append('nothing tells the frame of the velocity (too little motion): '
                                'it is taken as east-north-up')
-        elif frame.frame == 'ned':
-            self._settings.append('velocity_frame=ned')
+        elif frame.frame == 'ned' or _is_refused(self._data[velocity.name]):
+            self._settings.append(f'velocity_frame={frame.frame}')
         if frame is not None and frame.upside_down:
             self._notes.append('the vertical velocity has the wrong sign')
         if velocity.vertical_absent:
@@ -314,10 +331,9 @@ class _Survey:
             return
         self._advise_delay(chosen, imu.timing.stamp_age_s)
         if lateness is not None and Config.gnss_lateness < lateness < MAX_LATENESS:
-            self._settings.append(f'gnss_lateness={math.ceil(2.0 * lateness) / 2.0 + 0.5:g}')
-            self._notes.append(f'GNSS messages come up to {lateness:.1f} s later than newer IMU '
-                               'samples; if it is their clock that is behind, and not the '
-                               f'messages, set gnss_delay={-lateness:.1f} instead')
+            advice, value = lateness_advice(lateness)
+            self._settings.append(f'gnss_lateness={value}')
+            self._notes.append(advice)
 
     def _advise_delay(self, chosen: dict[str, TopicInfo | None], imu_age: float | None) -> None:
         """See whether GNSS messages are recorded before they could have been measured."""
@@ -370,7 +386,7 @@ def describe(info: Info) -> str:
     if info.command is None:
         lines += ['', '  it cannot be aligned', *(f'    - {text}' for text in info.obstacles)]
     else:
-        lines += ['', '  to align it, with the lever arm added: --set lever_arm=[X,Y,Z]',
+        lines += ['', '  to align it, with the lever arm added: --lever-arm X Y Z',
                   f'    {info.command}']
     return '\n'.join(printable(line) for text in lines for line in text.split('\n'))
 
@@ -472,6 +488,11 @@ def _stated(data: Recorded) -> dict[str, Any]:
         return {'covariance_share': 0.0 if stated.size else None}
     horizontal, vertical = np.median(data.sigmas[stated], axis=0).tolist()
     return {'covariance_share': float(np.mean(stated)), 'sigma': (horizontal, vertical)}
+
+
+def _is_refused(data: Recorded) -> bool:
+    """Whether an alignment refuses most velocities of a topic for their frame_id."""
+    return data.refusals.total() > 0.5 * data.stamps_ns.size
 
 
 def _says_unmeasured(data: Recorded) -> str:

@@ -129,6 +129,8 @@ def velocity_from_msg(msg: Any, config: Config) -> Velocity:
     frame = msg.header.frame_id
     if config.velocity_type == 'TwistStamped':
         linear = msg.twist.linear
+    elif config.velocity_type == 'Vector3Stamped':
+        linear = msg.vector
     else:
         linear = msg.twist.twist.linear
         covariance = np.array(msg.twist.covariance, dtype=float).reshape(1, 6, 6)
@@ -136,6 +138,11 @@ def velocity_from_msg(msg: Any, config: Config) -> Velocity:
             frame = msg.child_frame_id  # the frame of nav_msgs/Odometry's twist
     return velocities([stamp_from_msg(msg)], frame, [[linear.x, linear.y, linear.z]], covariance,
                       config)[0]
+
+
+def is_body_frame(frame: str) -> bool:
+    """Whether a frame_id is one of the customary names of a body frame."""
+    return _BODY_FRAME.search(frame) is not None
 
 
 def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
@@ -162,13 +169,14 @@ def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
     Raises
     ------
     MessageError
-        If the frame is that of a body.
+        If the frame is that of a body and ``config.velocity_frame`` does not say otherwise.
 
     """
-    if _BODY_FRAME.search(frame):
+    if config.velocity_frame == 'auto' and is_body_frame(frame):
         raise MessageError(
             f'the velocity is given in the body frame {frame[:80]!r}: an alignment needs it in a '
-            'world frame, east-north-up or north-east-down')
+            'world frame, east-north-up or north-east-down; if it is in one, whatever its '
+            'frame_id says, set velocity_frame to enu or ned')
     velocity = np.array(linear, dtype=float)
     usable: list[np.ndarray | None] = [None] * len(velocity)
     if config.velocity_frame == 'ned':

@@ -209,6 +209,13 @@ class RangeCheck:
         return at_end
 
 
+def force_fault(mean: float) -> str:
+    """Say what is wrong with a mean magnitude of the specific force, m/s^2; '' if nothing is."""
+    return '' if FORCE_RANGE[0] < mean < FORCE_RANGE[1] else (
+        f'the specific force averages {mean:.3g} m/s^2, gravity is 9.8: check the unit (g?) '
+        'and that gravity is not taken out')
+
+
 class ForceCheck:
     """Whether the magnitude of the specific force can be one in m/s^2."""
 
@@ -227,9 +234,7 @@ class ForceCheck:
             return
         mean = self._sum / self._count
         self._sum, self._count, self._seconds = 0.0, 0, 0.0
-        self.fault = '' if FORCE_RANGE[0] < mean < FORCE_RANGE[1] else (
-            f'the specific force averages {mean:.3g} m/s^2, gravity is 9.8: check the unit (g?) '
-            'and that gravity is not taken out')
+        self.fault = force_fault(mean)
 
 
 class VelocityCheck:

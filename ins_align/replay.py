@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable
+import dataclasses
 from dataclasses import dataclass
 import io
 import math
@@ -26,6 +27,7 @@ from typing import Any, NamedTuple
 from ins_align.ahead import run_ahead
 from ins_align.alignment import Alignment
 from ins_align.buffers import fault_of_fix
+from ins_align.checks import InputChecks
 from ins_align.config import Config
 from ins_align.intake import Intake, Step
 from ins_align.messages import Fix
@@ -128,6 +130,23 @@ class ReplayResult:
         """Whether the recording ends with a declared alignment."""
         return self.status.state is State.ALIGNED
 
+    @property
+    def declared(self) -> Attitude | None:
+        """Return the initial attitude as the node publishes it at the last declaration."""
+        declared, before = None, None
+        for epoch in self.epochs:
+            if epoch.state is State.ALIGNED and before is not State.ALIGNED:
+                declared = epoch.initial
+            before = epoch.state
+        return declared
+
+    @property
+    def first_t0_ns(self) -> int | None:
+        """Return the stamp from which `Epoch.t_s` is counted; None: there is no epoch."""
+        if not self.epochs:
+            return None
+        return self.epochs[0].stamp_ns - round(self.epochs[0].t_s * 1e9)
+
     def to_json(self) -> dict[str, Any]:
         """Return the object that ``--json`` writes; numbers that are not finite are None."""
         status = self.status
@@ -225,15 +244,20 @@ class _Prepared(NamedTuple):
     counts: Counter[str]  # of all messages so far
     done: float  # how much of the recording this ends at, 0 to 1
     warnings: tuple[str, ...]  # so far
+    faults: tuple[str, ...] = ()  # of the messages, in sentences; of the last part
 
 
 def _prepared(request: Request) -> Generator[_Prepared, None, None]:
     """Read a recording and prepare it; the last part has all counts and warnings."""
     intake: Intake | None = None
+    checks = InputChecks(request.config)
     waiting = 0
     for part in read(request):
         intake = intake or Intake(part.config)
         _feed(intake, part)
+        checks.add(part.imu.stamps_ns, part.imu.gyro, part.imu.accel, [
+            (before, message) for before, message in part.gnss
+            if not isinstance(message, Refused)])
         waiting += len(part.imu.stamps_ns) + len(part.gnss)
         fixes = [(message.stamp_ns, message.latitude_deg, message.longitude_deg)
                  for _, message in part.gnss
@@ -248,7 +272,8 @@ def _prepared(request: Request) -> Generator[_Prepared, None, None]:
     assert intake is not None
     intake.prepare(last=True)
     # Of the last part, which has no messages.
-    yield prepared._replace(steps=intake.take_steps(), counts=Counter(intake.counts))
+    yield prepared._replace(steps=intake.take_steps(), counts=Counter(intake.counts),
+                            faults=tuple(checks.faults()))
 
 
 def _feed(intake: Intake, part: Part) -> None:
@@ -294,9 +319,12 @@ class _Run:
         first_fix_ns = self._fixes[0][0] if self._fixes else 0
         track = np.array([(stamp - first_fix_ns, latitude, longitude)
                           for stamp, latitude, longitude in self._fixes]).reshape(-1, 3)
-        return ReplayResult(self._path, self._alignment.status(last.counts), tuple(self._epochs),
-                            last.warnings, self._reference, self._topics, track, first_fix_ns,
-                            self._config)
+        status = self._alignment.status(last.counts)
+        if status.state is not State.ALIGNED and last.faults:
+            status = dataclasses.replace(
+                status, reason='; '.join([status.reason, *last.faults]))
+        return ReplayResult(self._path, status, tuple(self._epochs), last.warnings,
+                            self._reference, self._topics, track, first_fix_ns, self._config)
 
 
 def _attitude_json(attitude: Attitude | None) -> dict[str, Any] | None:

@@ -41,8 +41,8 @@ STATE_COLOURS = {
 ROLL, PITCH, HEADING = '#0072B2', '#CC79A7', '#D55E00'
 AXES_OF_ENU = (('east', ROLL), ('north', PITCH), ('up', HEADING))
 AXES_OF_IMU = (('x', ROLL), ('y', PITCH), ('z', HEADING))
+DECLARED_GREEN = STATE_COLOURS[State.ALIGNED]
 INNOVATION_LIMIT = 5.0  # sigmas shown at least
-DECLARED_GREEN = '#009E73'
 METRES_PER_DEGREE = 6_371_000.0 * math.pi / 180.0  # of latitude, mean sphere: good for a picture
 BREAK_INTERVALS = 5.0  # a line ends where epochs are further apart than so many usual distances
 LOST_SIGMA_DEG = 60.0  # above this a heading is not worth drawing
@@ -141,34 +141,44 @@ def _cell(value: Any) -> str:
     return str(value)
 
 
-def declared_spans(epochs: Sequence[Epoch]) -> list[tuple[float, float]]:
-    """Return the first and the last epoch of each time that was ALIGNED, s since the first t0."""
+def declared_spans(epochs: Sequence[Epoch], state: State = State.ALIGNED,
+                   ) -> list[tuple[float, float]]:
+    """Return the first and the last epoch of each time in a state, s since the first t0."""
     spans: list[tuple[float, float]] = []
-    aligned = False
+    inside = False
     for epoch in epochs:
-        start = spans[-1][0] if aligned else epoch.t_s
-        if epoch.state is State.ALIGNED:
-            spans[len(spans) - aligned:] = [(start, epoch.t_s)]
-        aligned = epoch.state is State.ALIGNED
+        start = spans[-1][0] if inside else epoch.t_s
+        if epoch.state is state:
+            spans[len(spans) - inside:] = [(start, epoch.t_s)]
+        inside = epoch.state is state
     return spans
+
+
+def _state_in_words(result: ReplayResult) -> str:
+    """Return the state at the end, and when it was declared, s since the first t0."""
+    state = result.status.state
+    spans = declared_spans(result.epochs)
+    after = f' after {spans[-1][0]:.1f} s' if spans and state is State.ALIGNED else ''
+    return f'{state.value}{after}'
 
 
 def summary(result: ReplayResult) -> str:
     """Return the table that ``ins_align replay`` prints of a recording."""
     status = result.status
-    after = '' if status.time_to_align_s is None else f' after {status.time_to_align_s:.1f} s'
-    lines = [result.bag, f'  {status.state.value}{after}: {status.reason}']
+    lines = [result.bag, f'  {_state_in_words(result)}: {status.reason}']
     spans = declared_spans(result.epochs)
     # Where it is not one from then to the end.
     if spans and (status.state is not State.ALIGNED or len(spans) > 1):
         lines.append('  it was ALIGNED from ' + ', '.join(
             f'{start:.1f} to {end:.1f} s' for start, end in spans))
-    attitudes = [('initial', status.initial), ('final', status.current)]
+    declared = None if status.initial is None else result.declared
+    attitudes = [('declared', declared), ('initial', status.initial), ('final', status.current)]
+    start_ns = result.first_t0_ns or 0
     rows = []
     for name, attitude in attitudes:
         if attitude is None:
             continue
-        row = [name, f'{attitude.stamp_ns * 1e-9:.3f}']
+        row = [name, f'{(attitude.stamp_ns - start_ns) * 1e-9:.1f}']
         row += [f'{angle:.3f}' for angle in (
             attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg, attitude.heading_deg)]
         row += [f'{sigma:.3f}' for sigma in attitude.sigma_deg]
@@ -177,11 +187,13 @@ def summary(result: ReplayResult) -> str:
             row += ['-'] * 3 if errors is None else [f'{error:+.3f}' for error in errors[1]]
         rows.append(row)
     if rows:
-        header = ['attitude, deg', 'stamp, s', 'roll', 'pitch', 'yaw', 'heading', 'sigma e',
+        header = ['attitude, deg', 'at, s', 'roll', 'pitch', 'yaw', 'heading', 'sigma e',
                   'n', 'u']
         if result.reference is not None:
             header += ['error roll', 'pitch', 'yaw']
-        lines += ['', format_table(rows, header, '  '), '', _nuisance_table(result)]
+        lines += ['', format_table(rows, header, '  '),
+                  f'  all times since the first t0, stamp {start_ns * 1e-9:.3f} s; declared: '
+                  'at its t0, as the node publishes it', '', _nuisance_table(result)]
     counts = ', '.join(f'{name} {count}' for name, count in sorted(status.counts.items()) if count)
     return '\n'.join([*lines, '', f'  counts: {counts or "nothing read"}'])
 
@@ -228,9 +240,8 @@ def plot(result: ReplayResult) -> Figure:
     """
     figure = new_figure(16.0, 11.0)
     status = result.status
-    after = '' if status.time_to_align_s is None else f' after {status.time_to_align_s:.1f} s'
     name = one_line(Path(result.bag).name or result.bag)
-    figure.suptitle(f'{name}: {status.state.value}{after}', fontsize=13, parse_math=False)
+    figure.suptitle(f'{name}: {_state_in_words(result)}', fontsize=13, parse_math=False)
     columns = figure.add_gridspec(1, 2, width_ratios=(3, 2))
     left, right = figure.add_subfigure(columns[0]), figure.add_subfigure(columns[1])
     series = _Series(result)
@@ -257,7 +268,8 @@ def plot(result: ReplayResult) -> Figure:
         axes.set_xlabel('time since t0 (s)')
     _plot_track(track, result)
     for axes in (tilt, heading, sigma, innovation, *upper):
-        _mark_declaration(axes, series)
+        _shade_states(axes, series, axes is tilt)
+    _mark_declared(tilt, heading, result)
     for axes in (tilt, heading, sigma, innovation, *upper, track):
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
@@ -301,6 +313,7 @@ class _Series:
         self.aligned = np.insert(
             np.array([epoch.state is State.ALIGNED for epoch, _, _ in pairs], bool), breaks, False)
         self.declared = declared_spans(result.epochs)
+        self.levelled = declared_spans(result.epochs, State.LEVELLED)
         self.errors = self.reference = None
         if result.reference is not None:
             none = (np.full(3, np.nan), np.full(3, np.nan))
@@ -447,8 +460,26 @@ def _plot_track(axes: Axes, result: ReplayResult) -> None:
     axes.set_aspect('equal', adjustable='datalim')
 
 
-def _mark_declaration(axes: Axes, series: _Series) -> None:
-    for number, (start, end) in enumerate(series.declared):
-        axes.axvspan(start, end, color=DECLARED_GREEN, alpha=0.07, linewidth=0)
-        axes.axvline(start, color=DECLARED_GREEN, linewidth=1.2,
-                     label='declared aligned' if number == 0 else None)
+def _shade_states(axes: Axes, series: _Series, named: bool) -> None:
+    """Shade the times that were ALIGNED or LEVELLED; one legend with the names is enough."""
+    for spans, colour, label in (
+            (series.levelled, STATE_COLOURS[State.LEVELLED], 'roll and pitch declared'),
+            (series.declared, DECLARED_GREEN, 'declared aligned')):
+        for number, (start, end) in enumerate(spans):
+            axes.axvspan(start, end, color=colour, alpha=0.1, linewidth=0)
+            axes.axvline(start, color=colour, linewidth=1.2,
+                         label=label if named and number == 0 else None)
+
+
+def _mark_declared(tilt: Axes, heading: Axes, result: ReplayResult) -> None:
+    """Draw the attitude as it was declared, with its sigma, where it holds: at its t0."""
+    declared = result.declared
+    if declared is None or result.first_t0_ns is None:
+        return
+    time = (declared.stamp_ns - result.first_t0_ns) * 1e-9
+    level, up = max(declared.sigma_deg[:2]), declared.sigma_deg[2]
+    for axes, angle, sigma, label in (
+            (tilt, declared.roll_deg, level, 'declared, at its t0'),
+            (tilt, declared.pitch_deg, level, None), (heading, declared.yaw_deg, up, None)):
+        axes.errorbar([time], [angle], yerr=[sigma], color='black', marker='D', markersize=4,
+                      capsize=3.0, linewidth=1.0, linestyle='none', label=label, zorder=5)

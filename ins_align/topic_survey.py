@@ -29,7 +29,7 @@ from ins_align.recordings import Topic
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import (
     decode_gnss, decode_imu, deserialize, GNSS_TYPES, IMU_TYPE, Refused)
-from ins_align.recordings.reader import REFERENCE_NAMESPACE
+from ins_align.recordings.reader import may_be_velocity, REFERENCE_NAMESPACE
 from ins_align.rotation import Array
 import numpy as np
 
@@ -87,7 +87,7 @@ class Recorded:
         self.usable = np.zeros(0, bool)  # finite and, of fixes, with a fix
         self.no_fix = 0
         self.undecodable = 0
-        self.refusals: Counter[str] = Counter()  # why messages cannot be used, in words
+        self.refusals: Counter[str] = Counter()  # why a frame_id is refused, in words
         self.unmeasured: list[str] = []  # what an IMU says that it does not measure
         self._rows: list[tuple[Any, ...]] = []
 
@@ -101,14 +101,17 @@ class Recorded:
             self._rows.append((times_ns[samples.decoded], samples.stamps_ns,
                                np.hstack([samples.gyro, samples.accel])))
             return
-        for time_ns, message in zip(times_ns.tolist(),
-                                    decode_gnss(messages, self.topic, Config())):
-            if not isinstance(message, Refused):
-                self._add_gnss(time_ns, message)
-            elif message.why:
-                self.refusals[message.why] += 1
-            else:
+        decoded = decode_gnss(messages, self.topic, Config())
+        refusals = [message.why for message in decoded
+                    if isinstance(message, Refused) and message.why]
+        if refusals:  # for their frame_id, which may be wrong: the motion will tell
+            self.refusals.update(refusals)
+            decoded = decode_gnss(messages, self.topic, Config(velocity_frame='enu'))
+        for time_ns, message in zip(times_ns.tolist(), decoded):
+            if isinstance(message, Refused):
                 self.undecodable += 1
+            else:
+                self._add_gnss(time_ns, message)
 
     def finish(self) -> None:
         """Turn what has been added into arrays."""
@@ -146,7 +149,7 @@ class Recorded:
         """Return when messages came."""
         count = self.stamps_ns.size
         if count == 0:
-            return Timing(self.undecodable + self.refusals.total(), None, None, None, None, None,
+            return Timing(self.undecodable, None, None, None, None, None,
                           0, 0, 0, None)
         ages = (self.recorded_ns - self.stamps_ns) * 1e-9
         astray = self._astray()
@@ -165,7 +168,7 @@ class Recorded:
                 gap = Gap(float(stamps[longest] - start_ns + self.age_ns) * 1e-9,
                           float(intervals[longest]))
         return Timing(
-            count + self.undecodable + self.refusals.total(), rate,
+            count + self.undecodable, rate,
             (int(self.recorded_ns[0]) - start_ns) * 1e-9,
             (int(self.recorded_ns[-1]) - start_ns) * 1e-9,
             float(np.median(ages)), high - low, int(np.count_nonzero(astray)),
@@ -231,4 +234,6 @@ def read_candidates(bag: Bag) -> list[Recorded]:
 def _kind(topic: Topic) -> str:
     if topic.msgtype == IMU_TYPE:
         return 'imu'
-    return GNSS_TYPES[topic.msgtype].kind if topic.msgtype in GNSS_TYPES else ''
+    if topic.msgtype not in GNSS_TYPES or not may_be_velocity(topic):
+        return ''
+    return GNSS_TYPES[topic.msgtype].kind

@@ -19,21 +19,23 @@ static_transform_publisher). The result is the pose of base_link in an ENU frame
 where the vehicle was aligned, on /odometry/filtered and as the transform odom -> base_link.
 
     ros2 launch ins_align robot_localization.launch.py params_file:=my_robot.yaml
+
+All of it may start at once: before the alignment there is no message on ~/imu, and both nodes of
+robot_localization wait for the first one. navsat_transform_node takes its heading, for good.
 """
 
 from launch import LaunchDescription
-from launch.actions import (
-    DeclareLaunchArgument, ExecuteProcess, IncludeLaunchDescription, LogInfo, RegisterEventHandler)
-from launch.event_handlers import OnProcessExit
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-ALIGNED_IMU = '/ins_align/imu'
+# Names without a leading slash are those of the namespace that everything is started in.
+ALIGNED_IMU = 'ins_align/imu'
 
 NAVSAT_TRANSFORM = {
     'frequency': 30.0,
-    # No seconds to wait for a compass to settle: the heading is good when this node starts.
+    # No seconds to wait for a compass to settle: the first heading that arrives is good.
     'delay': 0.0,
     # The heading of ~/imu is true: it comes from GNSS and from the Earth's axis, not from a
     # magnetometer. There is no declination to add.
@@ -62,7 +64,7 @@ EKF = {
     # One filter, all of it absolute: it broadcasts odom -> base_link itself. With wheel odometry
     # take robot_localization's example of two filters; this one is then the map's.
     'world_frame': 'odom',
-    'odom0': '/odometry/gps',
+    'odom0': 'odometry/gps',
     'odom0_config': POSITION_ONLY,
     # As measured, neither as differences nor relative to the first: both inputs are absolute.
     'odom0_differential': False,
@@ -76,49 +78,29 @@ EKF = {
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Align, and start robot_localization once that is done."""
+    """Start the alignment and robot_localization."""
+    arguments = {
+        'params_file': PathJoinSubstitution(
+            [FindPackageShare('ins_align'), 'config', 'ins_align.yaml']),
+        'namespace': '',
+        'imu_topic': 'imu/data_raw',
+        'fix_topic': 'fix',
+        'velocity_topic': 'fix_velocity',
+        'use_sim_time': 'false',
+    }
+    given = {name: LaunchConfiguration(name) for name in arguments}
     alignment = IncludeLaunchDescription(
         PathJoinSubstitution([FindPackageShare('ins_align'), 'launch', 'ins_align.launch.xml']),
-        launch_arguments={
-            'params_file': LaunchConfiguration('params_file'),
-            'imu_topic': LaunchConfiguration('imu_topic'),
-            'fix_topic': LaunchConfiguration('fix_topic'),
-            'velocity_topic': LaunchConfiguration('velocity_topic'),
-            'use_sim_time': LaunchConfiguration('use_sim_time'),
-        }.items())
-    # navsat_transform_node takes the heading of the first IMU message after the first odometry
-    # and keeps it for good, whether or not orientation_covariance[0] = -1 says that there is none
-    # yet. It must not run before the alignment has been declared, which the latched topic tells.
-    aligned = ExecuteProcess(
-        cmd=['ros2', 'topic', 'echo', '--once', '--qos-durability', 'transient_local',
-             '--qos-reliability', 'reliable', '/ins_align/initial_attitude',
-             'geometry_msgs/msg/QuaternionStamped'],
-        name='wait_for_alignment', output='screen')
-    sim_time = {'use_sim_time': LaunchConfiguration('use_sim_time')}
+        launch_arguments=given.items())
+    sim_time = {'use_sim_time': given['use_sim_time']}
     navsat_transform = Node(
         package='robot_localization', executable='navsat_transform_node',
-        name='navsat_transform', output='screen', parameters=[NAVSAT_TRANSFORM, sim_time],
-        remappings=[('imu', ALIGNED_IMU), ('gps/fix', LaunchConfiguration('fix_topic'))])
+        name='navsat_transform', namespace=given['namespace'], output='screen',
+        parameters=[NAVSAT_TRANSFORM, sim_time],
+        remappings=[('imu', ALIGNED_IMU), ('gps/fix', given['fix_topic'])])
     ekf = Node(
         package='robot_localization', executable='ekf_node', name='ekf_filter_node',
-        output='screen', parameters=[EKF, sim_time])
-
-    def start_filter(event, context):
-        if event.returncode != 0:
-            return LogInfo(msg='stopped before the alignment was declared')
-        return [navsat_transform, ekf]
-
+        namespace=given['namespace'], output='screen', parameters=[EKF, sim_time])
     return LaunchDescription([
-        DeclareLaunchArgument(
-            'params_file',
-            default_value=PathJoinSubstitution(
-                [FindPackageShare('ins_align'), 'config', 'ins_align.yaml']),
-            description='Parameters of the alignment'),
-        DeclareLaunchArgument('imu_topic', default_value='imu/data_raw'),
-        DeclareLaunchArgument('fix_topic', default_value='fix'),
-        DeclareLaunchArgument('velocity_topic', default_value='fix_velocity'),
-        DeclareLaunchArgument('use_sim_time', default_value='false'),
-        RegisterEventHandler(OnProcessExit(target_action=aligned, on_exit=start_filter)),
-        alignment,
-        aligned,
-    ])
+        *(DeclareLaunchArgument(name, default_value=value) for name, value in arguments.items()),
+        alignment, navsat_transform, ekf])

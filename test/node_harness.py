@@ -99,19 +99,21 @@ def running_node(parameters=(), arguments=()):
 class Listener:
     """Hears what the node publishes, in a thread of the test."""
 
-    def __init__(self, *, imu=False, name='listener'):
+    def __init__(self, *, imu=False, name='listener', namespace=''):
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self.node = rclpy.create_node(name, context=self._context)
         self.attitudes, self.statuses, self.diagnostics, self.imus = [], [], [], []
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         for msg_type, topic, store, qos in (
-                (QuaternionStamped, '/ins_align/initial_attitude', self.attitudes, latched),
-                (DiagnosticArray, '/ins_align/status', self.statuses, 100),
+                (QuaternionStamped, f'{namespace}/ins_align/initial_attitude', self.attitudes,
+                 latched),
+                (DiagnosticArray, f'{namespace}/ins_align/status', self.statuses, 100),
                 (DiagnosticArray, '/diagnostics', self.diagnostics, 100)):
             self.node.create_subscription(msg_type, topic, store.append, qos)
         if imu:
-            self.node.create_subscription(Imu, '/ins_align/imu', self.imus.append, 10000)
+            self.node.create_subscription(
+                Imu, f'{namespace}/ins_align/imu', self.imus.append, 10000)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._spin, daemon=True)

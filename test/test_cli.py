@@ -211,7 +211,31 @@ def test_no_recording_writes_over_the_files_of_another(bags):
         assert label.startswith(Path(bag).name.split('.')[0])
 
 
+def test_without_a_command_it_shows_the_help(capsys):
+    assert main([]) == 2
+    captured = capsys.readouterr()
+    assert captured.err == '' and 'align recordings (rosbag2' in captured.out
+
+
+@pytest.mark.parametrize('command', ['info', 'replay'])
+def test_json_to_standard_output_is_nothing_but_json(standing, capsys, command):
+    main([command, str(standing), '--json', '-'])
+    assert json.loads(capsys.readouterr().out)['bag'] == str(standing)
+    main([command, str(standing), str(standing), '--json', '-'])
+    assert len(json.loads(capsys.readouterr().out)) == 2
+
+
+def test_one_spelling_of_the_lever_arm(standing, capsys):
+    main(['replay', str(standing), '--lever-arm', '-1', '0', '2.5', '--json', '-'])
+    first = json.loads(capsys.readouterr().out)
+    main(['replay', str(standing), '--set', 'lever_arm=[-1,0,2.5]', '--json', '-'])
+    assert json.loads(capsys.readouterr().out) == first
+    assert main(['replay', str(standing), '--lever-arm', 'nan', '0', '0']) == 2
+    assert 'finite' in one_sentence(capsys)
+
+
 @pytest.mark.parametrize('arguments, message', [
+    (['--csv', '-'], '--csv needs the name of a file'),
     (['--set', 'lever_arm=[1,2]'], 'lever_arm must be three numbers'),
     (['--set', 'lever_arm=[1,2,.nan]'], 'finite'),
     (['--set', 'lever_arm=[1,2,.inf]'], 'finite'),
@@ -232,7 +256,7 @@ def test_wrong_arguments(standing, capsys, arguments, message):
 
 
 @pytest.mark.parametrize('arguments', [
-    [], ['replay'], ['fly'], ['replay', 'x', '--start', '-1'], ['replay', 'x', '--start', 'nan'],
+    ['replay'], ['fly'], ['replay', 'x', '--start', '-1'], ['replay', 'x', '--start', 'nan'],
     ['replay', 'x', '--nothing'], ['replay', 'x', '--jobs', '0'], ['simulate'],
     ['simulate', 'x', '--seed', 'a'], ['simulate', 'x', '--lever-arm', '1', '2'],
     ['experiment', 'x']])

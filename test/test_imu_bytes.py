@@ -63,13 +63,3 @@ def test_nothing_but_the_orientation_changes(frame_id, way):
     changed = deserialize_message(with_orientation(data, quaternion, covariance), Imu)
     assert changed == expected
     assert deserialize_message(data, Imu) == message(frame_id)
-
-
-@pytest.mark.parametrize('frame_id', FRAMES)
-def test_an_orientation_that_is_not_known_is_marked(frame_id, way):
-    expected = message(frame_id)
-    turn = expected.orientation
-    turn.x, turn.y, turn.z, turn.w = 0.0, 0.0, 0.0, 1.0
-    expected.orientation_covariance = np.array([-1.0] + [0.0] * 8)
-    assert deserialize_message(with_orientation(serialize_message(message(frame_id))),
-                               Imu) == expected

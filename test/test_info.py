@@ -165,9 +165,50 @@ def test_velocity_that_says_it_is_in_the_body_frame(changed):
             message.header.frame_id = 'base_link'
         return [(name, time, message)]
 
+    # The motion tells that it is not.
     info = inspect(changed(change))
+    assert by_name(info, '/fix_velocity').faults == ()
+    assert 'velocity_frame=enu' in info.command
+
+    def in_the_axes_of_the_vehicle(name, time, message):
+        linear = getattr(getattr(getattr(message, 'twist', None), 'twist', None), 'linear', None)
+        if linear is not None:
+            linear.x, linear.y = math.hypot(linear.x, linear.y), 0.0
+        return change(name, time, message)
+
+    info = inspect(changed(in_the_axes_of_the_vehicle, name='vehicle'))
     assert 'base_link' in by_name(info, '/fix_velocity').faults[0]
     assert 'use_velocity=false' in info.command
+
+
+def test_velocities_of_other_types(changed):
+    """Vector3Stamped is read if its name says velocity, a Twist without a stamp is named."""
+    types = typestore().types
+    vector, twist = ('geometry_msgs/msg/Vector3Stamped', 'geometry_msgs/msg/Twist')
+
+    def change(name, time, message):
+        if name != '/fix_velocity':
+            return [(name, time, message)]
+        linear, field = message.twist.twist.linear, types['geometry_msgs/msg/Vector3'](1., 2., 3.)
+        return [('/gnss/velocity', time, types[vector](message.header, linear)),
+                ('/mag', time, types[vector](message.header, field)),
+                ('/vel', time, message.twist.twist)]
+
+    topics = {'/imu/data_raw': IMU, '/fix': FIX, '/gnss/velocity': vector, '/mag': vector,
+              '/vel': twist}
+    path = changed(change, topics=topics)
+    info = inspect(path)
+    assert info.chosen['velocity'] == '/gnss/velocity'
+    assert [topic.name for topic in info.topics] == ['/imu/data_raw', '/fix', '/gnss/velocity']
+    assert command_of(info) == ['--set', 'imu_grade=tactical']
+    assert replay(path, duration=5.0).topics.velocity.name == '/gnss/velocity'
+
+    path = changed(lambda name, time, message: [
+        new for new in change(name, time, message) if 'gnss' not in new[0]],
+        name='twist', topics={name: topics[name] for name in topics if 'gnss' not in name})
+    assert '/vel cannot be used: geometry_msgs/Twist has no stamp' in inspect(path).warnings[0]
+    warning, = replay(path, duration=5.0).warnings
+    assert '/vel cannot be used: geometry_msgs/Twist has no stamp' in warning
 
 
 def test_no_velocity_topic(changed):

@@ -156,6 +156,9 @@ def test_other_velocity_types():
     result = velocity_from_msg(stamped, Config(velocity_type='TwistStamped'))
     np.testing.assert_array_equal(result.velocity, [1.0, 2.0, 3.0])
     assert result.covariance is None
+    vector = Msg(header=header('world'), vector=xyz(1.0, 2.0, 3.0))
+    result = velocity_from_msg(vector, Config(velocity_type='Vector3Stamped'))
+    np.testing.assert_array_equal(result.velocity, [1.0, 2.0, 3.0])
     odometry = twist_with_covariance((1.0, 2.0, 3.0), np.eye(3), 'base_link')
     odometry.child_frame_id = 'gps'
     result = velocity_from_msg(odometry, Config(velocity_type='Odometry'))
@@ -172,6 +175,9 @@ def test_body_frame_velocity_is_refused(frame):
     msg.header.frame_id, msg.child_frame_id = 'map', frame
     with pytest.raises(MessageError, match='body frame'):
         velocity_from_msg(msg, Config(velocity_type='Odometry'))
+    # Who says in which world frame it is knows better than the frame_id.
+    velocity = velocity_from_msg(msg, Config(velocity_type='Odometry', velocity_frame='ned'))
+    np.testing.assert_array_equal(velocity.velocity, [2.0, 1.0, -3.0])
 
 
 @pytest.mark.parametrize('frame', ['', 'gps', 'gnss_link', 'antenna', 'map', 'enu', 'ned',

@@ -41,7 +41,7 @@ WRONG = (
     (['-p', 'hold_time:=-1'], 'hold_time must lie between 0 and 3600 s'),
     (['-p', 'imu_grade:=golden'], 'imu_grade must be one of navigation, tactical, mems, custom'),
     (['-p', 'imu_grade:=custom'], 'missing: angle_random_walk'),
-    (['-p', 'velocity_frame:=body'], 'velocity_frame must be one of enu, ned'),
+    (['-p', 'velocity_frame:=body'], 'velocity_frame must be one of auto, enu, ned'),
     (['-p', 'qos_overrides./fix.subscription.reliability:=perhaps'], 'reliability'),
     (['--params-file', 'no_such_file.yaml'], 'no_such_file.yaml'),
     (['--no-such-option'], '--no-such-option'),
@@ -105,7 +105,7 @@ def test_parameters_and_status_of_an_idle_node():
     assert all(descriptor.description for descriptor in described)
     assert by_name['lever_arm'].description.endswith('[m]')
     assert by_name['lever_arm'].type == ParameterType.PARAMETER_DOUBLE_ARRAY
-    assert by_name['velocity_frame'].additional_constraints == 'one of: enu, ned'
+    assert by_name['velocity_frame'].additional_constraints == 'one of: auto, enu, ned'
     assert by_name['hold_time'].floating_point_range[0].to_value == 3600.0
     assert {name for name in names if not by_name[name].read_only} == {
         'heading_std_threshold', 'tilt_std_threshold', 'hold_time'}

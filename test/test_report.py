@@ -23,9 +23,11 @@ from types import SimpleNamespace
 from ins_align.config import Config
 from ins_align.replay import replay
 from ins_align.report import (
-    DECLARED_GREEN, declared_spans, format_table, plot, save_figure, summary, write_whole)
+    DECLARED_GREEN, declared_spans, format_table, plot, save_figure, STATE_COLOURS, summary,
+    write_whole)
 from ins_align.results import State
 from ins_align.simulation import simulate, write_bag
+from matplotlib.colors import to_rgb
 import numpy as np
 import pytest
 
@@ -164,6 +166,33 @@ def test_figure_marks_the_declaration(result):
     tilt = plot(result).axes[0]
     marks = [line for line in tilt.lines if line.get_label() == 'declared aligned']
     assert [line.get_xdata()[0] for line in marks] == [first]
+    # In one legend, and in it the attitude as the node publishes it, at its t0.
+    names = [[text.get_text() for text in axes.get_legend().get_texts()]
+             for axes in plot(result).axes if axes.get_legend()]
+    assert ['declared aligned' in of_one for of_one in names].count(True) == 1
+    assert 'declared, at its t0' in names[0]
+
+
+def test_what_was_declared_is_in_the_table(result):
+    """As known when it was declared, which is what the node publishes, not at the end."""
+    epoch = next(epoch for epoch in result.epochs if epoch.state is State.ALIGNED)
+    declared = epoch.initial
+    assert result.declared is declared
+    row = next(line.split() for line in summary(result).splitlines()
+               if line.split()[:1] == ['declared'])
+    seconds = (declared.stamp_ns - result.first_t0_ns) * 1e-9
+    assert row[1:5] == [f'{seconds:.1f}', *(f'{angle:.3f}' for angle in (
+        declared.roll_deg, declared.pitch_deg, declared.yaw_deg))]
+    not_declared = dataclasses.replace(result, epochs=result.epochs[:2])
+    assert not_declared.declared is None and 'declared  ' not in summary(not_declared)
+
+
+def test_roll_and_pitch_alone_are_shaded_too(result):
+    epochs = [dataclasses.replace(epoch, state=State.LEVELLED) if epoch.t_s < 5.0 else epoch
+              for epoch in result.epochs]
+    figure = plot(dataclasses.replace(result, epochs=tuple(epochs)))
+    colours = {patch.get_facecolor()[:3] for patch in figure.axes[0].patches}
+    assert colours == {to_rgb(STATE_COLOURS[State.LEVELLED]), to_rgb(DECLARED_GREEN)}
 
 
 def test_figure_shows_every_angle_whole(result):
@@ -222,7 +251,8 @@ def test_what_is_declared_lasts_into_an_outage(dry):
     assert start < 20.0 and 42.0 < end < 98.0 and dry.status.state is not State.ALIGNED
     assert f'it was ALIGNED from {start:.1f} to {end:.1f} s' in summary(dry)
     bands = [patch.get_extents().transformed(axes.transData.inverted())
-             for axes in drawn(plot(dry))[:1] for patch in axes.patches]
+             for axes in drawn(plot(dry))[:1] for patch in axes.patches
+             if patch.get_facecolor()[:3] == to_rgb(DECLARED_GREEN)]
     assert [(band.x0, band.x1) for band in bands] == [pytest.approx((start, end))]
 
 

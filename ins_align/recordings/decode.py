@@ -62,6 +62,8 @@ GNSS_TYPES = {
     'nav_msgs/msg/Odometry': GnssFields(
         'velocity', 'twist.twist.linear.x twist.twist.linear.y twist.twist.linear.z',
         'twist.covariance', 'child_frame_id'),
+    'geometry_msgs/msg/Vector3Stamped': GnssFields(
+        'velocity', 'vector.x vector.y vector.z', '', 'header.frame_id'),
 }
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import dataclasses
 from dataclasses import dataclass
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 import os
 from typing import NamedTuple
 
@@ -33,6 +33,9 @@ import numpy as np
 
 FIX_TYPES, VELOCITY_TYPES = ([name for name, fields in GNSS_TYPES.items() if fields.kind == kind]
                              for kind in ('fix', 'velocity'))
+VECTOR_TYPE = 'geometry_msgs/msg/Vector3Stamped'  # of a velocity or of anything else
+UNSTAMPED_TYPES = ['geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistWithCovariance',
+                   'geometry_msgs/msg/Vector3']
 REFERENCE_NAMESPACE = '/reference/'
 REFERENCE_TOPIC = '/reference/imu'  # truth or the best that is known: to compare with, never input
 OPTIONS = {'IMU': '--imu-topic', 'position': '--fix-topic', 'velocity': '--velocity-topic'}
@@ -185,15 +188,19 @@ def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | N
     velocity_topic = None
     if velocity is not None:
         velocity_topic = _named(bag, 'velocity', VELOCITY_TYPES, velocity)
-        _measures(bag, velocity_topic)  # for the warning: it is read as the user wishes
+        _measures(bag, velocity_topic, config)  # for the warning: it is read as the user wishes
     elif config.use_velocity is not False:
         preferred = [name for name in VELOCITY_TYPES if _short(name) == config.velocity_type]
         others = [name for name in VELOCITY_TYPES if name not in preferred]
-        velocity_topic = _only(bag, 'velocity', preferred)
+        twists = [name for name in others if name != VECTOR_TYPE]
+        velocity_topic = _only(bag, 'velocity', preferred, config)
         if velocity_topic is not None:
             _warn_of_others(bag, velocity_topic, others)
         else:
-            velocity_topic = _only(bag, 'velocity', others)
+            velocity_topic = (_only(bag, 'velocity', twists, config)
+                              or _only(bag, 'velocity', [VECTOR_TYPE], config))
+        if velocity_topic is None:
+            _warn_of_unstamped(bag)
     reference = next((topic for topic in bag.topics if topic.name == REFERENCE_TOPIC
                       and topic.msgtype == IMU_TYPE), None)
     return Topics(imu_topic, fix_topic, velocity_topic,
@@ -212,11 +219,11 @@ def _candidates(bag: Bag, types: list[str]) -> list[Topic]:
             and REFERENCE_NAMESPACE not in topic.name]
 
 
-def _only(bag: Bag, what: str, types: list[str]) -> Topic | None:
+def _only(bag: Bag, what: str, types: list[str], config: Config = Config()) -> Topic | None:
     """Return the one topic of some types; where there are more the one that measures."""
     candidates = _candidates(bag, types)
     if what == 'velocity' or len(candidates) > 1:
-        candidates = [topic for topic in candidates if _measures(bag, topic)]
+        candidates = [topic for topic in candidates if _measures(bag, topic, config)]
     if len(candidates) > 1:
         names = ', '.join(sorted(topic.name for topic in candidates))
         raise BagError(f'{bag.path} has more than one {what} topic ({names}): '
@@ -247,21 +254,41 @@ def _warn_of_others(bag: Bag, velocity: Topic, types: list[str]) -> None:
                  f'from {", ".join(names)}: --velocity-topic chooses')
 
 
-def _measures(bag: Bag, topic: Topic, say: bool = True) -> bool:
+def _warn_of_unstamped(bag: Bag) -> None:
+    """Say which topics may be velocities, of types that an alignment cannot use."""
+    for topic in sorted(_candidates(bag, UNSTAMPED_TYPES), key=attrgetter('name')):
+        if not _is_command(topic):
+            bag.warn(f'{topic.name} cannot be used: {_in_words([topic.msgtype])} has no stamp; a '
+                     f'velocity needs {_in_words(VELOCITY_TYPES)}')
+
+
+def may_be_velocity(topic: Topic) -> bool:
+    """Whether the name of a topic is no other vector's: a field, an angular rate, a force."""
+    name = topic.name.lower()
+    return topic.msgtype != VECTOR_TYPE or ('vel' in name and 'ang' not in name)
+
+
+def _is_command(topic: Topic) -> bool:
+    """Whether a topic is a wish, not a measurement: /cmd_vel."""
+    return 'cmd' in topic.name.rsplit('/', 1)[-1]
+
+
+def _measures(bag: Bag, topic: Topic, config: Config = Config(), say: bool = True) -> bool:
     """
     Look into a topic's first message for whether it can be what its type promises.
 
     With `say` there is a warning of a message that cannot be used.
     """
-    if 'cmd' in topic.name.rsplit('/', 1)[-1]:
-        return False  # /cmd_vel: a wish, not a measurement
+    if _is_command(topic) or not may_be_velocity(topic):
+        return False
     data = bag.first_message(topic)
     if data is None:
         return False
     try:
         message = deserialize(data, topic)
         if topic.msgtype in VELOCITY_TYPES:
-            velocity_from_msg(message, Config(velocity_type=_short(topic.msgtype)))
+            velocity_from_msg(message, dataclasses.replace(
+                config, velocity_type=_short(topic.msgtype)))
     except MessageError as error:
         if say:
             bag.warn(f'{topic.name} cannot be used: {error}')

@@ -1,0 +1,253 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Checks of units, axes and clocks that need no alignment: the same for node, replay and info.
+
+What is found is said in sentences that tell what to set or to change.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+import math
+from typing import Union
+
+from ins_align.buffers import fault_of_fix, MAX_ACCELERATION, MAX_RATE, usable_velocity
+from ins_align.config import Config
+from ins_align.messages import Fix, Velocity
+from ins_align.motion_survey import (
+    GRID, on_grid, Series, track, velocity_frame, velocity_from_positions,
+    VelocityFrame, without_wild_positions)
+from ins_align.rotation import Array, Index
+import numpy as np
+
+MIN_COURSE_SPEED = 2.0  # m/s above which a course means something
+MIN_COURSE_RATE = 0.05  # rad/s
+MIN_CORRELATION = 0.7
+DEGREES_RATIO = 15.0  # times the turn of the course: between 1 and 57, nearer to degrees
+ANY_GYRO_RATE = 70.0  # rad/s: more than the 4000 deg/s that any usual gyroscope measures
+MIN_MISFIT = 0.1  # of the logarithm of a length: by so much exchanged positions fit better
+MAX_LATENESS = 60.0  # s, the limit of the parameter gnss_lateness
+LATE_SHARE, MIN_LATE = 0.1, 10  # of GNSS messages that are worth a word
+BEYOND_THE_POLES = 'latitudes are beyond the poles: they are exchanged with the longitudes'
+CELLS, GNSS_MESSAGES = 600, 3000  # kept of the latest data: 5 minutes, at up to 10 Hz
+
+
+def turn_fault_placeholder() -> None:
+    """Be replaced."""
+
+
+def degrees_fault(max_rate: float, ratio: float | None) -> str:
+    """
+    Say that angular rates are in deg/s; empty where they are not.
+
+    Parameters
+    ----------
+    max_rate : float
+        As measured, in rad/s if that is the unit.
+    ratio : float or None
+        From `turn_ratio`; its sign does not matter.
+
+    """
+    if max_rate > ANY_GYRO_RATE or (ratio is not None and abs(ratio) > DEGREES_RATIO):
+        return 'the angular rates look like deg/s: they must be rad/s'
+    return ''
+
+
+def turn_ratio(grid: Array, gyro: Array, up: Array, velocities: Series | None) -> float | None:
+    """Return the rate about the vertical over the turn of the course; None: nothing to tell."""
+    if velocities is None or velocities.times.size < 5:
+        return None
+    v = velocities.vectors[:, :2]
+    course = np.unwrap(np.arctan2(v[:, 1], v[:, 0]))
+    times = velocities.times
+    elapsed = times[2:] - times[:-2]
+    rate = (course[2:] - course[:-2]) / elapsed
+    moving = ((np.hypot(*v.T)[1:-1] > MIN_COURSE_SPEED) & (elapsed < 3.0 * GRID)
+              & (np.abs(rate) > MIN_COURSE_RATE))
+    turning = np.interp(times[1:-1], grid, gyro @ up)[moving]
+    rate = rate[moving]
+    energy = float(rate @ rate)
+    if rate.size < 10 or not turning.any():
+        return None
+    product = float(turning @ rate)
+    if abs(product) < MIN_CORRELATION * math.sqrt(energy * float(turning @ turning)):
+        return None
+    return product / energy
+
+
+def exchange_fault(positions_deg: Series, velocities: Series) -> str:
+    """
+    Say that latitude and longitude are exchanged; empty where they are not.
+
+    Parameters
+    ----------
+    positions_deg : Series
+        Latitude and longitude, degrees, altitude, m.
+    velocities : Series
+        As if they were ENU, m/s.
+
+    """
+    latitude, longitude, altitude = positions_deg.vectors.T
+    if positions_deg.times.size < 2 or np.abs(longitude).max() > 90.0:
+        return ''
+    as_sent, exchanged = (
+        velocity_frame(velocities, without_wild_positions(track(positions_deg.times, *columns)))
+        for columns in ((latitude, longitude, altitude), (longitude, latitude, altitude)))
+    if exchanged.frame not in ('enu', 'ned') or as_sent.frame in ('enu', 'unknown'):
+        return ''
+    # Velocities north-east-down would fit the positions as they are, in length too.
+    if as_sent.frame == 'ned' and _misfit(as_sent) < _misfit(exchanged) + MIN_MISFIT:
+        return ''
+    return ('the GNSS velocity fits the change of position with latitude and longitude exchanged: '
+            'they are exchanged in the positions')
+
+
+def _misfit(frame: VelocityFrame) -> float:
+    return abs(math.log(frame.speed_ratio or math.inf))
+
+
+def beyond_the_poles(latitude_deg: float, longitude_deg: float) -> bool:
+    """Whether a position could only be one with latitude and longitude exchanged."""
+    return abs(longitude_deg) <= 90.0 < abs(latitude_deg) <= 180.0
+
+
+def lateness_advice(lateness: float) -> tuple[str, str]:
+    """
+    Say how late GNSS messages are, and with which gnss_lateness they are used.
+
+    Parameters
+    ----------
+    lateness : float
+        Behind newer IMU samples, s.
+
+    Returns
+    -------
+    sentence, value : str
+
+    """
+    value = f'{math.ceil(2.0 * lateness) / 2.0 + 0.5:g}'
+    return (f'GNSS messages come up to {lateness:.1f} s later than newer IMU samples: set '
+            f'gnss_lateness to {value}; if it is their clock that is behind, and not the '
+            f'messages, set gnss_delay={-lateness:.1f} instead'), value
+
+
+class InputChecks:
+    """
+    Looks at messages as they arrive, in bounded memory.
+
+    Parameters
+    ----------
+    config : Config
+        ``gnss_lateness``.
+
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._cells: dict[int, Array] = {}  # count, sums of rate and specific force
+        self._samples = self._too_fast = 0
+        self._newest_ns: int | None = None
+        self._late: deque[float] = deque(maxlen=10 * MIN_LATE)
+        self._fixes: deque[tuple[float, ...]] = deque(maxlen=GNSS_MESSAGES)
+        self._velocities: deque[tuple[float, ...]] = deque(maxlen=GNSS_MESSAGES)
+        self._beyond_the_poles = 0
+
+    def add(self, stamps_ns: Index, gyro: Array, accel: Array,
+            gnss: Sequence[tuple[int, Union[Fix, Velocity]]]) -> None:
+        """
+        Take messages in the order of their arrival.
+
+        Parameters
+        ----------
+        stamps_ns : ndarray of int, shape (N,)
+            Of IMU samples.
+        gyro, accel : ndarray, shape (N, 3)
+            rad/s, m/s^2, as sent.
+        gnss : sequence of (int, message)
+            How many of the samples come before each.
+
+        """
+        newest = np.maximum.accumulate(stamps_ns)
+        for before, message in gnss:
+            newest_ns = int(newest[before - 1]) if before else self._newest_ns
+            if before and self._newest_ns is not None:
+                newest_ns = max(newest_ns or 0, self._newest_ns)
+            if newest_ns is not None:
+                self._late.append((newest_ns - message.stamp_ns) * 1e-9)
+            self._add_gnss(message)
+        if stamps_ns.size:
+            # The newest of these: a clock that was set back goes on from where it is.
+            self._newest_ns = int(newest[-1])
+            self._add_imu(stamps_ns, gyro, accel)
+
+    def _add_gnss(self, message: Fix | Velocity) -> None:
+        time = message.stamp_ns * 1e-9
+        if isinstance(message, Velocity):
+            usable = usable_velocity(message)
+            if usable is not None:
+                self._velocities.append((time, *usable.velocity.tolist()))
+        elif not fault_of_fix(message):
+            altitude = message.altitude_m if math.isfinite(message.altitude_m) else 0.0
+            self._fixes.append((time, message.latitude_deg, message.longitude_deg, altitude))
+        elif beyond_the_poles(message.latitude_deg, message.longitude_deg):
+            self._beyond_the_poles += 1
+
+    def _add_imu(self, stamps_ns: Index, gyro: Array, accel: Array) -> None:
+        rates = np.abs(gyro).max(axis=1)
+        self._samples += stamps_ns.size
+        self._too_fast += np.count_nonzero(rates > ANY_GYRO_RATE)
+        good = (rates < 60.0 * MAX_RATE) & (np.abs(accel).max(axis=1) < MAX_ACCELERATION)
+        index, place = np.unique((stamps_ns[good] * 1e-9 / GRID).astype(np.int64),
+                                 return_inverse=True)
+        sums = np.zeros((index.size, 7))
+        np.add.at(sums, place, np.column_stack([np.ones(place.size), gyro[good], accel[good]]))
+        for cell, row in zip(index.tolist(), sums):
+            self._cells[cell] = self._cells.get(cell, 0.0) + row
+        while len(self._cells) > CELLS:
+            del self._cells[next(iter(self._cells))]
+
+    def faults(self) -> list[str]:
+        """Return what is wrong, each in a sentence."""
+        fixes, velocities = _series(self._fixes), _series(self._velocities)
+        motion = on_grid(velocities) if velocities.times.size > 1 else velocity_from_positions(
+            track(fixes.times, *fixes.vectors.T))
+        found = [degrees_fault(
+            math.inf if self._too_fast > 1e-3 * self._samples else 0.0, self._turn_ratio(motion))]
+        found.append(exchange_fault(fixes, velocities) or (
+            BEYOND_THE_POLES if self._beyond_the_poles > MIN_LATE else ''))
+        late = [lateness for lateness in self._late if lateness > self._config.gnss_lateness]
+        if len(late) >= max(MIN_LATE, LATE_SHARE * len(self._late)) and max(late) < MAX_LATENESS:
+            found.append(lateness_advice(float(np.quantile(late, 0.99)))[0])
+        return [fault for fault in found if fault]
+
+    def _turn_ratio(self, motion: Series) -> float | None:
+        if len(self._cells) < 2:
+            return None
+        cells = sorted(self._cells)
+        sums = np.array([self._cells[cell] for cell in cells])
+        means = sums[:, 1:] / sums[:, :1]
+        up = means[:, 3:].mean(axis=0)
+        return turn_ratio((np.array(cells) + 0.5) * GRID, means[:, :3],
+                          up / (math.hypot(*up.tolist()) or 1.0), motion)
+
+
+def _series(rows: Sequence[tuple[float, ...]]) -> Series:
+    """Return rows of time and three numbers over increasing time."""
+    if not rows:
+        return Series(np.zeros(0), np.zeros((0, 3)))
+    columns = np.array(rows)
+    times, first = np.unique(columns[:, 0], return_index=True)
+    return Series(times, columns[first, 1:])

@@ -1,0 +1,195 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What the node says of itself: diagnostics, the reason in the log, numbers for plots, topics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+import re
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Vector3Stamped
+from ins_align.config import Config, Parameter, parameters
+from ins_align.results import State, Status
+import numpy as np
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.node import Node
+from rclpy.time import Time
+
+LEVELS = {
+    State.ALIGNED: DiagnosticStatus.OK,
+    State.FAULT: DiagnosticStatus.ERROR,
+}
+LOG_AGAIN = 10.0  # s after which a reason that has stayed is worth another line
+_NUMBER = re.compile(r'[-+]?\d[\d.]*(?:e[-+]?\d+)?')
+
+
+class ReasonLog:
+    """Decides which parts of a reason are worth a line in the log: new ones, those that stay."""
+
+    def __init__(self) -> None:
+        """Start with nothing logged."""
+        self._logged: dict[str, float] = {}  # kinds of the last seconds, and when
+        self._present: set[str] = set()
+
+    def note(self, text: str, now: float) -> None:
+        """Take a state with its reason for logged."""
+        kinds = [_NUMBER.sub('#', part) for part in text.split('; ')]
+        self._present.update(kinds)
+        self._logged.update(dict.fromkeys(kinds, now))
+
+    def due(self, parts: Sequence[str], now: float, again: bool) -> list[tuple[str, bool]]:
+        """
+        Return the parts to log, and whether they were there before; they are taken for logged.
+
+        Parameters
+        ----------
+        parts : sequence of str
+            Other numbers in a part make no other kind.
+        now : float
+            s.
+        again : bool
+            Whether what stays is logged again and again.
+
+        """
+        self._logged = {kind: when for kind, when in self._logged.items()
+                        if now - when < LOG_AGAIN}
+        before, kinds = self._present, [_NUMBER.sub('#', part) for part in parts]
+        self._present = set(kinds)
+        found = [(part, kind in before) for part, kind in zip(parts, kinds)
+                 if kind not in self._logged and (again or kind not in before)]
+        self._logged.update((_NUMBER.sub('#', part), now) for part, _ in found)
+        return found
+
+
+def type_name(msg_type: type) -> str:
+    """Return the full name of a message type: sensor_msgs/msg/Imu."""
+    return f'{msg_type.__module__.split(".")[0]}/msg/{msg_type.__name__}'
+
+
+def in_words(node: Node, inputs: Mapping[str, type], config: Config) -> str:
+    """Say what a node reads, and with which parameters."""
+    topics = ', '.join(f'{node.resolve_topic_name(topic)} ({_short(type_name(msg_type))})'
+                       for topic, msg_type in inputs.items())
+    default = Config()
+    changed = ''.join(
+        f', {own.name} {getattr(config, own.name)}' for own in parameters()
+        if own.name != 'lever_arm'
+        and getattr(config, own.name) != getattr(default, own.name))
+    return (f'reads {topics}; lever_arm {list(config.lever_arm)} m{changed}, '
+            'other parameters at their defaults')
+
+
+def topic_faults(node: Node, inputs: Mapping[str, type], expected: Iterable[str],
+                 velocity_types: Mapping[str, type]) -> Iterator[str]:
+    """
+    Look at the publishers of the topics that a node reads, and say what is wrong with them.
+
+    Parameters
+    ----------
+    node : Node
+        That reads them.
+    inputs : mapping
+        Message types by topic, as they are named in the node.
+    expected : iterable of str
+        Topics that are worth a word where nobody publishes them.
+    velocity_types : mapping
+        Message types that the parameter velocity_type can name.
+
+    """
+    for topic, msg_type in inputs.items():
+        name = node.resolve_topic_name(topic)
+        types = {info.topic_type for info in node.get_publishers_info_by_topic(topic)}
+        wanted = type_name(msg_type)
+        if not types and topic in expected:
+            yield f'nobody publishes {name}'
+        if not types or wanted in types:
+            continue
+        other = min(types)
+        known = [parameter for parameter, velocity in velocity_types.items()
+                 if msg_type in velocity_types.values() and type_name(velocity) == other]
+        hint = f': set velocity_type to {known[0]}' if known else ''
+        yield f'{name} is published as {_short(other)}, not {_short(wanted)}{hint}'
+
+
+def _short(name: str) -> str:
+    return name.replace('/msg/', '/')
+
+
+def parameter_descriptor(parameter: Parameter) -> ParameterDescriptor:
+    """Describe one field of `Config` to ROS."""
+    unit = f' [{parameter.unit}]' if parameter.unit else ''
+    descriptor = ParameterDescriptor(
+        description=parameter.description + unit, read_only=parameter.read_only)
+    if parameter.choices:
+        descriptor.additional_constraints = 'one of: ' + ', '.join(
+            str(choice).lower() if isinstance(choice, bool) else choice
+            for choice in parameter.choices)
+    if parameter.minimum is not None and parameter.maximum is not None:
+        descriptor.floating_point_range = [FloatingPointRange(
+            from_value=parameter.minimum, to_value=parameter.maximum)]
+    return descriptor
+
+
+def vector_msg(stamp_ns: int, frame_id: str, values: Sequence[float] | np.ndarray,
+               ) -> Vector3Stamped:
+    """Put three numbers into a message."""
+    msg = Vector3Stamped()
+    msg.header.stamp = Time(nanoseconds=stamp_ns).to_msg()
+    msg.header.frame_id = frame_id
+    msg.vector.x, msg.vector.y, msg.vector.z = map(float, values)
+    return msg
+
+
+def diagnostic_status(name: str, hardware_id: str, level: bytes, status: Status,
+                      ) -> DiagnosticStatus:
+    """Return a status as diagnostics have it."""
+    return DiagnosticStatus(
+        level=level, name=f'{name.lstrip("/")}: alignment', hardware_id=hardware_id,
+        message=f'{status.state.value}: {status.reason}',
+        values=[KeyValue(key=key, value=value) for key, value in status_values(status)])
+
+
+def status_values(status: Status) -> Iterator[tuple[str, str]]:
+    """List what a status says as names and values, angles in degrees."""
+    yield 'state', status.state.value
+    yield 'reason', status.reason
+    for name, value in (('stamp_ns', status.stamp_ns), ('t0_ns', status.t0_ns)):
+        yield name, '' if value is None else str(value)
+    yield 'time_to_align_s', _text(status.time_to_align_s)
+    for name, attitude in (('initial', status.initial), ('current', status.current)):
+        angles = sigma = None
+        if attitude is not None:
+            angles = attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg
+            sigma = attitude.sigma_deg
+        yield f'{name}_roll_pitch_yaw_deg', _text(angles)
+        yield f'{name}_sigma_east_north_up_deg', _text(sigma)
+    yield 'current_heading_deg', _text(
+        None if status.current is None else status.current.heading_deg)
+    for name, estimate, sigma, unit in (
+            ('gyro_bias', status.gyro_bias, status.gyro_bias_std, 'rad_s'),
+            ('accel_bias', status.accel_bias, status.accel_bias_std, 'm_s2'),
+            ('lever_arm', status.lever_arm, status.lever_arm_std, 'm'),
+            ('gnss_delay', status.gnss_delay, status.gnss_delay_std, 's')):
+        yield f'{name}_{unit}', _text(estimate)
+        yield f'{name}_std_{unit}', _text(sigma)
+    for name, count in status.counts.items():
+        yield name, str(count)
+
+
+def _text(value: float | Sequence[float] | np.ndarray | None) -> str:
+    """Write a number or several; nothing where nothing is known."""
+    if value is None:
+        return ''
+    return ' '.join(f'{number:.6g}' for number in np.atleast_1d(value))

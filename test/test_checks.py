@@ -1,0 +1,119 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Units, axes and clocks that are wrong: node, replay and info say the same sentence."""
+
+import dataclasses
+
+from ins_align.checks import BEYOND_THE_POLES, degrees_fault, exchange_fault, InputChecks
+from ins_align.config import Config
+from ins_align.info import describe, inspect
+from ins_align.messages import Fix, Velocity
+from ins_align.motion_survey import Series
+from ins_align.replay import replay
+from ins_align.simulation import simulate, write_bag
+import numpy as np
+import pytest
+
+DEGREES = 'the angular rates look like deg/s'
+EXCHANGED = 'with latitude and longitude exchanged'
+LATE = 'GNSS messages come up to 1.7 s later than newer IMU samples: set gnss_lateness to 2.5'
+
+
+@pytest.fixture(scope='module')
+def drive():
+    return simulate('car', seed=1, duration=40.0, stand_still=5.0, imu_grade='tactical')
+
+
+def in_degrees(simulation):
+    return dataclasses.replace(simulation, gyro=np.degrees(simulation.gyro))
+
+
+def exchanged(simulation):
+    return dataclasses.replace(simulation, lla_deg=simulation.lla_deg[:, [1, 0, 2]])
+
+
+def far_in_the_east(simulation):
+    return dataclasses.replace(
+        simulation, lla_deg=simulation.lla_deg[:, [1, 0, 2]] + [100.0, 0.0, 0.0])
+
+
+def late(simulation):
+    return dataclasses.replace(
+        simulation, gnss_arrival_ns=simulation.gnss_stamps_ns + 1_720_000_000)
+
+
+WRONG = ((in_degrees, DEGREES), (exchanged, EXCHANGED), (far_in_the_east, BEYOND_THE_POLES),
+         (late, LATE))
+
+
+@pytest.mark.parametrize('change, sentence', WRONG)
+def test_info_and_replay_say_the_same(drive, tmp_path, change, sentence):
+    path = tmp_path / 'drive'
+    write_bag(change(drive), path)
+    info, result = describe(inspect(path)), replay(path)
+    assert sentence in info
+    assert result.status.state != 'ALIGNED' and sentence in result.status.reason
+    # Nothing else is accused.
+    for _, other in WRONG:
+        assert (other in info) == (other in result.status.reason) == (other == sentence)
+
+
+def test_nothing_is_said_of_what_is_right(drive):
+    checks = checked(drive)
+    assert checks.faults() == []
+
+
+def test_velocities_north_east_down_are_no_exchanged_positions(drive):
+    velocity = drive.velocity[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    checks = checked(dataclasses.replace(drive, velocity=velocity))
+    assert checks.faults() == []
+
+
+@pytest.mark.parametrize('change, sentence', WRONG)
+def test_it_is_found_in_pieces_of_any_size(drive, change, sentence):
+    for samples in (1, 37, 10 ** 6):
+        fault, = checked(change(drive), samples).faults()
+        assert sentence in fault
+
+
+def test_what_is_no_number_says_nothing():
+    nan, huge = np.full((3, 3), np.nan), np.full((3, 3), 1e300)
+    checks = InputChecks(Config())
+    assert checks.faults() == []
+    for values in (nan, huge):
+        checks.add(np.arange(3), values, values, [
+            (1, Fix(0, np.nan, np.nan, np.nan, None, 0)), (1, Velocity(0, values[0], None))])
+    assert checks.faults() == [degrees_fault(np.inf, None)]  # of the huge ones
+    nothing = Series(np.zeros(0), np.zeros((0, 3)))
+    assert exchange_fault(nothing, nothing) == ''
+
+
+def checked(simulation, samples=500):
+    """Give the checks a simulation as it arrives, so many samples at a time."""
+    checks = InputChecks(Config())
+    stamps = simulation.imu_stamps_ns
+    for start in range(0, len(stamps), samples):
+        part = slice(start, start + samples)
+        begin = stamps[start] if start else -np.inf
+        end = stamps[part.stop] if part.stop < len(stamps) else np.inf
+        arrived = np.flatnonzero((simulation.gnss_arrival_ns >= begin)
+                                 & (simulation.gnss_arrival_ns < end))
+        gnss = []
+        for k in arrived.tolist():
+            before = int(np.searchsorted(stamps[part], simulation.gnss_arrival_ns[k]))
+            stamp = int(simulation.gnss_stamps_ns[k])
+            gnss += [(before, Fix(stamp, *simulation.lla_deg[k].tolist(), None, 0)),
+                     (before, Velocity(stamp, simulation.velocity[k], None))]
+        checks.add(stamps[part], simulation.gyro[part], simulation.accel[part], gnss)
+    return checks
