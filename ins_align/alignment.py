@@ -19,30 +19,20 @@ other, and tells what has become of it.
 """
 
 from collections import Counter
-import math
-from typing import NamedTuple
 
 from ins_align.config import Config
-from ins_align.declaration import Declaration
-from ins_align.handover import aged
+from ins_align.estimation.bank import Bank, Learnt
+from ins_align.estimation.declaration import Declaration, Fit
+from ins_align.estimation.formula import NoteMethod
 from ins_align.intake import Afresh, Located, Loss, Run, Start, Step, Wait
-from ins_align.methods import MapMethod, Method, NoteMethod
 from ins_align.plausibility import ForceCheck
 from ins_align.preintegration import SensorErrors
 from ins_align.results import (
     Attitude, Epoch, Event, Nuisance, Severity, State, Status, Verdict)
-from ins_align.unknowns import Prior
 import numpy as np
 
 _DECLARED = {State.LEVELLED: 1, State.ALIGNED: 2}
 _NOTHING_YET = Verdict(State.WAITING_FOR_IMU, 'no IMU sample yet')
-
-
-class _Learnt(NamedTuple):
-    """What an alignment that is over has learnt of sensors, lever arm and delay, and when."""
-
-    prior: Prior
-    stamp_ns: int
 
 
 class Alignment:
@@ -70,11 +60,11 @@ class Alignment:
         self.counts: Counter[str] = Counter()
         self._events: list[Event] = []
         self._epochs: Counter[str] = Counter()      # of alignments that are over
-        self._method: Method | None = None
+        self._method: Bank | NoteMethod | None = None
         self._first_t0_ns: int | None = None
         self._forget(None)
 
-    def _forget(self, learnt: _Learnt | None) -> None:
+    def _forget(self, learnt: Learnt | None) -> None:
         """Forget everything but the counts and what was learnt of sensors, lever arm and delay."""
         if self._method is not None:
             self._epochs.update(_epoch_counts(self._method))
@@ -118,10 +108,8 @@ class Alignment:
         self._without_velocity = step.without_velocity
         if self._first_t0_ns is None:
             self._first_t0_ns = epoch.stamp_ns
-        if self.config.method == 'map':
-            from ins_align.estimation.bank import Bank
-            self._method = Bank(self.config, epoch, step.imu, step.use_position,
-                                     self._learnt)
+        if self.config.method == 'bank':
+            self._method = Bank(self.config, epoch, step.imu, step.use_position, self._learnt)
         else:
             self._method = NoteMethod(self.config, epoch, step.imu, epoch.v_n is None)
         return self._judge(self._method, step.first)
@@ -145,13 +133,12 @@ class Alignment:
             learnt = self._method.learnt()
         self._forget(learnt)
 
-    def _judge(self, method: Method, located: Located) -> Epoch:
+    def _judge(self, method: Bank | NoteMethod, located: Located) -> Epoch:
         """Results and state after an epoch."""
         assert self._first_t0_ns is not None
         epoch = located.epoch
         self._stamp_ns = stamp_ns = epoch.stamp_ns
         time_s = (stamp_ns - self._start_ns) * 1e-9
-        method.settle()
         fit = method.fit()
         initial, current = method.initial(), method.current()
         measured = epoch.v_n is not None or epoch.position_measured
@@ -165,14 +152,13 @@ class Alignment:
             if measured:
                 verdict = self._declaration.update(time_s, initial[1], current[1], fit,
                                                    method.unconfirmed)
-                if self._declaration.later_start:
-                    method.renew()
+                if self._declaration.move_t0:
+                    method.move_t0()
             else:
                 verdict = self._declaration.update_without_gnss(silent_s, initial[1], current[1],
                                                                 fit)
-            scale = fit.factor ** 2 if math.isfinite(fit.factor) else 1.0
-            self._initial = Attitude(method.t0_ns, initial[0], initial[1] * scale)
-            self.current = Attitude(stamp_ns, current[0], current[1] * scale)
+            self._initial = Attitude(method.t0_ns, *initial)
+            self.current = Attitude(stamp_ns, *current)
         fault = self._force_check.fault or located.fault
         if fault:
             self._declaration.withdraw()
@@ -182,7 +168,6 @@ class Alignment:
         if self._without_velocity:
             verdict = Verdict(verdict.state, f'{verdict.reason}; no GNSS velocity is used: '
                                              f'{self._without_velocity}')
-        method.judged(self._declaration.contradicted or bool(fault), verdict.state)
         if verdict.state is State.ALIGNED and self.declared is None:
             self.declared = self._initial
             self._time_to_align_s = time_s
@@ -192,7 +177,7 @@ class Alignment:
         self._set_verdict(verdict)
         sensors = method.sensor_errors()
         return Epoch(stamp_ns, (stamp_ns - self._first_t0_ns) * 1e-9, verdict.state,
-                     self._initial, self.current, fit.innovation.normalised,
+                     self._initial, self.current, fit.innovation,
                      sensors.gyro_bias, sensors.accel_bias, located.dry)
 
     def _set_verdict(self, verdict: Verdict) -> None:
@@ -239,7 +224,7 @@ class Alignment:
                       **vars(self.nuisance()), counts=dict(counts))
 
 
-def _epoch_counts(method: Method | None) -> Counter[str]:
+def _epoch_counts(method: Bank | NoteMethod | None) -> Counter[str]:
     """Return what became of the epochs of an alignment."""
     if method is None:
         return Counter(epochs_used=0, epochs_rejected_velocity=0, epochs_rejected_position=0,

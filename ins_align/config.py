@@ -166,9 +166,9 @@ class Config:
         False, 'the axes and signs of the IMU are known to be right: declare a heading without '
         'waiting for motion that shows it, also at rest', choices=(True, False))
     method: str = _parameter(
-        'map', 'vif, pif: velocity and position integration formula as published, whose sigmas '
-        "know nothing of the IMU's errors; map: the estimator that knows them",
-        choices=('vif', 'pif', 'map'))
+        'bank', 'vif, pif: velocity and position integration formula as published, whose sigmas '
+        "know nothing of the IMU's errors; bank: filters that know them",
+        choices=('vif', 'pif', 'bank'))
     free_start: bool = _parameter(
         True, 'vif and pif: leave the noisy first velocity and rate out of every later vector; '
         'false: the published formula to the letter', choices=(True, False))
@@ -183,14 +183,14 @@ class Config:
                               'align with, set one of them to auto or true')
         if self.method == 'vif' and self.use_velocity is False:
             raise ConfigError('method vif needs velocities, but use_velocity is false: set it to '
-                              'auto or true, or use the method pif or map')
+                              'auto or true, or use the method pif or bank')
         if self.use_position is True and (self.method == 'vif' or (
                 self.method == 'pif' and self.use_velocity is not False)):
             raise ConfigError(
                 f'method {self.method} does not align with positions beside velocities, but '
                 'use_position is true: set it to auto, '
                 + ('' if self.method == 'vif' else 'or use_velocity to false, ')
-                + 'or use the method map')
+                + 'or use the method bank')
         if self.imu_grade == 'custom':
             missing = [name for name in ImuNoise._fields[:4] if getattr(self, name) == 0.0]
             if missing:

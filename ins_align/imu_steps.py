@@ -25,7 +25,6 @@ import math
 
 from ins_align.buffers import ImuBuffer
 from ins_align.config import ImuNoise
-from ins_align.g_sensitivity import GSensitivity
 from ins_align.plausibility import IMU_BEFORE, RangeCheck, without_spikes
 from ins_align.preintegration import (Intervals, Noise, preintegrate, SensorErrors,
                                       split_at_epochs, Steps, white_noise)
@@ -80,8 +79,6 @@ class ImuCutter:
         self._stated = np.array(stated[:2])
         self._buffer = buffer
         self._counts = counts
-        self._scale_std = stated.gyro_scale_std
-        self._g_sensitivity = GSensitivity(self._scale_std)
         self._range = RangeCheck()
         self._upto_ns = 0                   # up to where the IMU is cut
         self._checked_ns = 0                # and its range checked
@@ -114,7 +111,6 @@ class ImuCutter:
 
     def start(self, stamp_ns: int) -> ImuSteps:
         """Return the steps of no length at the first epoch of an alignment."""
-        self._g_sensitivity = GSensitivity(self._scale_std)
         self._upto_ns = stamp_ns
         return self.cut([stamp_ns], [0.0])[0]
 
@@ -152,9 +148,8 @@ class ImuCutter:
         gap, jitter = self._of_stamps(stamps, first, ends[1:], steps.dt)
         beyond = self._beyond_range(stamps, ends_ns, steps.dt)
         seconds = np.diff(ends_ns) * 1e-9
-        by_force = self._g_sensitivity.noise(seconds, recent)
         noise = Noise(
-            _together(self._stated[0], by_force, GAP_ANGULAR_ACCELERATION * gap,
+            _together(self._stated[0], GAP_ANGULAR_ACCELERATION * gap,
                       jitter * _rms(steps.omega_dot), beyond[0]),
             _together(self._stated[1], GAP_JERK * gap, jitter * _rms(steps.f_dot), beyond[1],
                       np.array(gravity_drift)[:, None]),

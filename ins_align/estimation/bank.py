@@ -27,14 +27,15 @@ from typing import NamedTuple
 
 from ins_align.antenna import AntennaEpoch
 from ins_align.config import Config, STANDARD_GRAVITY
+from ins_align.estimation.declaration import Fit
 from ins_align.estimation.filter import (
     DELAY, Filters, FIRST, GYRO, Linearised, linearised, PHI, PHI0, RHO, Track, XI)
+from ins_align.estimation.formula import AttitudeMoments
 from ins_align.estimation.rivals import in_words, log_sum, Parameters, rivals_of
-from ins_align.fit import Fit, Innovation, no_fit, NOTHING_NEW
-from ins_align.formula import AttitudeMoments, InertialTrack
 from ins_align.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
 from ins_align.rotation import apply, Array, cross, cumulative_rotations, exp_so3, log_so3
+from ins_align.track import InertialTrack
 import numpy as np
 
 # Headings that the bank starts with, every two degrees, and their sigma over the step between
@@ -61,6 +62,8 @@ LOUD, FOLLOW, CLIP = 2.0, 0.02, 5.0
 # A mean of innovations over some epochs, which forgets this share with each, shows errors that
 # last; so much more than white noise makes of it is chance.
 LASTING, CHANCE = 0.2, 0.5
+# Factor on variances that is worth a word.
+MENTIONED = 1.5
 # Epochs over which the mean square of innovations is taken, and those it is believed to be 1 for.
 MEMORY, BELIEVED = 300, 30
 # Parameters are linearised anew when the likeliest mean has gone so far from the point: lever arm
@@ -79,6 +82,9 @@ RESOLVED_STD = 0.35
 FIRST_EPOCHS, MAX_WAITING = 4, 64
 # The residuals of the others are so many times smaller without an outlier.
 OUTLYING = 10.0
+
+
+NOTHING_NEW = np.full(3, math.nan)
 
 
 class Learnt(NamedTuple):
@@ -135,7 +141,7 @@ class Bank:
         self._waiting: list[tuple[AntennaEpoch, Intervals]] = []
         self._last = epoch                          # the last epoch that was processed
         self._C_nn0 = np.eye(3)
-        self._innovation = NOTHING_NEW
+        self._nis, self._innovation = math.nan, NOTHING_NEW
         # Log of factors on variances: of velocity and position, horizontal and vertical.
         self._noise = np.zeros((2, 2))
         self._misfit = self._lasting = 1.0
@@ -248,7 +254,7 @@ class Bank:
 
     def _step(self, filters: Filters, model: Linearised, k: int, track: Track) -> None:
         filters.propagate(model, k)
-        self._innovation = NOTHING_NEW
+        self._nis, self._innovation = math.nan, NOTHING_NEW
         if not any(track.present[k]):
             return
         self._offered += 1
@@ -272,7 +278,7 @@ class Bank:
             nis.append(square)
         self._rejected[2] += bad
         self._in_a_row = self._in_a_row + 1 if astray else 0
-        self._innovation = Innovation(sum(nis) / len(nis), first)
+        self._nis, self._innovation = sum(nis) / len(nis), first
         self._select(filters)
 
     def _best(self, filters: Filters) -> int:
@@ -487,40 +493,39 @@ class Bank:
         return mean, np.sum(share[:, None, None] * total, axis=0) / share.sum()
 
     def initial(self) -> tuple[Array, Array] | None:
+        """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
         if self._filters is None:
             return None
         C, P = self._mixture(self._filters.C0, PHI0)
         return C, self.factor * P
 
     def current(self) -> tuple[Array, Array] | None:
+        """Return ``C_nb`` at the last epoch and the covariance of its error in ENU."""
         if self._filters is None:
             return None
         C, P = self._mixture(self._filters.C, PHI)
-        return (self._C_nn0 @ C,
-                self.factor * self._C_nn0 @ P @ self._C_nn0.T)
+        return self._C_nn0 @ C, self.factor * self._C_nn0 @ P @ self._C_nn0.T
 
     def fit(self) -> Fit:
+        """Return how well the data fit."""
         if self._filters is None:
-            return no_fit(self._offered, self._config.gnss_delay)
-        x, _ = self._body()
-        rows = 3 * (self._offered - self._rejected[2])
-        words, contradicted = self.rival()
-        return Fit(rows * self._misfit, rows, self._innovation, True, *self._rejected,
-                   self._offered, self._config.gnss_delay + float(x[DELAY]),
-                   objection=words if contradicted else '')
+            return Fit(self._offered, delay=self._config.gnss_delay)
+        words, contradicted = self._doubt()
+        return Fit(self._offered, 3 * (self._offered - self._rejected[2]), self._misfit,
+                   self._nis, self._innovation, *self._rejected,
+                   delay=self._config.gnss_delay + float(self._body()[0][DELAY]),
+                   objection=words if contradicted else '', noise=self._noise_in_words())
 
-    def settle(self):
-        pass
-
-    def renew(self):
+    def move_t0(self) -> None:
         """Move t0 to the last epoch."""
         assert self._filters is not None
         self._filters.clone(self._C_nn0.T)
         self.moved += 1
         self.t0_ns = self._last.stamp_ns
 
-    def judged(self, contradicted, state):
-        pass
+    def unconfirmed(self) -> str:
+        """Return what speaks against declaring a heading, or ''."""
+        return self._doubt()[0]
 
     def _ahead_of(self, filters: Filters) -> Array:
         """Return how much likelier each rival that is wrong is than all levels, shape (M,)."""
@@ -529,7 +534,7 @@ class Bank:
         ahead = np.where(wrong, evidence - log_sum(evidence[~wrong]), -np.inf)
         return np.asarray(ahead / max(self._misfit, 1.0))
 
-    def rival(self) -> tuple[str, bool]:
+    def _doubt(self) -> tuple[str, bool]:
         """
         Hear the rivals that are wrong.
 
@@ -559,12 +564,19 @@ class Bank:
             return self._words(filters, worst), True
         return 'the signs of the IMU axes are not confirmed by the motion yet: turn', False
 
-    def unconfirmed(self) -> str:
-        return self.rival()[0]
-
     def _words(self, filters: Filters, rival: int) -> str:
         return in_words(self._rivals[filters.ids[rival]], filters.x[filters.lead[rival]],
                         self._config.gnss_delay)
+
+    def _noise_in_words(self) -> str:
+        """Return how the noise is another one than is stated, as the end of a sentence."""
+        more = ''.join(f'; the GNSS {name} are {math.exp(noise / 2):.1f} times as noisy as stated'
+                       for name, noise in zip(('velocities', 'positions'), self._noise.max(axis=1))
+                       if math.exp(noise) > MENTIONED)
+        if self._lasting - CHANCE > max(MENTIONED, self._misfit):
+            more += ('; errors of the GNSS last from epoch to epoch: sigmas are '
+                     f'{math.sqrt(self.factor):.1f} times larger')
+        return more
 
     def _body(self) -> tuple[Array, Array]:
         filters = self._filters
@@ -574,6 +586,7 @@ class Bank:
         return filters.x[filters.lead[best]], filters.P[best, FIRST:, FIRST:]
 
     def nuisance(self) -> Nuisance:
+        """Return biases, lever arm and delay."""
         x, P = self._body()
         std = np.sqrt(np.diag(P))
         size = (x.size - GYRO) // 2
@@ -582,6 +595,7 @@ class Bank:
                         float(self._config.gnss_delay + x[DELAY]), float(std[DELAY]))
 
     def sensor_errors(self) -> SensorErrors:
+        """Return the errors of gyros and accelerometers at the last epoch."""
         x, _ = self._body()
         size = (x.size - GYRO) // 2
         full = np.zeros(24)

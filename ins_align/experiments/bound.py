@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Experiment ``bound``: errors of `method: map` against the Cramer-Rao bound, and its sigma.
+Experiment ``bound``: errors of `method: bank` against the Cramer-Rao bound, and its sigma.
 
 The bound comes from the dense reference on the true motion. Errors are those of the attitude at
 t0 after so many seconds of data.

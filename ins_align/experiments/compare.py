@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Experiment ``compare``: heading from course over ground, the note, its centred form, and map."""
+"""Experiment ``compare``: heading from course over ground, the note, its centred form, and bank."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 METHODS: dict[str, dict[str, Any]] = {
     'note': {'method': 'vif', 'free_start': False},
     'centred': {'method': 'vif'},
-    'map': {'method': 'map'},
+    'bank': {'method': 'bank'},
 }
 NAMES = ('course', *METHODS)
-COLOURS = {'course': '#009E73', 'note': '#0072B2', 'centred': '#E69F00', 'map': '#CC79A7'}
+COLOURS = {'course': '#009E73', 'note': '#0072B2', 'centred': '#E69F00', 'bank': '#CC79A7'}
 
 
 def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
@@ -57,7 +57,7 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
         'said otherwise, lever arm [1 1 1] m unless said otherwise, GNSS 5 Hz, 0.1 m/s), and of '
         'the windows with real motion of each recording (experiment `recordings`). course: the '
         f'direction of the GNSS velocity, where it exceeds {SLOWEST:g} m/s, for the heading. '
-        'note: vif with free_start false; centred: vif; map: the default. All are told the '
+        'note: vif with free_start false; centred: vif; bank: the default. All are told the '
         "vehicle's lever arm where it is known.")
     tasks = [(name, seed) for name in CASES for seed in range(runs)]
     results = parallel(run_one, tasks, jobs, 'runs')
@@ -118,7 +118,7 @@ def recorded(data_dir: Path, jobs: int | None) -> dict[str, Array]:
 
     medians = {}
     for name, methods in collect(recordings_in(data_dir), jobs).items():
-        moving = [window.moves for window in methods['map']]
+        moving = [window.moves for window in methods['bank']]
         errors = np.full((sum(moving), len(NAMES), len(TIMES)), np.nan)
         for line, method in enumerate(METHODS, 1):
             chosen = [window for window, moves in zip(methods[method], moving) if moves]

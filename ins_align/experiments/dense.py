@@ -20,7 +20,7 @@ the random-walk errors of all epochs is one dense matrix. On the true motion its
 information is the Cramer-Rao bound; on the measured data it gives the estimate that the recursion
 must match. Cost grows with the cube of the number of epochs: 500 take about a second.
 
-The unknowns are in the order of `ins_align.unknowns`; velocity rows come before position rows.
+Velocity rows come before position rows.
 """
 
 from __future__ import annotations
@@ -29,14 +29,19 @@ from dataclasses import dataclass
 import math
 
 from ins_align.config import ImuNoise, STANDARD_GRAVITY
+from ins_align.estimation.rivals import ACCEL_ERRORS, GYRO_MISALIGNMENT
 from ins_align.messages import ENU_FROM_NED
-from ins_align.rotation import Array, skew
+from ins_align.rotation import Array, Index, skew
 from ins_align.simulation import Simulation
-from ins_align.unknowns import (ACCEL, ACCEL_BIAS, ACCEL_ERRORS, ACCEL_MATRIX, ATTITUDE, DELAY,
-                                GYRO, GYRO_BIAS, GYRO_MATRIX, gyro_matrix_std, Index, LEVER_ARM,
-                                SIZE, START_POSITION, START_VELOCITY)
 import numpy as np
 
+# Places of the unknowns.
+ATTITUDE, GYRO_BIAS, GYRO_MATRIX = slice(0, 3), slice(3, 6), slice(6, 15)
+ACCEL_BIAS, ACCEL_MATRIX = slice(15, 18), slice(18, 27)
+START_VELOCITY, START_POSITION = slice(27, 30), slice(30, 33)
+LEVER_ARM, DELAY = slice(33, 36), slice(36, 37)
+SIZE = 37
+GYRO, ACCEL = slice(GYRO_BIAS.start, GYRO_MATRIX.stop), slice(ACCEL_BIAS.start, ACCEL_MATRIX.stop)
 # Nothing more than "somewhere on the circle" is known of an angle (rad): keeps the information
 # regular where the motion shows no heading.
 _ATTITUDE_STD = math.pi / math.sqrt(3)
@@ -536,7 +541,8 @@ def _prior(simulation: Simulation, noise: ImuNoise, use_position: bool, lever_ar
     std[START_VELOCITY] = math.inf
     std[START_POSITION] = math.inf if use_position else 0.0
     std[GYRO_BIAS] = noise.gyro_bias_std
-    std[GYRO_MATRIX] = gyro_matrix_std(noise.gyro_scale_std).ravel()
+    std[GYRO_MATRIX] = noise.gyro_scale_std * np.where(
+        np.eye(3) > 0, 1.0, GYRO_MISALIGNMENT).ravel()
     std[ACCEL_BIAS] = noise.accel_bias_std
     std[ACCEL_MATRIX] = ACCEL_ERRORS * noise.gyro_scale_std
     std[LEVER_ARM], std[DELAY] = lever_arm_std, delay_std

@@ -27,9 +27,8 @@ from ins_align.aligner import Aligner
 from ins_align.earth import EARTH_RATE, earth_rate_n, LocalLevel
 from ins_align.experiments import dense
 from ins_align.experiments.common import exact_config_for, parallel, Report, rms
-from ins_align.formula import exact_lever_remainder
 from ins_align.report import new_figure
-from ins_align.rotation import Array, cross, roll_pitch_yaw
+from ins_align.rotation import Array, cross, roll_pitch_yaw, skew
 from ins_align.simulation import epochs_of, simulate
 import numpy as np
 
@@ -48,15 +47,15 @@ VARIANTS: dict[str, tuple[tuple[float, ...], dict[str, Any]]] = {
     'zero lever arm': (NO_LEVER, {'method': 'vif', 'free_start': False}),
     'not compensated, free start': (LEVER, {'method': 'vif', 'lever_arm': NO_LEVER}),
     'compensated, free start': (LEVER, {'method': 'vif'}),
-    'map': (LEVER, {'method': 'map'}),
+    'bank': (LEVER, {'method': 'bank'}),
 }
-ADDED = ('compensated', 'compensated, free start', 'map')
+ADDED = ('compensated', 'compensated, free start', 'bank')
 COLOURS = {'not compensated': '#D55E00', 'compensated': '#0072B2', 'zero lever arm': '#009E73',
-           'compensated, free start': '#E69F00', 'map': '#CC79A7'}
+           'compensated, free start': '#E69F00', 'bank': '#CC79A7'}
 
 
 def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
-    """Run all variants, navigation grade; the note, its free start and map with MEMS too."""
+    """Run all variants, navigation grade; the note, its free start and bank with MEMS too."""
     runs = runs or 100
     report = Report('note', "The note's experiment", out, f' --runs {runs}')
     report.text(
@@ -71,14 +70,14 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
     for number in range(0, len(tasks), runs):
         grade, name, _ = tasks[number]
         errors[grade][name] = np.array(results[number:number + runs])
-    time = np.arange(errors['navigation']['map'].shape[1]) / 5.0
+    time = np.arange(errors['navigation']['bank'].shape[1]) / 5.0
     bounds = {grade: bound_of(grade) for grade in errors}
     numbers = {'rms_heading_deg': rms_table(report, errors, bounds, time),
                'peak_deg': peak_table(report, errors['navigation'], time)}
     report.figure(note_figure(errors['navigation'], time), '', f'Mean errors of {runs} runs, '
                   'method `vif` without free start, as in Fig. 1 of the note')
     report.figure(added_figure(errors, bounds, time), '_added', 'Root mean square errors: the '
-                  'note, its free start, map, and the Cramer-Rao bound')
+                  'note, its free start, bank, and the Cramer-Rao bound')
     remarks = remarks_of(REMARK_DURATION)
     report.figure(remark_figure(*remarks), '_remarks', 'Remark 2.1: what the short form of (9) '
                   'leaves out. Remark 2.2: the lever-arm term against the integral of the '
@@ -131,7 +130,7 @@ def rms_table(report: Report, errors: dict[str, dict[str, Array]], bounds: dict[
         for name, values in columns.items():
             rows.append([f'{grade}: {name}', *(f'{value:.2g}' for value in values)])
             numbers[f'{grade}: {name}'] = list(values)
-    report.table('Heading error, rms in deg. Without "free start" and map: free_start false, '
+    report.table('Heading error, rms in deg. Without "free start" and bank: free_start false, '
                  'the note to the letter', ['variant', *(f'{t:g} s' for t in TABLE_TIMES)], rows)
     return numbers
 
@@ -265,3 +264,39 @@ def remark_figure(time: Array, remainder: Array, limit: Array, term: Array,
         ax.grid(alpha=0.3)
         ax.legend()
     return picture
+
+
+def exact_lever_remainder(time: Array, C_b0b: Array, omega_eb_b: Array, omega_ie_b0: Array,
+                          lever_b: Array) -> Array:
+    """
+    Difference of the exact form of (9) from the short one: the oracle of Remark 2.1.
+
+    Parameters
+    ----------
+    time : ndarray, shape (N,)
+        Seconds, starting at t0.
+    C_b0b : ndarray, shape (N, 3, 3)
+        Attitude relative to t0.
+    omega_eb_b : ndarray, shape (N, 3)
+        Angular rate to the Earth.
+    omega_ie_b0 : ndarray, shape (3,)
+        Earth rate in b0.
+    lever_b : ndarray, shape (3,)
+        Lever arm, metres.
+
+    Returns
+    -------
+    ndarray, shape (N, 3)
+        m/s; at most ``W^2 t |lever|``.
+
+    """
+    rate = skew(omega_eb_b)
+    swept = C_b0b @ rate
+    h = np.diff(time)[:, None, None]
+    integral = np.concatenate([np.zeros((1, 3, 3)),
+                               np.cumsum(h / 2 * (swept[1:] + swept[:-1]), axis=0)])
+    omega_ie_b = (C_b0b.transpose(0, 2, 1) @ omega_ie_b0)
+    exact = C_b0b @ rate - rate[0] + skew(omega_ie_b0) @ integral
+    omega_ib_b = omega_eb_b + omega_ie_b
+    short = C_b0b @ skew(omega_ib_b) - skew(omega_ib_b[0])
+    return (exact - short) @ lever_b

@@ -31,9 +31,9 @@ TIMES = (30.0, 60.0, 120.0)
 METHODS: dict[str, dict[str, Any]] = {
     'note': {'method': 'vif', 'free_start': False},
     'centred': {'method': 'vif'},
-    'map': {'method': 'map'},
+    'bank': {'method': 'bank'},
 }
-COLOURS = {'note': '#0072B2', 'centred': '#E69F00', 'map': '#CC79A7'}
+COLOURS = {'note': '#0072B2', 'centred': '#E69F00', 'bank': '#CC79A7'}
 
 
 def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
@@ -54,7 +54,7 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
     declared_table(report, windows)
     time_table(report, windows)
     report.figure(figure(windows), '', 'Heading error of all windows against time; declared '
-                                       'parts of map drawn dark')
+                                       'parts of the bank drawn dark')
     numbers = {name: {method: [window_json(window) for window in each]
                       for method, each in methods.items()} for name, methods in windows.items()}
     report.write(numbers)
@@ -84,8 +84,8 @@ def run_task(task: tuple[Path, str, float]) -> Window:
 
 
 def targets_text(report: Report, windows: dict[str, dict[str, list[Window]]]) -> None:
-    """Say of map how much of the declared was right and how much was declared soon."""
-    every = [(name, window) for name, methods in windows.items() for window in methods['map']]
+    """Say of the bank how much of the declared was right and how much was declared soon."""
+    every = [(name, window) for name, methods in windows.items() for window in methods['bank']]
     declared = [(name, window, window.declared) for name, window in every
                 if window.declared is not None]
     sigmas = np.array([max(error.tilt_sigmas, error.heading_sigmas) for *_, error in declared])
@@ -93,13 +93,13 @@ def targets_text(report: Report, windows: dict[str, dict[str, list[Window]]]) ->
     soon = sum(window.declared_s is not None and window.declared_s <= MOTION_TIME
                for window in moving)
     report.text(
-        f'map over all recordings: of {len(declared)} declared, {np.sum(sigmas <= 3)} are within '
+        f'bank over all recordings: of {len(declared)} declared, {np.sum(sigmas <= 3)} are within '
         f'3 sigma ({100 * np.mean(sigmas <= 3):.0f} %, target 99 %) and {np.sum(sigmas > 5)} '
         f'beyond 5 (target none); of {len(moving)} windows with real motion, {soon} declare '
         f'within {MOTION_TIME:g} s ({100 * soon / max(len(moving), 1):.0f} %, target 90 %). '
         'Target of the median heading error at the declaration: 1 deg (UAV, car), 3 deg '
-        '(quadrotor).' if declared else 'map declared nothing.')
-    report.table('map: declared beyond 3 sigma', [
+        '(quadrotor).' if declared else 'the bank declared nothing.')
+    report.table('bank: declared beyond 3 sigma', [
         'recording', 'start, s', 'after, s', 'heading, deg', 'sigmas', 'tilt, deg', 'sigmas'], [
         [name, f'{window.start_s:g}', f'{window.declared_s:.1f}', f'{error.angles_deg[2]:.2f}',
          f'{error.heading_sigmas:.1f}', f'{np.hypot(*error.angles_deg[:2]):.2f}',
@@ -145,7 +145,7 @@ def time_table(report: Report, windows: dict[str, dict[str, list[Window]]]) -> N
     """Print errors after fixed times, of windows with real motion."""
     rows = []
     for name, methods in windows.items():
-        moving = [window.moves for window in methods['map']]
+        moving = [window.moves for window in methods['bank']]
         if not any(moving):
             moving = [True] * len(moving)
         for method, each in methods.items():
@@ -188,31 +188,31 @@ def figure(windows: dict[str, dict[str, list[Window]]]) -> Any:
     axes = picture.subplots(len(windows), 2, squeeze=False, sharey='row')
     grid = np.arange(1.0, LENGTH + 1.0)
     for (name, methods), (left, right) in zip(windows.items(), axes):
-        for window in methods['map']:
+        for window in methods['bank']:
             # Two a second are enough to see, ten make a large file.
             step = max(1, round(0.5 * len(window.time) / max(np.ptp(window.time), 1.0))
                        if len(window.time) else 1)
             time, aligned = window.time[::step], window.aligned[::step]
             error = np.abs(window.error_deg[::step, 2])
             left.semilogy(time, error, color='#bbbbbb', linewidth=0.5)
-            left.semilogy(time, np.where(aligned, error, np.nan), color=COLOURS['map'],
+            left.semilogy(time, np.where(aligned, error, np.nan), color=COLOURS['bank'],
                           linewidth=0.7)
-        moving = [window.moves for window in methods['map']]
+        moving = [window.moves for window in methods['bank']]
         if not any(moving):
             moving = [True] * len(moving)
         for method, each in methods.items():
             chosen = [window for window, moves in zip(each, moving) if moves]
             right.semilogy(grid, _median_over(chosen, grid, 'error_deg'), color=COLOURS[method],
                            label=f'{method}: median error')
-        chosen = [window for window, moves in zip(methods['map'], moving) if moves]
+        chosen = [window for window, moves in zip(methods['bank'], moving) if moves]
         right.semilogy(grid, _median_over(chosen, grid, 'sigma_deg'), 'k--',
-                       label='map: median stated sigma')
+                       label='bank: median stated sigma')
         left.set_title(f'{name}: map, every window (declared: dark)')
         right.set_title(f'{name}: medians, windows with real motion' if any(
-            window.moves for window in methods['map']) else f'{name}: medians, all windows')
+            window.moves for window in methods['bank']) else f'{name}: medians, all windows')
         left.set_ylabel('heading error (deg)')
         left.set_ylim(0.02, 200.0)
-        longest = max((window.time[-1] for window in methods['map'] if len(window.time)),
+        longest = max((window.time[-1] for window in methods['bank'] if len(window.time)),
                       default=LENGTH)
         for ax in (left, right):
             ax.set_xlim(0.0, longest)

@@ -19,14 +19,13 @@ under its threshold; the residuals must pass; both must have held for a while.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 import math
 
 from ins_align.config import Config
-from ins_align.fit import Fit
 from ins_align.results import State, Verdict
 from ins_align.rotation import Array
-from ins_align.told import seem_late
-
+import numpy as np
 
 # Mean square of normalised residuals above which the model is contradicted.
 MAX_MISFIT = 4.0
@@ -35,16 +34,55 @@ REJECTED_SHARE = 0.25
 # What was declared is withdrawn when its sigma is so many times the threshold.
 WITHDRAWN_AT = 2.0
 # Redundant rows before anything is declared.
-MIN_DOF = 12
+MIN_ROWS = 12
 # A delay is to be expected within so many of its sigmas; and further off (s) it is more than a
 # correction to the model, whatever the sigma.
 DELAY_SIGMAS, UNEXPLAINED_DELAY = 3.0, 0.3
-# Factor on variances that is worth a word.
-MENTIONED = 1.5
 # Conditions that have to hold are seen to hold at epochs that are no further apart than this (s).
 MAX_SILENCE = 30.0
 # Epochs over which the latest innovations are averaged.
 RECENT = 25
+
+
+@dataclass(frozen=True)
+class Fit:
+    """
+    How well the data fit the model of a method.
+
+    Attributes
+    ----------
+    offered : int
+        Epochs with a measurement, rejected ones included.
+    rows : int
+        Redundant rows; 0 before there is a solution.
+    misfit : float
+        Mean square of normalised residuals.
+    nis : float
+        Normalised innovation squared of the last epoch, per row; nan where nothing was tested.
+    innovation : ndarray, shape (3,)
+        Of the velocity (of the position where only that is used) over its sigma.
+    rejected_velocity, rejected_position, rejected : int
+        Measurements, and epochs with any of them, that were refused as outliers.
+    delay : float
+        Of the GNSS, seconds; the configured one where none is estimated.
+    objection : str
+        What the data say against the configuration, in words.
+    noise : str
+        How the noise is another one than is stated, as the end of a sentence.
+
+    """
+
+    offered: int
+    rows: int = 0
+    misfit: float = math.nan
+    nis: float = math.nan
+    innovation: Array = field(default_factory=lambda: np.full(3, math.nan))
+    rejected_velocity: int = 0
+    rejected_position: int = 0
+    rejected: int = 0
+    delay: float = 0.0
+    objection: str = ''
+    noise: str = ''
 
 
 class Declaration:
@@ -60,10 +98,8 @@ class Declaration:
     ----------
     levelled, aligned : bool
         What is declared.
-    later_start : bool
+    move_t0 : bool
         Whether t0 had better move.
-    contradicted : bool
-        Whether the data contradict the model.
 
     """
 
@@ -74,8 +110,7 @@ class Declaration:
         self._heading_since_s: float | None = None
         self.levelled = False
         self.aligned = False
-        self.later_start = False
-        self.contradicted = False
+        self.move_t0 = False
         self._against = ''                  # what spoke against it when it was judged last
         self._contradiction = ''            # when there was redundancy last
         self._offered = 0                   # epochs until then
@@ -93,7 +128,7 @@ class Declaration:
             Seconds since the first t0.
         initial, current : ndarray, shape (3, 3)
             Covariances of the attitude at t0 and of the one now, in ENU. Both must be good enough;
-            where only the present one is, `later_start` says that t0 had better move.
+            where only the present one is, `move_t0` says that t0 had better move.
         fit : Fit
             How well the data fit the model.
         unconfirmed : callable
@@ -104,24 +139,21 @@ class Declaration:
         Verdict
 
         """
-        nis = fit.innovation.nis
-        if math.isfinite(nis):
-            self._recent_nis += (min(nis, 10.0) - self._recent_nis) / RECENT
+        if math.isfinite(fit.nis):
+            self._recent_nis += (min(fit.nis, 10.0) - self._recent_nis) / RECENT
         contradiction = self._contradicted_by(fit)
-        if fit.dof >= MIN_DOF:
+        if fit.rows >= MIN_ROWS:
             self._contradiction, self._offered = contradiction, fit.offered
-        self.contradicted = bool(contradiction)
-        tilt, heading = _sigmas_deg(initial, fit.factor)
-        tilt_now, heading_now = _sigmas_deg(current, fit.factor)
+        tilt, heading = _sigmas_deg(initial)
+        tilt_now, heading_now = _sigmas_deg(current)
         tilt, heading = max(tilt, tilt_now), max(heading, heading_now)
         just_rejected, self._rejected = fit.rejected > self._rejected, fit.rejected
-        good = (not contradiction and not just_rejected and fit.converged
-                and fit.dof >= MIN_DOF)
+        good = not contradiction and not just_rejected and fit.rows >= MIN_ROWS
         max_tilt, max_heading = self.config.tilt_std_threshold, self.config.heading_std_threshold
         self._level_since_s = _since(self._level_since_s, time_s, good and tilt <= max_tilt)
         self._heading_since_s = _since(self._heading_since_s, time_s, good
                                        and tilt_now <= max_tilt and heading_now <= max_heading)
-        self.later_start = False
+        self.move_t0 = False
         self._against = contradiction
         if contradiction:
             self.withdraw()
@@ -131,7 +163,7 @@ class Declaration:
         if not self.aligned and self._held(self._heading_since_s, time_s):
             self._against = doubt = unconfirmed()
             self.aligned = not doubt and tilt <= max_tilt and heading <= max_heading
-            self.later_start = not doubt and not self.aligned
+            self.move_t0 = not doubt and not self.aligned
         self._withdraw_lost(tilt, heading)
         if doubt:
             return Verdict(State.LEVELLED if self.levelled else State.ALIGNING, doubt)
@@ -157,7 +189,7 @@ class Declaration:
         if silent_s > MAX_SILENCE:
             self._level_since_s = self._heading_since_s = None
         tilt, heading = (max(worse) for worse in zip(*(
-            _sigmas_deg(P, fit.factor) for P in (initial, current))))
+            _sigmas_deg(P) for P in (initial, current))))
         self._withdraw_lost(tilt, heading)
         verdict = self._verdict(tilt, heading, fit)
         return Verdict(verdict.state,
@@ -184,8 +216,8 @@ class Declaration:
         config = self.config
         if self.aligned:
             return Verdict(State.ALIGNED, f'heading sigma {heading:.2g} deg, '
-                                          f'tilt sigma {tilt:.2g} deg{_noise(fit)}')
-        if fit.dof < MIN_DOF:
+                                          f'tilt sigma {tilt:.2g} deg{fit.noise}')
+        if fit.rows < MIN_ROWS:
             return Verdict(State.ALIGNING, self._too_few(fit))
         if tilt > config.tilt_std_threshold and not self.levelled:
             return Verdict(State.ALIGNING,
@@ -194,10 +226,7 @@ class Declaration:
         state = State.LEVELLED if self.levelled else State.ALIGNING
         if heading > config.heading_std_threshold:
             return Verdict(state, f'heading sigma {_above(heading, config.heading_std_threshold)}'
-                                  f': turn or change speed{_noise(fit)}')
-        if not fit.converged:
-            return Verdict(state, f'heading sigma {heading:.2g} deg is good enough: the estimate '
-                                  'is still settling')
+                                  f': turn or change speed{fit.noise}')
         return Verdict(state, f'heading sigma {heading:.2g} deg is good enough: it has to hold '
                               f'for {config.hold_time:g} s')
 
@@ -212,7 +241,7 @@ class Declaration:
 
     def _contradicted_by(self, fit: Fit) -> str:
         """Return what in the data contradicts the model; empty when nothing does."""
-        if fit.dof < MIN_DOF:
+        if fit.rows < MIN_ROWS:
             return ''
         if fit.rejected > REJECTED_SHARE * fit.offered:
             return (f'{fit.rejected} of {fit.offered} GNSS epochs do not fit the rest: check the '
@@ -220,10 +249,12 @@ class Declaration:
         config = self.config
         unexplained = abs(fit.delay - config.gnss_delay)
         if unexplained > min(DELAY_SIGMAS * config.gnss_delay_std, UNEXPLAINED_DELAY) > 0:
-            return f'{seem_late(fit.delay, config)}, or set gnss_delay'
+            return (f'the GNSS stamps seem to be {fit.delay:.2f} s late, gnss_delay is '
+                    f'{config.gnss_delay:g} and gnss_delay_std {config.gnss_delay_std:g}: check '
+                    'the clocks, or set gnss_delay')
         if fit.objection:
             return fit.objection
-        misfit = max(fit.chi2 / fit.dof, self._recent_nis)
+        misfit = max(fit.misfit, self._recent_nis)
         if misfit > MAX_MISFIT:
             return (f'the residuals are {math.sqrt(misfit):.1f} times what the stated noise '
                     'allows: check the lever arm, the GNSS delay, the velocity frame, the IMU '
@@ -235,19 +266,6 @@ def _silence(silent_s: float) -> str:
     return f'; no GNSS for {silent_s:.0f} s'
 
 
-def _noise(fit: Fit) -> str:
-    """Return how the noise is another one than is stated, as the end of a sentence."""
-    more = ''.join(f'; the GNSS {name} are {math.sqrt(factor):.1f} times as noisy as stated'
-                   for name, factor in zip(('velocities', 'positions'), fit.gnss_noise)
-                   if factor > 1.0)
-    if fit.walk > 1.0:
-        more += f'; the biases of the gyros drift {fit.walk:.0f} times as fast as stated'
-    if fit.lasting_factor ** 2 > MENTIONED:
-        more += ('; errors of the GNSS last from epoch to epoch: sigmas are '
-                 f'{fit.lasting_factor:.1f} times larger')
-    return more
-
-
 def _above(sigma_deg: float, threshold_deg: float) -> str:
     """Return a sigma and the threshold that it is above, so that this shows."""
     text = f'{sigma_deg:.2g}'
@@ -256,11 +274,11 @@ def _above(sigma_deg: float, threshold_deg: float) -> str:
     return f'{text} deg, needs {threshold_deg:g}'
 
 
-def _sigmas_deg(P: Array, factor: float) -> tuple[float, float]:
-    """Sigma of tilt, about the horizontal axis where it is largest, and of heading, inflated."""
+def _sigmas_deg(P: Array) -> tuple[float, float]:
+    """Sigma of tilt, about the horizontal axis where it is largest, and of heading."""
     (ee, en, _), (_, nn, _), (_, _, uu) = P.tolist()
     tilt = math.sqrt(0.5 * (ee + nn) + math.hypot(0.5 * (ee - nn), en))
-    return math.degrees(tilt) * factor, math.degrees(math.sqrt(uu)) * factor
+    return math.degrees(tilt), math.degrees(math.sqrt(uu))
 
 
 def _since(since_s: float | None, time_s: float, good: bool) -> float | None:

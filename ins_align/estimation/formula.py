@@ -15,18 +15,25 @@
 The note: velocity and position integration formulas with lever arm, and attitude from them.
 
 Y. Wu, "Further results on 'Velocity/position integration formula (I): application to in-flight
-coarse alignment'", and the free start, the position form (Remark 2.3) and the form in a
-non-rotating frame that this package adds (docs, "Theory").
+coarse alignment'", and the free start and the position form (Remark 2.3) that this package
+adds (docs, "Theory").
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+import math
 
-from ins_align.earth import (earth_rate_n, gravitation_n, gravity_n, ground_velocity_n,
-                             LocalLevel, position_n)
-from ins_align.preintegration import Intervals
-from ins_align.rotation import (Array, cross, matrix_from_quaternion, orthonormalized,
-                                running_sum, skew)
+from ins_align.antenna import AntennaEpoch
+from ins_align.config import Config
+from ins_align.earth import earth_rate_n, gravity_n, LocalLevel
+from ins_align.estimation.declaration import Fit
+from ins_align.preintegration import Intervals, SensorErrors
+from ins_align.results import Nuisance
+from ins_align.rotation import Array, cross, matrix_from_quaternion, orthonormalized
+from ins_align.track import InertialTrack
 import numpy as np
+
+# Sigma of an angle that may be any, radians.
+UNIFORM_STD = math.pi / math.sqrt(3.0)
 
 
 class BodyIntegrals:
@@ -166,106 +173,6 @@ class NavigationIntegrals:
         return self.s_p - self.time * self.v_n0
 
 
-@dataclass(frozen=True)
-class InertialTrack:
-    """
-    The navigation side in the non-rotating frame n0, from positions and velocities as they come.
-
-    ``s_p = C_n0e Rz(W t) r_e(t) - int int gravitation`` and its derivative ``s_v`` differ from
-    the integrated forms of `NavigationIntegrals` by a constant and a term in t, which a free
-    start takes out; nothing between epochs has to be interpolated but gravitation, so gaps do no
-    harm. Both are kept relative to a point that is fixed in the Earth at t0, against rounding.
-
-    Attributes
-    ----------
-    n0 : LocalLevel
-    time : ndarray, shape (...)
-        Seconds since t0.
-    C_n0n : ndarray, shape (..., 3, 3)
-    still_v : ndarray, shape (..., 3)
-        s_v of an antenna that rests on the Earth here, m/s.
-    s_p : ndarray, shape (..., 3)
-        Metres.
-    gravity, gravitation : ndarray, shape (..., 3)
-        In n0 axes, m/s^2.
-    int_gravitation, int_int_gravitation : ndarray, shape (..., 3)
-    origin_r, origin_v : ndarray, shape (3,)
-        Position and ground velocity at t0.
-
-    """
-
-    n0: LocalLevel
-    time: Array
-    C_n0n: Array
-    still_v: Array
-    s_p: Array
-    gravity: Array
-    gravitation: Array
-    int_gravitation: Array
-    int_int_gravitation: Array
-    origin_r: Array
-    origin_v: Array
-
-    @staticmethod
-    def start(latitude: float, longitude: float, altitude: float) -> 'InertialTrack':
-        """Start at t0, with the antenna there: radians and metres."""
-        zero = np.zeros(3)
-        return InertialTrack(
-            LocalLevel(latitude, longitude), np.zeros(()), np.eye(3), zero, zero,
-            gravity_n(latitude, altitude), gravitation_n(latitude, altitude), zero, zero,
-            position_n(latitude, altitude), ground_velocity_n(latitude, altitude))
-
-    def extended(self, time: Array, latitude: Array, longitude: Array,
-                 altitude: Array) -> 'InertialTrack':
-        """
-        Follow the antenna through K epochs.
-
-        Parameters
-        ----------
-        time : ndarray, shape (K,)
-            Seconds since t0, increasing.
-        latitude, longitude, altitude : ndarray, shape (K,)
-            Of the antenna, radians and metres.
-
-        Returns
-        -------
-        InertialTrack
-            With a leading axis of K.
-
-        """
-        C_n0n = self.n0.matrix(time, latitude, longitude)
-
-        def seen(vector_n: Array) -> Array:
-            return (C_n0n @ vector_n[..., None])[..., 0]
-
-        gravity_here = gravity_n(latitude, altitude)
-        ground_velocity = ground_velocity_n(latitude, altitude)
-        gravitation = seen(gravity_here + cross(earth_rate_n(latitude), ground_velocity))
-        before = np.concatenate([self.gravitation[None], gravitation[:-1]])
-        h = np.diff(time, prepend=self.time)[:, None]
-        steps = h / 2 * (before + gravitation)
-        int_gravitation = running_sum(self.int_gravitation, steps)
-        int_int_gravitation = running_sum(
-            self.int_int_gravitation,
-            h * (int_gravitation - steps) + h * h / 6 * (2 * before + gravitation))
-        return InertialTrack(
-            self.n0, time, C_n0n, seen(ground_velocity) - self.origin_v - int_gravitation,
-            (seen(position_n(latitude, altitude)) - self.origin_r
-             - time[:, None] * self.origin_v - int_int_gravitation),
-            seen(gravity_here), gravitation, int_gravitation, int_int_gravitation,
-            self.origin_r, self.origin_v)
-
-    def at(self, index: int | tuple[()]) -> 'InertialTrack':
-        """Return one epoch of a track over many; () of a track that is of one."""
-        return replace(self, **{name: getattr(self, name)[index] for name in (
-            'time', 'C_n0n', 'still_v', 's_p', 'gravity', 'gravitation', 'int_gravitation',
-            'int_int_gravitation')})
-
-    def s_v(self, v_n: Array) -> Array:
-        """Velocity side for antenna velocities `v_n` (ENU, m/s), shape (..., 3)."""
-        return (self.C_n0n @ v_n[..., None])[..., 0] + self.still_v
-
-
 class AttitudeMoments:
     """
     Sums from which ``min_C sum |s - (unknown start) - C a|^2`` is solved: constant memory.
@@ -339,37 +246,171 @@ def attitude_from_moments(B: Array, total: float) -> tuple[Array, float]:
     return matrix_from_quaternion(vectors[:, 0]), max(float(values[0]), 0.0)
 
 
-def exact_lever_remainder(time: Array, C_b0b: Array, omega_eb_b: Array, omega_ie_b0: Array,
-                          lever_b: Array) -> Array:
+def _mean_variance(covariance: Array) -> float:
+    """Mean of the three axes' variances."""
+    return float(np.trace(covariance)) / 3
+
+
+class NoteMethod:
     """
-    Difference of the exact form of (9) from the short one: the oracle of Remark 2.1.
+    The note's velocity (``vif``) or position (``pif``) integration formula with lever arm.
+
+    Errors of the IMU are not known to it: its sigma comes from the centred moments, the noise of
+    the receiver and the residuals; those of the gyros count where the GNSS is silent. ``pif``
+    takes positions where no velocity comes; the start velocity is then always free.
 
     Parameters
     ----------
-    time : ndarray, shape (N,)
-        Seconds, starting at t0.
-    C_b0b : ndarray, shape (N, 3, 3)
-        Attitude relative to t0.
-    omega_eb_b : ndarray, shape (N, 3)
-        Angular rate to the Earth.
-    omega_ie_b0 : ndarray, shape (3,)
-        Earth rate in b0.
-    lever_b : ndarray, shape (3,)
-        Lever arm, metres.
-
-    Returns
-    -------
-    ndarray, shape (N, 3)
-        m/s; at most ``W^2 t |lever|``.
+    config : Config
+    epoch : AntennaEpoch
+        t0.
+    imu : Intervals
+        Of no length, at t0.
+    use_position : bool
+        For ``pif``: integrate positions, not velocities.
 
     """
-    rate = skew(omega_eb_b)
-    swept = C_b0b @ rate
-    h = np.diff(time)[:, None, None]
-    integral = np.concatenate([np.zeros((1, 3, 3)),
-                               np.cumsum(h / 2 * (swept[1:] + swept[:-1]), axis=0)])
-    omega_ie_b = (C_b0b.transpose(0, 2, 1) @ omega_ie_b0)
-    exact = C_b0b @ rate - rate[0] + skew(omega_ie_b0) @ integral
-    omega_ib_b = omega_eb_b + omega_ie_b
-    short = C_b0b @ skew(omega_ib_b) - skew(omega_ib_b[0])
-    return (exact - short) @ lever_b
+
+    def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals,
+                 use_position: bool) -> None:
+        """Start at t0."""
+        self.t0_ns = epoch.stamp_ns
+        self.moved = 0
+        self._config = config
+        self._lever_b = np.array(config.lever_arm)
+        self._free = config.free_start
+        self._position_form = config.method == 'pif'
+        self._from_positions = self._position_form and use_position
+        self._body = BodyIntegrals(self._lever_b, imu.omega[0])
+        place = epoch.latitude, epoch.longitude, epoch.altitude
+        self._track = InertialTrack.start(*place)
+        self._navigation: NavigationIntegrals | None = None
+        if epoch.v_n is not None:
+            self._navigation = NavigationIntegrals(*place, epoch.v_n)
+        nuisance = 0
+        if self._position_form:
+            nuisance = 2 if self._free else int(self._from_positions)
+        elif self._free:
+            nuisance = 1
+        self._moments = AttitudeMoments(nuisance)
+        self._nuisance = nuisance
+        self._offered = 0
+        self._variance = 0.0                # of what the receiver says, summed over pairs
+        self._start_variance = _mean_variance(epoch.position_covariance if self._from_positions
+                                              else epoch.velocity_covariance)
+        self._solution: tuple[Array, Array] | None = None
+        self._solved_s = 0.0
+        self._residual = 0.0
+        if self._free or self._from_positions:
+            self._pair(epoch)
+
+    def advance(self, epochs: Sequence[AntennaEpoch], imu: Intervals) -> Iterator[AntennaEpoch]:
+        """Take epochs and the IMU intervals before each; yield each when the results are its."""
+        for k, epoch in enumerate(epochs):
+            self._body.advance(imu, k)
+            time = (epoch.stamp_ns - self.t0_ns) * 1e-9
+            place = epoch.latitude, epoch.longitude, epoch.altitude
+            self._track = self._track.extended(*np.array([time, *place])[:, None]).at(0)
+            if epoch.v_n is not None and self._navigation is not None:
+                self._navigation.advance(time, *place, epoch.v_n)
+            self._pair(epoch)
+            yield epoch
+
+    def _pair(self, epoch: AntennaEpoch) -> None:
+        """Add the pair of vectors of an epoch and solve."""
+        body, time = self._body, float(self._track.time)
+        if self._from_positions:
+            if not epoch.position_measured:
+                return
+            regressors = (1.0, time) if self._free else (time,)
+            first = 0.0 if self._free else 1.0
+            self._moments.add(self._track.s_p, body.a_p - first * self._lever_b, regressors)
+            self._variance += _mean_variance(epoch.position_covariance)
+        elif epoch.v_n is not None and self._navigation is not None:
+            navigation = self._navigation
+            if self._position_form:
+                if self._free:
+                    self._moments.add(navigation.s_p, body.a_p, (1.0, time))
+                else:
+                    self._moments.add(navigation.beta_p, body.alpha_p)
+            elif self._free:
+                self._moments.add(navigation.s_v, body.a_v, (1.0,))
+            else:
+                self._moments.add(navigation.beta_v, body.alpha_v)
+            self._variance += _mean_variance(epoch.velocity_covariance)
+        else:
+            return
+        self._offered += 1
+        if self._moments.count < 3:
+            return
+        C, residual, A = self._moments.solve()
+        A_n = C @ A @ C.T
+        information = np.trace(A_n) * np.eye(3) - A_n
+        self._residual = residual
+        self._solved_s = time
+        white, common = self._noise()
+        # What is common to all pairs does not average out.
+        self._solution = C, np.linalg.inv(information / (white + self._moments.count * common)
+                                          + np.eye(3) / UNIFORM_STD ** 2)
+
+    def _noise(self) -> tuple[float, float]:
+        """Return the variance of a pair that is white, and that which all pairs have together."""
+        variance = self._variance / self._offered
+        start = 0.0 if self._free else self._start_variance
+        if not self._position_form or self._from_positions:
+            return variance, start
+        # Integrated velocities walk at random; a free start takes out all but 1/15 of it, and what
+        # the first one is off grows with time.
+        time = float(self._track.time)
+        walk = variance * time / self._offered * time
+        return 0.0, walk / 15 if self._free else walk / 2 + start * time ** 2 / 3
+
+    def initial(self) -> tuple[Array, Array] | None:
+        """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
+        if self._solution is None:
+            return None
+        return self._solution[0], self._factor() * self._solution[1]
+
+    def current(self) -> tuple[Array, Array] | None:
+        """Return ``C_nb`` at the last epoch and the covariance of its error in ENU."""
+        if self._solution is None:
+            return None
+        C, covariance = self._solution
+        C_nn0 = self._track.C_n0n.T
+        # Where no measurement comes, the gyros alone carry it on.
+        noise, silent_s = self._config.imu_noise, float(self._track.time) - self._solved_s
+        drift = noise.angle_random_walk ** 2 * silent_s + (noise.gyro_bias_std * silent_s) ** 2
+        return (orthonormalized(C_nn0 @ C @ self._body.C_b0b),
+                self._factor() * (C_nn0 @ covariance @ C_nn0.T + drift * np.eye(3)))
+
+    def fit(self) -> Fit:
+        """Return how well the data fit."""
+        rows = 3 * self._moments.count - 3 - 3 * self._nuisance
+        if self._solution is None or rows <= 0:
+            return Fit(self._offered, delay=self._config.gnss_delay)
+        return Fit(self._offered, rows=rows, misfit=self._residual / sum(self._noise()) / rows,
+                   delay=self._config.gnss_delay)
+
+    def _factor(self) -> float:
+        """Return the factor on variances for data that fit worse than stated."""
+        fit = self.fit()
+        return max(1.0, fit.misfit) if fit.rows else math.inf
+
+    def move_t0(self) -> None:
+        """Leave t0 where it is."""
+
+    def unconfirmed(self) -> str:
+        """Return nothing: there is no test of the signs."""
+        return ''
+
+    def nuisance(self) -> Nuisance:
+        """Return what is assumed: no biases, lever arm and delay as configured."""
+        zero = np.zeros(3)
+        return Nuisance(zero, zero, zero, zero, self._lever_b, zero, self._config.gnss_delay, 0.0)
+
+    def sensor_errors(self) -> SensorErrors:
+        """Return zeros."""
+        return SensorErrors.none()
+
+    def learnt(self) -> None:
+        """Return nothing: only the attitude is estimated."""

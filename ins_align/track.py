@@ -1,0 +1,121 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The antenna's way in a frame that does not rotate."""
+
+from dataclasses import dataclass, replace
+
+from ins_align.earth import (
+    earth_rate_n, gravitation_n, gravity_n, ground_velocity_n, LocalLevel, position_n)
+from ins_align.rotation import Array, cross, running_sum
+import numpy as np
+
+
+@dataclass(frozen=True)
+class InertialTrack:
+    """
+    The navigation side in the non-rotating frame n0, from positions and velocities as they come.
+
+    ``s_p = C_n0e Rz(W t) r_e(t) - int int gravitation`` and its derivative ``s_v`` differ from
+    the integrated forms of `NavigationIntegrals` by a constant and a term in t, which a free
+    start takes out; nothing between epochs has to be interpolated but gravitation, so gaps do no
+    harm. Both are kept relative to a point that is fixed in the Earth at t0, against rounding.
+
+    Attributes
+    ----------
+    n0 : LocalLevel
+    time : ndarray, shape (...)
+        Seconds since t0.
+    C_n0n : ndarray, shape (..., 3, 3)
+    still_v : ndarray, shape (..., 3)
+        s_v of an antenna that rests on the Earth here, m/s.
+    s_p : ndarray, shape (..., 3)
+        Metres.
+    gravity, gravitation : ndarray, shape (..., 3)
+        In n0 axes, m/s^2.
+    int_gravitation, int_int_gravitation : ndarray, shape (..., 3)
+    origin_r, origin_v : ndarray, shape (3,)
+        Position and ground velocity at t0.
+
+    """
+
+    n0: LocalLevel
+    time: Array
+    C_n0n: Array
+    still_v: Array
+    s_p: Array
+    gravity: Array
+    gravitation: Array
+    int_gravitation: Array
+    int_int_gravitation: Array
+    origin_r: Array
+    origin_v: Array
+
+    @staticmethod
+    def start(latitude: float, longitude: float, altitude: float) -> 'InertialTrack':
+        """Start at t0, with the antenna there: radians and metres."""
+        zero = np.zeros(3)
+        return InertialTrack(
+            LocalLevel(latitude, longitude), np.zeros(()), np.eye(3), zero, zero,
+            gravity_n(latitude, altitude), gravitation_n(latitude, altitude), zero, zero,
+            position_n(latitude, altitude), ground_velocity_n(latitude, altitude))
+
+    def extended(self, time: Array, latitude: Array, longitude: Array,
+                 altitude: Array) -> 'InertialTrack':
+        """
+        Follow the antenna through K epochs.
+
+        Parameters
+        ----------
+        time : ndarray, shape (K,)
+            Seconds since t0, increasing.
+        latitude, longitude, altitude : ndarray, shape (K,)
+            Of the antenna, radians and metres.
+
+        Returns
+        -------
+        InertialTrack
+            With a leading axis of K.
+
+        """
+        C_n0n = self.n0.matrix(time, latitude, longitude)
+
+        def seen(vector_n: Array) -> Array:
+            return (C_n0n @ vector_n[..., None])[..., 0]
+
+        gravity_here = gravity_n(latitude, altitude)
+        ground_velocity = ground_velocity_n(latitude, altitude)
+        gravitation = seen(gravity_here + cross(earth_rate_n(latitude), ground_velocity))
+        before = np.concatenate([self.gravitation[None], gravitation[:-1]])
+        h = np.diff(time, prepend=self.time)[:, None]
+        steps = h / 2 * (before + gravitation)
+        int_gravitation = running_sum(self.int_gravitation, steps)
+        int_int_gravitation = running_sum(
+            self.int_int_gravitation,
+            h * (int_gravitation - steps) + h * h / 6 * (2 * before + gravitation))
+        return InertialTrack(
+            self.n0, time, C_n0n, seen(ground_velocity) - self.origin_v - int_gravitation,
+            (seen(position_n(latitude, altitude)) - self.origin_r
+             - time[:, None] * self.origin_v - int_int_gravitation),
+            seen(gravity_here), gravitation, int_gravitation, int_int_gravitation,
+            self.origin_r, self.origin_v)
+
+    def at(self, index: int | tuple[()]) -> 'InertialTrack':
+        """Return one epoch of a track over many; () of a track that is of one."""
+        return replace(self, **{name: getattr(self, name)[index] for name in (
+            'time', 'C_n0n', 'still_v', 's_p', 'gravity', 'gravitation', 'int_gravitation',
+            'int_int_gravitation')})
+
+    def s_v(self, v_n: Array) -> Array:
+        """Velocity side for antenna velocities `v_n` (ENU, m/s), shape (..., 3)."""
+        return (self.C_n0n @ v_n[..., None])[..., 0] + self.still_v
