@@ -17,10 +17,8 @@ from functools import lru_cache
 
 from ins_align.aligner import Aligner
 from ins_align.experiments.common import exact_config_for
-from ins_align.preintegration import SensorErrors
-from ins_align.rotation import exp_so3, log_so3, matrix_from_quaternion
+from ins_align.rotation import log_so3, matrix_from_quaternion
 from ins_align.simulation import feed, simulate
-from ins_align.unknowns import Unknowns
 import numpy as np
 
 LEVER = (1.0, 1.0, 1.0)
@@ -30,16 +28,6 @@ LEVER = (1.0, 1.0, 1.0)
 def simulated(scenario, **options):
     """Return a simulation; the same arguments give the same object."""
     return simulate(scenario, **options)
-
-
-def some_unknowns(seed=0):
-    """Return unknowns of the usual sizes."""
-    r = np.random.default_rng(seed)
-    sensors = SensorErrors(1e-3 * r.standard_normal(3), 0.01 * r.standard_normal((3, 3)),
-                           0.01 * r.standard_normal(3), 0.01 * r.standard_normal((3, 3)))
-    return Unknowns(C=exp_so3(r.standard_normal(3)), sensors=sensors,
-                    start_velocity=r.standard_normal(3), start_position=r.standard_normal(3),
-                    lever_b=r.standard_normal(3), delay=0.03)
 
 
 def config_for(simulation, **changes):
@@ -79,8 +67,3 @@ def normalised_error(attitude, simulation):
     """Squared error of an attitude over its covariance; 3 on average where that is honest."""
     error = error_of(attitude, simulation)
     return float(error @ np.linalg.solve(attitude.covariance, error))
-
-
-def estimator_of(aligner):
-    """Return the estimator inside an aligner: the only place that looks there."""
-    return aligner._alignment._method._estimator

@@ -370,7 +370,7 @@ def test_cut_off_is_used_as_far_as_it_goes(flight, tmp_path, capsys):
 
 
 @pytest.mark.parametrize('name', ['uav_thor75', 'car_drive0708', 'quad_dot08.bag'])
-@pytest.mark.parametrize('method', ['vif', 'map'])
+@pytest.mark.parametrize('method', ['vif', 'bank'])
 def test_real_recordings(tmp_path, capsys, name, method):
     path = real_recording(name)
     status = main(['replay', str(path), '--set', f'method={method}', '--duration', '60',

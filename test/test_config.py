@@ -114,7 +114,7 @@ def test_contradictions_refused(values):
 
 @pytest.mark.parametrize('method, use_velocity, refused', [
     ('vif', 'auto', True), ('pif', 'auto', True), ('pif', True, True), ('pif', False, False),
-    ('map', 'auto', False)])
+    ('bank', 'auto', False)])
 def test_positions_that_a_method_would_not_use_are_refused(method, use_velocity, refused):
     values = {'method': method, 'use_velocity': use_velocity, 'use_position': True}
     if refused:

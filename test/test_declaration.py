@@ -14,7 +14,7 @@
 """When something is declared, held back and withdrawn, and the words for it."""
 
 from ins_align.config import Config
-from ins_align.declaration import Declaration
+from ins_align.estimation.declaration import Declaration
 from ins_align.fit import Fit, Innovation
 from ins_align.results import State, Verdict
 import numpy as np

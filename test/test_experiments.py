@@ -153,13 +153,13 @@ def test_window_of_a_recording_against_its_reference(folder):
     assert recorded.recordings_in(folder) == [path, folder / 'hovering']
     recording = recorded.load(path)
     assert recording.duration == pytest.approx(32.0, abs=0.1)
-    window = recorded.run_window(path, 2.0, 25.0, method='map')
+    window = recorded.run_window(path, 2.0, 25.0, method='bank')
     assert window.moves and not window.covers_minute
     assert window.declared_s is not None and window.declared.heading_sigmas < 5
     assert window.time[-1] == pytest.approx(25.0, abs=0.5)
     assert np.abs(window.error_deg[-1, 2]) < 3.0
     assert np.nanmedian(np.abs(window.course_deg)) < 3.0
-    assert not recorded.run_window(folder / 'hovering', 0.0, 25.0, method='map').moves
+    assert not recorded.run_window(folder / 'hovering', 0.0, 25.0, method='bank').moves
 
 
 def test_recordings_and_their_files(folder, tmp_path, capsys):
@@ -168,7 +168,7 @@ def test_recordings_and_their_files(folder, tmp_path, capsys):
     assert 'ins_align experiment recordings --out DIR --data DIR' in text
     assert 'driven, map' in text
     numbers = json.loads((tmp_path / 'recordings.json').read_text('utf-8'))
-    assert [window['start_s'] for window in numbers['driven']['map']] == [0.0, 10.0, 20.0]
+    assert [window['start_s'] for window in numbers['driven']['bank']] == [0.0, 10.0, 20.0]
     assert (tmp_path / 'recordings.png').stat().st_size > 10_000
     assert 'driven, note' in capsys.readouterr().out
 

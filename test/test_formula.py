@@ -15,7 +15,7 @@
 
 from functools import lru_cache
 
-from ins_align import formula
+from ins_align.estimation import formula
 from ins_align.earth import EARTH_RATE, earth_rate_n
 from ins_align.experiments.dense import bound
 from ins_align.preintegration import Noise, preintegrate, SensorErrors, split_at_epochs

@@ -31,7 +31,7 @@ METHODS = {
     'pif': {'method': 'pif'}, 'pif to the letter': {'method': 'pif', 'free_start': False},
     'pif of positions': {'method': 'pif', 'velocity': False},
     'pif of positions to the letter': {'method': 'pif', 'velocity': False, 'free_start': False},
-    'map': {'method': 'map'}, 'map of positions': {'method': 'map', 'velocity': False},
+    'bank': {'method': 'bank'}, 'bank of positions': {'method': 'bank', 'velocity': False},
 }
 
 
@@ -93,13 +93,13 @@ def test_sigma_of_the_note_is_honest_where_its_model_holds(method):
 
 
 def test_biases_spoil_the_note_and_not_the_map():
-    errors = {'vif': [], 'map': []}
+    errors = {'vif': [], 'bank': []}
     for seed in range(4):
         s = simulated('car', imu_grade='mems', duration=50.0, seed=seed, gnss_rate=2.0)
         for method, found in errors.items():
             status = aligned(s, method=method)[0].status()
             found.append(abs(np.degrees(error_of(status.initial, s)[2])))
-    assert np.median(errors['map']) < 0.5 < 1.0 < np.median(errors['vif'])
+    assert np.median(errors['bank']) < 0.5 < 1.0 < np.median(errors['vif'])
 
 
 def test_what_the_note_does_not_estimate_it_says_to_be_as_configured():
@@ -130,7 +130,7 @@ def test_what_is_handed_on_is_widened_where_a_misfit_is_no_chance(ratio, dof, sc
     assert fit.significant_scale == pytest.approx(scale)
 
 
-@pytest.mark.parametrize('method', ('vif', 'map'))
+@pytest.mark.parametrize('method', ('vif', 'bank'))
 def test_without_gnss_the_gyros_errors_count(method):
     """They alone carry the attitude on."""
     s = simulated('car', imu_grade='tactical', seed=1, duration=400.0, imu_rate=50.0,
