@@ -322,8 +322,13 @@ class Filters:
         Parameters
         ----------
         model : Linearised
-        k, kind : int
+            Of K epochs.
+        k : int
+            Which of them.
+        kind : int
+            0 or 1.
         track : Track
+            Of the same epochs.
         noise : ndarray, shape (3,)
             Factors on the sigmas that the receiver states, east, north and up.
 

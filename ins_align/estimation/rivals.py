@@ -141,7 +141,9 @@ class Parameters:
         Parameters
         ----------
         config : Config
+            What is stated.
         rival : Rival
+            What is assumed beside it.
         force : ndarray, shape (3,)
             Specific force, m/s^2, at which all errors of the accelerometers together are as large
             as their biases are said to be.

@@ -181,6 +181,7 @@ class Start:
         Parameters
         ----------
         rough : RoughAttitude
+            As `solve` returned it.
         known : ndarray, shape (M, m, m)
             Covariance of the parameters.
 
