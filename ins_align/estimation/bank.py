@@ -26,7 +26,7 @@ from ins_align.antenna import AntennaEpoch
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimation.declaration import Fit
 from ins_align.estimation.filter import (
-    DELAY, Filters, FIRST, GYRO, Linearised, linearised, PHI, PHI0, Track)
+    DELAY, Filters, FIRST, GYRO, Linearised, linearised, MAX_DELAY, MIN_DELAY, PHI, PHI0, Track)
 from ins_align.estimation.rivals import in_words, log_sum, Parameters, rivals_of
 from ins_align.estimation.start import (
     all_headings, HEADINGS, LOUD, OPEN_POSITION, RoughAttitude, Start)
@@ -223,7 +223,7 @@ class Bank:
     def _model(self, filters: Filters, imu: Intervals) -> Linearised:
         """Linearise epochs at the likeliest mean of each rival, at one delay for all."""
         ids, point = filters.ids, filters.x[filters.lead]
-        point[:, DELAY] = point[self._best(filters), DELAY]
+        point[:, DELAY] = np.clip(point[self._best(filters), DELAY], MIN_DELAY, MAX_DELAY)
         shares = self._share_of[ids, None, None]
         return linearised(point, imu.mirrored(self._signs[ids]),
                           imu.Q[:, None] + shares * imu.Q_excess[:, None], self._use_position)
