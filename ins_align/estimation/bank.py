@@ -34,7 +34,8 @@ from ins_align.estimation.formula import AttitudeMoments
 from ins_align.estimation.rivals import in_words, log_sum, Parameters, rivals_of
 from ins_align.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
-from ins_align.rotation import apply, Array, cross, cumulative_rotations, exp_so3, log_so3
+from ins_align.rotation import (
+    apply, Array, cross, cumulative_rotations, exp_so3, Index, log_so3)
 from ins_align.track import InertialTrack
 import numpy as np
 
@@ -511,8 +512,9 @@ class Bank:
         if self._filters is None:
             return Fit(self._offered, delay=self._config.gnss_delay)
         words, contradicted = self._doubt()
-        return Fit(self._offered, 3 * (self._offered - self._rejected[2]), self._misfit,
-                   self._nis, self._innovation, *self._rejected,
+        velocity, position, either = self._rejected
+        return Fit(self._offered, 3 * (self._offered - either), self._misfit,
+                   self._nis, self._innovation, velocity, position, either,
                    delay=self._config.gnss_delay + float(self._body()[0][DELAY]),
                    objection=words if contradicted else '', noise=self._noise_in_words())
 
@@ -617,7 +619,7 @@ class Bank:
         return Learnt(x, P, self._last.stamp_ns)
 
 
-def _solved(s: Array, a: Array, time: Array, places: Array,
+def _solved(s: Array, a: Array, time: Array, places: Index,
             kind: int) -> tuple[Array, float, Array]:
     """Solve ``s = (free start) + C a`` for some epochs; see `AttitudeMoments.solve`."""
     moments = AttitudeMoments(1 + kind)
