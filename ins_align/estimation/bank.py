@@ -139,6 +139,7 @@ class Bank:
         size = (self._known[0].x.size - GYRO) // 2
         self._reach = np.concatenate([_REACH[:4 + size], _REACH[16:16 + size]])
         self._filters: Filters | None = None
+        self._point: Array | None = None            # parameters that are linearised at
         self._waiting: list[tuple[AntennaEpoch, Intervals]] = []
         self._last = epoch                          # the last epoch that was processed
         self._C_nn0 = np.eye(3)
@@ -198,8 +199,12 @@ class Bank:
                 yield epoch
                 return
             changed = self._choose(epoch)
-            if (changed or filters.ids.size != ids.size or k + 1 == len(epochs) or np.any(
-                    np.abs(filters.x[filters.lead] - point) > self._reach)):
+            # By the data alone, not by how many epochs come at a time.
+            stale = changed or filters.ids.size != ids.size or np.any(
+                np.abs(filters.x[filters.lead] - point) > self._reach)
+            if stale:
+                self._point = None
+            if stale or k + 1 == len(epochs):
                 self._anchor(filters, k)
                 if changed and self._use_position:
                     filters.open_position(np.zeros(3), OPEN_POSITION)
@@ -241,10 +246,12 @@ class Bank:
 
     def _model(self, filters: Filters, imu: Intervals) -> Linearised:
         """Linearise epochs at the likeliest mean of each rival, at one delay for all."""
-        ids, point = filters.ids, filters.x[filters.lead]
-        point[:, DELAY] = point[self._best(filters), DELAY]
+        ids = filters.ids
+        if self._point is None:
+            self._point = filters.x[filters.lead]
+            self._point[:, DELAY] = self._point[self._best(filters), DELAY]
         shares = self._share_of[ids, None, None]
-        return linearised(point, imu.mirrored(self._signs[ids]),
+        return linearised(self._point, imu.mirrored(self._signs[ids]),
                           imu.Q[:, None] + shares * imu.Q_excess[:, None], self._use_position)
 
     def _anchor(self, filters: Filters, k: int) -> None:
@@ -460,10 +467,11 @@ class Bank:
                                           np.array([known.walk for known in self._known]))
         for k in range(len(epochs)):
             one = slice(k, k + 1)
+            self._point = None
             model = self._model(filters, imu.take(one))
             self._step(filters, model, 0, Track(track.s[one], track.covariance[one],
                                                 track.present[one], track.C_n0n[one]))
-        self._last = epochs[-1]
+        self._last, self._point = epochs[-1], None
         self._anchor(filters, len(epochs) - 1)
 
     # Results
