@@ -243,6 +243,8 @@ class Declaration:
         """Return what in the data contradicts the model; empty when nothing does."""
         if fit.rows < MIN_ROWS:
             return ''
+        if fit.objection:
+            return fit.objection
         if fit.rejected > REJECTED_SHARE * fit.offered:
             return (f'{fit.rejected} of {fit.offered} GNSS epochs do not fit the rest: check the '
                     'velocity frame, the IMU axes and signs, the lever arm, the GNSS delay')
@@ -252,8 +254,6 @@ class Declaration:
             return (f'the GNSS stamps seem to be {fit.delay:.2f} s late, gnss_delay is '
                     f'{config.gnss_delay:g} and gnss_delay_std {config.gnss_delay_std:g}: check '
                     'the clocks, or set gnss_delay')
-        if fit.objection:
-            return fit.objection
         misfit = max(fit.misfit, self._recent_nis)
         if misfit > MAX_MISFIT:
             return (f'the residuals are {math.sqrt(misfit):.1f} times what the stated noise '
