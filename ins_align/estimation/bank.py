@@ -121,6 +121,7 @@ class Bank:
         self._reach = np.concatenate([_REACH[:4 + size], _REACH[16:16 + size]])
         self._filters: Filters | None = None
         self._start = Start(self._config)
+        self._point: Array | None = None            # parameters that are linearised at
         self._last = epoch                          # the last epoch that was processed
         self._C_nn0 = np.eye(3)
         self._nis, self._innovation = math.nan, NOTHING_NEW
@@ -149,6 +150,7 @@ class Bank:
         done = 0
         while done < len(epochs):
             if self._filters is None:
+                self._choose(epochs[done])
                 self._wait(epochs[done], imu.take(slice(done, done + 1)))
                 done += 1
                 yield epochs[done - 1]
@@ -179,8 +181,12 @@ class Bank:
                 yield epoch
                 return
             changed = self._choose(epoch)
-            if (changed or filters.ids.size != ids.size or k + 1 == len(epochs) or np.any(
-                    np.abs(filters.x[filters.lead] - point) > self._reach)):
+            # By the data alone, not by how many epochs come at a time.
+            stale = changed or filters.ids.size != ids.size or np.any(
+                np.abs(filters.x[filters.lead] - point) > self._reach)
+            if stale:
+                self._point = None
+            if stale or k + 1 == len(epochs):
                 self._anchor(filters, k)
                 if changed and self._use_position:
                     filters.open_position(np.zeros(3), OPEN_POSITION)
@@ -222,10 +228,13 @@ class Bank:
 
     def _model(self, filters: Filters, imu: Intervals) -> Linearised:
         """Linearise epochs at the likeliest mean of each rival, at one delay for all."""
-        ids, point = filters.ids, filters.x[filters.lead]
-        point[:, DELAY] = np.clip(point[self._best(filters), DELAY], MIN_DELAY, MAX_DELAY)
+        ids = filters.ids
+        if self._point is None:
+            self._point = filters.x[filters.lead]
+            self._point[:, DELAY] = np.clip(self._point[self._best(filters), DELAY],
+                                            MIN_DELAY, MAX_DELAY)
         shares = self._share_of[ids, None, None]
-        return linearised(point, imu.mirrored(self._signs[ids]),
+        return linearised(self._point, imu.mirrored(self._signs[ids]),
                           imu.Q[:, None] + shares * imu.Q_excess[:, None], self._use_position)
 
     def _anchor(self, filters: Filters, k: int) -> None:
@@ -339,11 +348,12 @@ class Bank:
                                           np.array([known.walk for known in self._known]))
         for k in range(len(epochs)):
             one = slice(k, k + 1)
+            self._point = None
             model = self._model(filters, imu.take(one))
             self._step(filters, model, 0, Track(track.s[one], track.covariance[one],
                                                 track.present[one], track.C_n0n[one]))
         self._start = Start(self._config)
-        self._last = epochs[-1]
+        self._last, self._point = epochs[-1], None
         self._anchor(filters, len(epochs) - 1)
 
     # Results
@@ -392,8 +402,9 @@ class Bank:
         if self._filters is None:
             return Fit(self._offered, delay=self._config.gnss_delay)
         words, contradicted = self._doubt()
-        return Fit(self._offered, 3 * (self._offered - self._rejected[2]), self._misfit,
-                   self._nis, self._innovation, *self._rejected,
+        velocity, position, either = self._rejected
+        return Fit(self._offered, 3 * (self._offered - either), self._misfit,
+                   self._nis, self._innovation, velocity, position, either,
                    delay=self._config.gnss_delay + float(self._body()[0][DELAY]),
                    objection=words if contradicted else '', noise=self._noise_in_words())
 

@@ -27,7 +27,7 @@ from ins_align.config import Config
 from ins_align.estimation.filter import FIRST, PHI, PHI0, RHO, XI
 from ins_align.estimation.formula import AttitudeMoments
 from ins_align.preintegration import Intervals
-from ins_align.rotation import apply, Array, cross, cumulative_rotations, exp_so3
+from ins_align.rotation import apply, Array, cross, cumulative_rotations, exp_so3, Index
 from ins_align.track import InertialTrack
 import numpy as np
 
@@ -219,7 +219,7 @@ def _measured(epoch: AntennaEpoch) -> bool:
     return epoch.v_n is not None or epoch.position_measured
 
 
-def _solved(s: Array, a: Array, time: Array, places: Array,
+def _solved(s: Array, a: Array, time: Array, places: Index,
             kind: int) -> tuple[Array, float, Array]:
     """Solve ``s = (free start) + C a`` for some epochs; see `AttitudeMoments.solve`."""
     moments = AttitudeMoments(1 + kind)
