@@ -22,7 +22,7 @@ from collections import Counter
 
 from ins_align.config import Config
 from ins_align.estimation.bank import Bank, Learnt
-from ins_align.estimation.declaration import Declaration, Fit
+from ins_align.estimation.declaration import Declaration
 from ins_align.estimation.formula import NoteMethod
 from ins_align.intake import Afresh, Located, Loss, Run, Start, Step, Wait
 from ins_align.plausibility import ForceCheck
@@ -154,6 +154,7 @@ class Alignment:
                                                    method.unconfirmed)
                 if self._declaration.move_t0:
                     method.move_t0()
+                    initial = method.initial() or initial
             else:
                 verdict = self._declaration.update_without_gnss(silent_s, initial[1], current[1],
                                                                 fit)

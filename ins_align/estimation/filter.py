@@ -323,8 +323,11 @@ class Filters:
         Parameters
         ----------
         model : Linearised
+            Of these means.
         k, kind : int
+            Epoch in the model and the track; which measurement.
         track : Track
+            What the GNSS measures.
         noise : ndarray, shape (3,)
             Factors on the sigmas that the receiver states, east, north and up.
 

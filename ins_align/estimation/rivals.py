@@ -143,7 +143,9 @@ class Parameters:
         Parameters
         ----------
         config : Config
+            What is stated of lever arm, delay and IMU.
         rival : Rival
+            What it takes to be otherwise.
         force : ndarray, shape (3,)
             Specific force, m/s^2, at which all errors of the accelerometers together are as large
             as their biases are said to be.
