@@ -11,4 +11,4 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Estimation: the bank of filters, the note's formula, and when an attitude is declared."""
+"""The estimate: the note's formulas, a bank of filters, its rivals, and the declaration."""

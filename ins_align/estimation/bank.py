@@ -11,8 +11,6 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-
-
 """
 The bank: filters for every heading and every rival, side by side on the same data.
 
@@ -21,7 +19,6 @@ gives the attitude as a mixture (docs, "Theory").
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 import math
 from typing import NamedTuple
 
@@ -29,24 +26,16 @@ from ins_align.antenna import AntennaEpoch
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimation.declaration import Fit
 from ins_align.estimation.filter import (
-    DELAY, Filters, FIRST, GYRO, Linearised, linearised, PHI, PHI0, RHO, Track, XI)
-from ins_align.estimation.formula import AttitudeMoments
+    DELAY, Filters, FIRST, GYRO, Linearised, linearised, PHI, PHI0, Track)
 from ins_align.estimation.rivals import in_words, log_sum, Parameters, rivals_of
+from ins_align.estimation.start import (
+    all_headings, HEADINGS, LOUD, OPEN_POSITION, RoughAttitude, Start)
 from ins_align.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
-from ins_align.rotation import apply, Array, cross, cumulative_rotations, exp_so3, log_so3
+from ins_align.rotation import Array, exp_so3, log_so3
 from ins_align.track import InertialTrack
 import numpy as np
 
-# Headings that the bank starts with, every two degrees, and their sigma over the step between
-# them: the sum of such normal densities is flat to 2e-6.
-HEADINGS, STEP_STD = 180, 0.6
-TILT_STD = math.radians(10.0)
-# The bank starts when the vector from which it does is so many times its noise.
-START_RATIO = 20.0
-# What is not known of velocity and position at first (m/s, m); of a velocity whose horizontal
-# part is measured, the vertical is known better.
-OPEN_VELOCITY, OPEN_POSITION, STEADY_VELOCITY = 1e3, 1e4, 10.0
 # Means whose log weight is so much below the likeliest's are dropped, and so are rivals that are
 # wrong; levels stay, for what they assume may become true.
 UNLIKELY, HOPELESS, LEAST = 14.0, 25.0, 13.0
@@ -55,10 +44,9 @@ ALIKE = 2.0
 # A wrong rival has to be less likely by this (log likelihood) or to give the same attitude, to so
 # many sigmas.
 MARGIN, HARMLESS = 6.0, 1.0
-# The receiver's noise is taken to be larger than stated when innovations are so many times as
-# large in the mean square; it follows at this rate for each epoch, a single epoch counting up to
-# the last.
-LOUD, FOLLOW, CLIP = 2.0, 0.02, 5.0
+# The receiver's noise is taken to be larger than stated when innovations are LOUD times as large
+# in the mean square; it follows at this rate, a single epoch counting up to the last.
+FOLLOW, CLIP = 0.02, 5.0
 # A mean of innovations over some epochs, which forgets this share with each, shows errors that
 # last; so much more than white noise makes of it is chance.
 LASTING, CHANCE = 0.2, 0.5
@@ -78,12 +66,6 @@ VELOCITY_STOPPED_NS, VELOCITY_BACK_NS = 10_000_000_000, 2_000_000_000
 ASTRAY = 10
 # A heading that is known to this (rad) is resolved.
 RESOLVED_STD = 0.35
-# A start takes so many epochs, fewer leave the formula no redundancy, and waits for no more.
-FIRST_EPOCHS, MAX_WAITING = 4, 64
-# The residuals of the others are so many times smaller without an outlier.
-OUTLYING = 10.0
-
-
 NOTHING_NEW = np.full(3, math.nan)
 
 
@@ -138,7 +120,7 @@ class Bank:
         size = (self._known[0].x.size - GYRO) // 2
         self._reach = np.concatenate([_REACH[:4 + size], _REACH[16:16 + size]])
         self._filters: Filters | None = None
-        self._waiting: list[tuple[AntennaEpoch, Intervals]] = []
+        self._start = Start(self._config)
         self._last = epoch                          # the last epoch that was processed
         self._C_nn0 = np.eye(3)
         self._nis, self._innovation = math.nan, NOTHING_NEW
@@ -330,131 +312,29 @@ class Bank:
 
     def _wait(self, epoch: AntennaEpoch, imu: Intervals) -> None:
         """Take an epoch that comes before the start, and start if it suffices."""
-        if epoch.v_n is None and not epoch.position_measured:
-            if not self._waiting:
-                return
-        self._waiting.append((epoch, imu))
-        found = self._rough_attitude()
-        if found is not None:
-            self._start(*found)
-        elif len(self._waiting) > MAX_WAITING:
-            self._begin_later()
+        start = self._start
+        start.add(epoch, imu)
+        rough = start.solve(self._use_position)
+        for kind, count in enumerate(start.rejected):
+            self._rejected[kind] += count
+            self._rejected[2] += count
+            self._offered += count
+        start.rejected = [0, 0]
+        if start.epochs:
+            self._last = start.epochs[0]
+            self.t0_ns = self._last.stamp_ns
+        if rough is not None:
+            self._noise[rough.kind] = math.log(rough.noise)
+            self._begin_with(rough)
 
-    def _begin_later(self) -> None:
-        """Wait for a start from a later epoch than the first one that waits."""
-        (_, imu), *rest = self._waiting
-        while rest and rest[0][0].v_n is None and not rest[0][0].position_measured:
-            imu, rest = rest[0][1], rest[1:]
-        if rest:
-            epoch, imu = rest[0]
-            self._waiting = [(epoch, imu.end()), *rest[1:]]
-            self._last, self.t0_ns = epoch, epoch.stamp_ns
-
-    def _rough_attitude(self) -> tuple[Array, Array] | None:
-        """
-        Solve the note's formula, its start free, for the epochs that wait.
-
-        Returns
-        -------
-        C : ndarray, shape (3, 3)
-            The attitude at t0, but for a rotation about an axis.
-        axis : ndarray, shape (3,)
-            In the body at t0. None for both where the epochs say too little, or contradict each
-            other.
-
-        """
-        epochs = [epoch for epoch, _ in self._waiting]
-        kind = 0 if sum(epoch.v_n is not None for epoch in epochs) >= FIRST_EPOCHS else 1
-        use = np.array([epoch.position_measured if kind else epoch.v_n is not None
-                        for epoch in epochs])
-        if np.count_nonzero(use) < FIRST_EPOCHS + kind or (kind and not self._use_position):
-            return None
-        imu, first = self._together(), epochs[0]
-        time = np.array([epoch.stamp_ns - first.stamp_ns for epoch in epochs]) * 1e-9
-        track = InertialTrack.start(first.latitude, first.longitude, first.altitude).extended(
-            time, *(np.array([getattr(epoch, name) for epoch in epochs])
-                    for name in ('latitude', 'longitude', 'altitude')))
-        C = np.concatenate([np.eye(3)[None], cumulative_rotations(imu.R)])
-        steps = apply(C[:-1], imu.v)
-        v = np.cumsum(steps, axis=0)
-        lever = np.array(self._config.lever_arm)
-        if kind:
-            s = track.s_p
-            a = (np.cumsum(imu.duration[:, None] * (v - steps) + apply(C[:-1], imu.p), axis=0)
-                 + C[1:] @ lever)
-            covariance = [epoch.position_covariance for epoch in epochs]
-        else:
-            s = track.s_v(np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n
-                                    for epoch in epochs]))
-            a = v + apply(C[1:], cross(imu.omega, np.broadcast_to(lever, imu.omega.shape)))
-            covariance = [epoch.velocity_covariance for epoch in epochs]
-        # A vertical that is not measured is taken for steady: good enough for a start.
-        variance = np.array([min(float(np.trace(matrix)) / 3, float(np.trace(matrix[:2, :2])))
-                             for matrix in covariance])
-        places = np.flatnonzero(use)
-        while True:
-            C, residual, moments = _solved(s, a, time, places, kind)
-            usual = float(np.mean(variance[places]))
-            noise = residual / (3 * (len(places) - 2 - kind) * usual)
-            values, vectors = np.linalg.eigh(moments)
-            if values[-1] < START_RATIO ** 2 * usual * max(noise, 1.0):
-                return None
-            if noise < LOUD or len(places) <= FIRST_EPOCHS + kind:
-                break
-            # If one of them is an outlier, the others agree much better without it.
-            left = [_solved(s, a, time, np.delete(places, i), kind)[1]
-                    for i in range(len(places))]
-            if min(left) > residual / OUTLYING:
-                break
-            places = np.delete(places, int(np.argmin(left)))
-        self._noise[kind] = math.log(noise) if noise > LOUD else 0.0
-        for k in np.setdiff1d(np.flatnonzero(use), places).tolist():
-            self._leave_out(k, kind)
-        if places[0] > 0:
-            self._begin_later()
-            return self._rough_attitude()
-        return C, vectors[:, -1]
-
-    def _leave_out(self, k: int, kind: int) -> None:
-        """Forget what was measured at an epoch that waits."""
-        epoch, imu = self._waiting[k]
-        changes = {'position_measured': False} if kind else {'v_n': None}
-        self._waiting[k] = replace(epoch, **changes), imu
-        self._offered += 1
-        self._rejected[kind] += 1
-        self._rejected[2] += 1
-
-    def _together(self) -> Intervals:
-        intervals = [imu for _, imu in self._waiting]
-        return Intervals(**{name: np.concatenate([getattr(imu, name) for imu in intervals])
-                            for name in vars(intervals[0])})
-
-    def _start(self, C_rough: Array, axis: Array) -> None:
+    def _begin_with(self, rough: RoughAttitude) -> None:
         """Start filters for all headings and rivals at t0, and feed them what has come since."""
-        M, m = len(self._rivals), self._known[0].x.size
-        rival = np.repeat(np.arange(M), HEADINGS)
-        step = 2 * math.pi / HEADINGS
-        around = exp_so3(step * np.arange(HEADINGS)[:, None] * axis)
-        # With the accelerations reversed it is half a turn about any axis across.
-        across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-        half = exp_so3(math.pi * across / np.linalg.norm(across))
-        C = np.concatenate([C_rough @ around if sign > 0 else C_rough @ half @ around
-                            for sign in self._signs[:, 3]])
-        along = np.outer(axis, axis)
-        attitude = TILT_STD ** 2 * (np.eye(3) - along) + (STEP_STD * step) ** 2 * along
-        P = np.zeros((M, FIRST + m, FIRST + m))
-        for rows in (PHI, PHI0):
-            for columns in (PHI, PHI0):
-                P[:, rows, columns] = attitude
-        epochs = [epoch for epoch, _ in self._waiting]
-        measured = [epoch.v_n for epoch in epochs if epoch.v_n is not None]
-        P[:, XI, XI] = (STEADY_VELOCITY if measured else OPEN_VELOCITY) ** 2 * np.eye(3)
-        P[:, RHO, RHO] = OPEN_POSITION ** 2 * np.eye(3)
-        P[:, FIRST:, FIRST:] = [known.P for known in self._known]
-        imu, self._waiting = self._together(), []
-        self._last = epochs[0]
+        epochs, imu = self._start.epochs, self._start.imu
+        C = np.concatenate([all_headings(rough, sign) for sign in self._signs[:, 3]])
+        rival = np.repeat(np.arange(len(self._rivals)), HEADINGS)
+        P = self._start.covariance(rough, np.array([known.P for known in self._known]))
+        v_n = next((epoch.v_n for epoch in epochs if epoch.v_n is not None), np.zeros(3))
         track = self._track_of(epochs)
-        v_n = measured[0] if measured else np.zeros(3)
         self._filters = filters = Filters(C, v_n, self._known[0].x, rival, P,
                                           np.array([known.walk for known in self._known]))
         for k in range(len(epochs)):
@@ -462,6 +342,7 @@ class Bank:
             model = self._model(filters, imu.take(one))
             self._step(filters, model, 0, Track(track.s[one], track.covariance[one],
                                                 track.present[one], track.C_n0n[one]))
+        self._start = Start(self._config)
         self._last = epochs[-1]
         self._anchor(filters, len(epochs) - 1)
 
@@ -615,12 +496,3 @@ class Bank:
             x[antenna], P[antenna, antenna] = (self._known[0].x[antenna],
                                                self._known[0].P[antenna, antenna])
         return Learnt(x, P, self._last.stamp_ns)
-
-
-def _solved(s: Array, a: Array, time: Array, places: Array,
-            kind: int) -> tuple[Array, float, Array]:
-    """Solve ``s = (free start) + C a`` for some epochs; see `AttitudeMoments.solve`."""
-    moments = AttitudeMoments(1 + kind)
-    for k in places.tolist():
-        moments.add(s[k], a[k], (1.0, time[k])[:1 + kind])
-    return moments.solve()

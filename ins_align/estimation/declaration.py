@@ -215,8 +215,8 @@ class Declaration:
     def _verdict(self, tilt: float, heading: float, fit: Fit) -> Verdict:
         config = self.config
         if self.aligned:
-            return Verdict(State.ALIGNED, f'heading sigma {heading:.2g} deg, '
-                                          f'tilt sigma {tilt:.2g} deg{fit.noise}')
+            return Verdict(State.ALIGNED, f'heading sigma {_deg(heading)}, '
+                                          f'tilt sigma {_deg(tilt)}{fit.noise}')
         if fit.rows < MIN_ROWS:
             return Verdict(State.ALIGNING, self._too_few(fit))
         if tilt > config.tilt_std_threshold and not self.levelled:
@@ -227,7 +227,7 @@ class Declaration:
         if heading > config.heading_std_threshold:
             return Verdict(state, f'heading sigma {_above(heading, config.heading_std_threshold)}'
                                   f': turn or change speed{fit.noise}')
-        return Verdict(state, f'heading sigma {heading:.2g} deg is good enough: it has to hold '
+        return Verdict(state, f'heading sigma {_deg(heading)} is good enough: it has to hold '
                               f'for {config.hold_time:g} s')
 
     def _too_few(self, fit: Fit) -> str:
@@ -268,10 +268,15 @@ def _silence(silent_s: float) -> str:
 
 def _above(sigma_deg: float, threshold_deg: float) -> str:
     """Return a sigma and the threshold that it is above, so that this shows."""
-    text = f'{sigma_deg:.2g}'
-    if float(text) <= threshold_deg:
-        text = f'{sigma_deg:.4g}'
-    return f'{text} deg, needs {threshold_deg:g}'
+    text = _deg(sigma_deg)
+    if float(text.split()[0]) <= threshold_deg:
+        text = f'{sigma_deg:.4g} deg'
+    return f'{text}, needs {threshold_deg:g}'
+
+
+def _deg(sigma_deg: float) -> str:
+    """Return a sigma with two digits, or as a whole number."""
+    return f'{sigma_deg:.2g} deg' if sigma_deg < 99.5 else f'{sigma_deg:.0f} deg'
 
 
 def _sigmas_deg(P: Array) -> tuple[float, float]:

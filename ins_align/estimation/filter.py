@@ -11,7 +11,6 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-
 """
 Error-state Kalman filters whose errors are the body's: many means, one covariance.
 
@@ -323,11 +322,13 @@ class Filters:
         Parameters
         ----------
         model : Linearised
-            Of these means.
-        k, kind : int
-            Epoch in the model and the track; which measurement.
+            Of K epochs.
+        k : int
+            Which of them.
+        kind : int
+            0 or 1.
         track : Track
-            What the GNSS measures.
+            Of the same epochs.
         noise : ndarray, shape (3,)
             Factors on the sigmas that the receiver states, east, north and up.
 

@@ -11,8 +11,6 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-
-
 """
 What else may be true: a table of rivals, each a change to the filter, a likelihood and a sentence.
 
@@ -143,9 +141,9 @@ class Parameters:
         Parameters
         ----------
         config : Config
-            What is stated of lever arm, delay and IMU.
+            What is stated.
         rival : Rival
-            What it takes to be otherwise.
+            What is assumed beside it.
         force : ndarray, shape (3,)
             Specific force, m/s^2, at which all errors of the accelerometers together are as large
             as their biases are said to be.

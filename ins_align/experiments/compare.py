@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Experiment ``compare``: heading from course over ground, the note, its centred form, bank."""
+"""Experiment ``compare``: heading from course over ground, the note, its free start, the bank."""
 
 from __future__ import annotations
 

@@ -1,0 +1,228 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+The start of a bank: the note's formula over the first epochs, then every heading.
+
+A change of velocity, or the gravity that is taken off it, gives a vector in n0 and in the body;
+what one vector leaves open is the rotation about it, so the bank starts with all of them.
+"""
+
+from dataclasses import replace
+import math
+from typing import NamedTuple
+
+from ins_align.antenna import AntennaEpoch
+from ins_align.config import Config
+from ins_align.estimation.filter import FIRST, PHI, PHI0, RHO, XI
+from ins_align.estimation.formula import AttitudeMoments
+from ins_align.preintegration import Intervals
+from ins_align.rotation import apply, Array, cross, cumulative_rotations, exp_so3
+from ins_align.track import InertialTrack
+import numpy as np
+
+# A start takes so many epochs, fewer leave the formula no redundancy, and waits for no more.
+FIRST_EPOCHS, MAX_WAITING = 4, 64
+# The vector from which a bank starts is so many times its noise.
+START_RATIO = 20.0
+# Residuals in the mean square, over what the receiver states, above which its noise is taken to be
+# larger, or one epoch for an outlier if those of the others are so many times smaller without it.
+LOUD, OUTLYING = 2.0, 10.0
+# Headings, every two degrees, and their sigma over the step between them: the sum of such normal
+# densities is flat to 2e-6.
+HEADINGS, STEP_STD = 180, 0.6
+TILT_STD = math.radians(10.0)
+# What is not known of velocity and position at first (m/s, m); of a velocity whose horizontal
+# part is measured, the vertical is known better.
+OPEN_VELOCITY, OPEN_POSITION, STEADY_VELOCITY = 1e3, 1e4, 10.0
+
+
+class RoughAttitude(NamedTuple):
+    """
+    Attitude from the note's formula.
+
+    Attributes
+    ----------
+    C : ndarray, shape (3, 3)
+        At t0, but for a rotation about the axis.
+    axis : ndarray, shape (3,)
+        In the body at t0.
+    kind : int
+        0 from velocities, 1 from positions.
+    noise : float
+        Factor on the receiver's variances.
+
+    """
+
+    C: Array
+    axis: Array
+    kind: int
+    noise: float
+
+
+class Start:
+    """
+    Epochs that wait until there are enough to start with.
+
+    Parameters
+    ----------
+    config : Config
+
+    Attributes
+    ----------
+    epochs : list of AntennaEpoch
+        The first one is t0.
+    rejected : list of int
+        Velocities and positions that were left out as outliers.
+
+    """
+
+    def __init__(self, config: Config) -> None:
+        """Wait for the first epoch."""
+        self._lever = np.array(config.lever_arm)
+        self.epochs: list[AntennaEpoch] = []
+        self._imu: list[Intervals] = []
+        self.rejected = [0, 0]
+
+    def add(self, epoch: AntennaEpoch, imu: Intervals) -> None:
+        """Take an epoch and the interval before it."""
+        if self.epochs or _measured(epoch):
+            self._imu.append(imu if self.epochs else imu.end())
+            self.epochs.append(epoch)
+        if len(self.epochs) > MAX_WAITING:
+            self._drop_first()
+
+    @property
+    def imu(self) -> Intervals:
+        """Return the intervals before all epochs; the first is of no length."""
+        return Intervals(**{name: np.concatenate([getattr(imu, name) for imu in self._imu])
+                            for name in vars(self._imu[0])})
+
+    def _drop_first(self) -> None:
+        """Let t0 be the next epoch with a measurement."""
+        later = [k for k, epoch in enumerate(self.epochs) if k and _measured(epoch)]
+        if later:
+            imu = self._imu[later[0]].end()
+            del self.epochs[:later[0]], self._imu[:later[0]]
+            self._imu[0] = imu
+
+    def solve(self, use_position: bool) -> RoughAttitude | None:
+        """Return an attitude; None where the epochs say too little, or contradict each other."""
+        epochs = self.epochs
+        kind = 0 if sum(epoch.v_n is not None for epoch in epochs) >= FIRST_EPOCHS else 1
+        use = np.array([epoch.position_measured if kind else epoch.v_n is not None
+                        for epoch in epochs])
+        if np.count_nonzero(use) < FIRST_EPOCHS + kind or (kind and not use_position):
+            return None
+        time, s, a = self._pairs(kind)
+        variance = self._variance(kind)
+        places = np.flatnonzero(use)
+        while True:
+            C, residual, moments = _solved(s, a, time, places, kind)
+            usual = float(np.mean(variance[places]))
+            noise = residual / (3 * (len(places) - 2 - kind) * usual)
+            values, vectors = np.linalg.eigh(moments)
+            if values[-1] < START_RATIO ** 2 * usual * max(noise, 1.0):
+                return None
+            if noise < LOUD or len(places) <= FIRST_EPOCHS + kind:
+                break
+            left = [_solved(s, a, time, np.delete(places, i), kind)[1]
+                    for i in range(len(places))]
+            if min(left) > residual / OUTLYING:
+                break
+            places = np.delete(places, int(np.argmin(left)))
+        for k in np.setdiff1d(np.flatnonzero(use), places).tolist():
+            self.epochs[k] = replace(epochs[k], **(
+                {'position_measured': False} if kind else {'v_n': None}))
+            self.rejected[kind] += 1
+        if places[0] > 0:
+            self._drop_first()
+            return self.solve(use_position)
+        return RoughAttitude(C, vectors[:, -1], kind, noise if noise > LOUD else 1.0)
+
+    def _pairs(self, kind: int) -> tuple[Array, Array, Array]:
+        """Return the times and the vectors of the formula, free start, for all epochs."""
+        epochs, imu, first = self.epochs, self.imu, self.epochs[0]
+        time = np.array([epoch.stamp_ns - first.stamp_ns for epoch in epochs]) * 1e-9
+        track = InertialTrack.start(first.latitude, first.longitude, first.altitude).extended(
+            time, *(np.array([getattr(epoch, name) for epoch in epochs])
+                    for name in ('latitude', 'longitude', 'altitude')))
+        C = np.concatenate([np.eye(3)[None], cumulative_rotations(imu.R)])
+        steps = apply(C[:-1], imu.v)
+        v = np.cumsum(steps, axis=0)
+        if kind:
+            p = np.cumsum(imu.duration[:, None] * (v - steps) + apply(C[:-1], imu.p), axis=0)
+            return time, track.s_p, p + C[1:] @ self._lever
+        v_n = np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n for epoch in epochs])
+        swing = cross(imu.omega, np.broadcast_to(self._lever, imu.omega.shape))
+        return time, track.s_v(v_n), v + apply(C[1:], swing)
+
+    def _variance(self, kind: int) -> Array:
+        """Return what the receiver states; a vertical that is not measured is taken as steady."""
+        covariance = [epoch.position_covariance if kind else epoch.velocity_covariance
+                      for epoch in self.epochs]
+        return np.array([min(float(np.trace(matrix)) / 3, float(np.trace(matrix[:2, :2])))
+                         for matrix in covariance])
+
+    def covariance(self, rough: RoughAttitude, known: Array) -> Array:
+        """
+        Return the covariance of each rival's errors at t0.
+
+        Parameters
+        ----------
+        rough : RoughAttitude
+            As `solve` returned it.
+        known : ndarray, shape (M, m, m)
+            Covariance of the parameters.
+
+        Returns
+        -------
+        ndarray, shape (M, n, n)
+
+        """
+        along = np.outer(rough.axis, rough.axis)
+        step = STEP_STD * 2 * math.pi / HEADINGS
+        attitude = TILT_STD ** 2 * (np.eye(3) - along) + step ** 2 * along
+        M, m = known.shape[:2]
+        P = np.zeros((M, FIRST + m, FIRST + m))
+        for rows in (PHI, PHI0):
+            for columns in (PHI, PHI0):
+                P[:, rows, columns] = attitude
+        steady = any(epoch.v_n is not None for epoch in self.epochs)
+        P[:, XI, XI] = (STEADY_VELOCITY if steady else OPEN_VELOCITY) ** 2 * np.eye(3)
+        P[:, RHO, RHO] = OPEN_POSITION ** 2 * np.eye(3)
+        P[:, FIRST:, FIRST:] = known
+        return P
+
+
+def all_headings(rough: RoughAttitude, accel_sign: float) -> Array:
+    """Return attitudes all round the axis, shape (HEADINGS, 3, 3)."""
+    C, axis = rough.C, rough.axis
+    if accel_sign < 0:
+        # With the accelerations reversed it is half a turn about any axis across.
+        across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+        C = C @ exp_so3(math.pi * across / np.linalg.norm(across))
+    return C @ exp_so3(2 * math.pi / HEADINGS * np.arange(HEADINGS)[:, None] * axis)
+
+
+def _measured(epoch: AntennaEpoch) -> bool:
+    return epoch.v_n is not None or epoch.position_measured
+
+
+def _solved(s: Array, a: Array, time: Array, places: Array,
+            kind: int) -> tuple[Array, float, Array]:
+    """Solve ``s = (free start) + C a`` for some epochs; see `AttitudeMoments.solve`."""
+    moments = AttitudeMoments(1 + kind)
+    for k in places.tolist():
+        moments.add(s[k], a[k], (1.0, time[k])[:1 + kind])
+    return moments.solve()
