@@ -13,6 +13,8 @@
 # limitations under the License.
 """A flight through the live node: what it publishes against replay and against the truth."""
 
+import json
+
 from ins_align.simulation import simulate, write_bag
 from node_harness import (
     attitude_error_deg, bag_script, Listener, overrides, play, RELIABLE, replayed, running_node,
@@ -35,7 +37,7 @@ def test_flight(flight, tmp_path):
     bag = tmp_path / 'flight'
     write_bag(flight, bag)
     parameters = {'lever_arm': '[1, 1, 1]', 'gnss_lateness': LATENESS}
-    rows = replayed(bag, parameters, tmp_path / 'flight.csv')
+    rows = replayed(bag, parameters, tmp_path / 'flight.csv', f'--json={tmp_path / "flight.json"}')
     declared = next(row for row in rows if row['state'] == 'ALIGNED')
 
     with running_node([*overrides(parameters), *RELIABLE]) as node:
@@ -55,7 +57,12 @@ def test_flight(flight, tmp_path):
         [float(declared[name]) for name in ('qx', 'qy', 'qz', 'qw')], abs=1e-9)
     assert q.w >= 0.0
     assert attitude.header.frame_id == 'map'
-    assert stamp_ns(attitude) == int(rows[0]['stamp_ns'])
+    # t0 moves until it is declared, and no more; there it is the true attitude.
+    t0_ns = json.loads((tmp_path / 'flight.json').read_text())['t0']
+    assert stamp_ns(attitude) == t0_ns < int(declared['stamp_ns'])
+    error = attitude_error_deg(q, flight.attitude_at(t0_ns))
+    sigma = np.array([float(declared[f'sigma_{axis}_deg']) for axis in 'enu'])
+    assert np.abs(error / sigma).max() < 3.5
 
     # Nothing was lost or left out on the way, and the last word is that of replay as well.
     status = listener.status
