@@ -26,7 +26,7 @@ from ins_align.antenna import AntennaEpoch
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimation.declaration import Fit
 from ins_align.estimation.filter import (
-    DELAY, Filters, FIRST, GYRO, Linearised, linearised, PHI, PHI0, Track)
+    DELAY, Filters, FIRST, GYRO, Linearised, linearised, MAX_DELAY, MIN_DELAY, PHI, PHI0, Track)
 from ins_align.estimation.rivals import in_words, log_sum, Parameters, rivals_of
 from ins_align.estimation.start import (
     all_headings, HEADINGS, LOUD, OPEN_POSITION, RoughAttitude, Start)
@@ -235,7 +235,7 @@ class Bank:
     def _point_of(self, filters: Filters) -> Array:
         """Return the parameters of the likeliest mean of each rival, with one delay for all."""
         point = filters.x[filters.lead]
-        point[:, DELAY] = point[self._best(filters), DELAY]
+        point[:, DELAY] = np.clip(point[self._best(filters), DELAY], MIN_DELAY, MAX_DELAY)
         return point
 
     def _model(self, filters: Filters, point: Array, imu: Intervals) -> Linearised:

@@ -38,7 +38,7 @@ import numpy as np
 # gyros (bias, then matrix), errors of the accelerometers.
 PHI, XI, RHO, PHI0, FIRST = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12
 LEVER_ARM, DELAY, GYRO = slice(0, 3), 3, 4          # in the parameters
-# A delay within these (s) is followed along the recent motion, a larger one goes straight on.
+# A delay within these (s) is followed along the recent motion; from there it goes straight on.
 MIN_DELAY, MAX_DELAY = -0.1, AGES[-1]
 # Normalised innovation squared of three rows above which a measurement is an outlier: one good
 # one in 60 000 is (chi-square with three degrees of freedom).
@@ -114,7 +114,8 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool) 
     Parameters
     ----------
     point : ndarray, shape (M, m)
-        Parameters to linearise at; their delays are alike.
+        Parameters to linearise at; their delays are alike, and within `MIN_DELAY` and
+        `MAX_DELAY`.
     interval : Intervals
         Before each epoch, as each of the rivals has them: leading axes (K, M).
     Q : ndarray, shape (K, M, 9, 9)
@@ -162,7 +163,7 @@ class _Seen:
         self.size, self.shape = size, interval.R.shape[:2] + (3, FIRST + point.shape[1])
         gyro, accel = (point[:, GYRO + k * size:GYRO + (k + 1) * size] for k in (0, 1))
         self.lever = np.broadcast_to(point[:, LEVER_ARM], interval.omega.shape)
-        self.delay = delay = float(min(max(point[0, DELAY], MIN_DELAY), MAX_DELAY))
+        self.delay = delay = float(point[0, DELAY])
         force, self.gained, self.gained_p = exact(interval.gained, delay)
         rate, self.turned, _ = exact(interval.turned, delay)
         # A lever arm swings with the vibration too.
