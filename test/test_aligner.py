@@ -22,7 +22,6 @@ from alignment import (aligned, config_for, error_deg, error_of, give, LEVER,
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config, ConfigError, ImuNoise, PRESETS
 from ins_align.experiments.declare import largest, run_trial
-from ins_align.methods import MapMethod
 from ins_align.results import Severity
 from ins_align.rotation import exp_so3, matrix_from_quaternion, roll_pitch_yaw
 from ins_align.scenarios import Motion, Scenario, SCENARIOS
@@ -442,7 +441,7 @@ def test_positions_take_over_where_velocities_stop(use_position):
 @pytest.mark.parametrize('until_s', (5.0, 25.0))
 def test_velocities_that_come_late_are_used_without_positions(monkeypatch, until_s):
     """Positions that wander are better than nothing, and worse than velocities alone."""
-    monkeypatch.setattr('ins_align.alignment.MapMethod', partial(MapMethod, capacity=150))
+
     s = simulated('hover', imu_grade='mems', duration=90.0, seed=1, position_std=0.5,
                   position_drift_std=1.5)
 

@@ -15,11 +15,13 @@
 
 from functools import lru_cache
 
-from ins_align.estimation import formula
 from ins_align.earth import EARTH_RATE, earth_rate_n
+from ins_align.estimation import formula
 from ins_align.experiments.dense import bound
+from ins_align.experiments.note import exact_lever_remainder
 from ins_align.preintegration import Noise, preintegrate, SensorErrors, split_at_epochs
 from ins_align.simulation import simulate
+from ins_align.track import InertialTrack
 import numpy as np
 import pytest
 from scipy.integrate import quad_vec
@@ -55,7 +57,7 @@ def run(simulation, lever=LEVER):
                                          epochs[[0, 0]]), SensorErrors.none(), Noise())
     body = formula.BodyIntegrals(lever, first.omega[0])
     navigation = formula.NavigationIntegrals(*lla[0], simulation.velocity[0])
-    track = formula.InertialTrack.start(*lla[0])
+    track = InertialTrack.start(*lla[0])
     for k in range(1, len(epochs)):
         body.advance(intervals, k - 1)
         navigation.advance(epochs[k], *lla[k], simulation.velocity[k])
@@ -140,8 +142,8 @@ def turning_flight(duration=1000.0, rate=50.0):
 
 def test_short_form_stays_within_its_bound_for_a_thousand_seconds():
     time, C_b0b, omega_ib_b, omega_ie_b = turning_flight()
-    remainder = formula.exact_lever_remainder(time, C_b0b, omega_ib_b - omega_ie_b,
-                                              omega_ie_b[0], LEVER)
+    remainder = exact_lever_remainder(time, C_b0b, omega_ib_b - omega_ie_b, omega_ie_b[0],
+                                      LEVER)
     size = np.linalg.norm(remainder, axis=1)
     limit = 2 * EARTH_RATE ** 2 * time * np.linalg.norm(LEVER)
     # Rounding and the trapezoidal rule of the oracle's integral weigh 1e-8 m/s.
@@ -162,7 +164,7 @@ def test_exact_form_is_the_difference_of_antenna_and_imu_velocity():
     exact = relative - relative[0] + integral
     rate = np.einsum('nij,nj->ni', C_b0b, np.cross(omega_ib_b, LEVER))
     short = rate - rate[0]
-    remainder = formula.exact_lever_remainder(time, C_b0b, omega_eb_b, omega_ie_b0, LEVER)
+    remainder = exact_lever_remainder(time, C_b0b, omega_eb_b, omega_ie_b0, LEVER)
     assert np.allclose(exact - short, remainder, atol=1e-12)
 
 
@@ -203,7 +205,7 @@ def test_positions_alone_are_the_integrated_velocity_form():
     parts = quad_vec(integrand, 0.0, end, epsabs=1e-11, epsrel=1e-13)[0].reshape(5, 3)
     beta_v = turned(end, course.v_n(end)) - course.v_n(0.0) + parts[0] - parts[1]
     beta_p = parts[2] - end * course.v_n(0.0) + parts[3] - parts[4]
-    track = formula.InertialTrack.start(*start)
+    track = InertialTrack.start(*start)
     before = track.s_v(course.v_n(0.0))
     assert np.allclose(before, course.v_n(0.0), atol=1e-12)
     time = np.arange(0.01, end + 0.005, 0.01)      # gravitation changes over hundreds of seconds

@@ -129,7 +129,9 @@ class Bank:
         self._misfit = self._lasting = 1.0
         self._heard, self._mean = BELIEVED, np.zeros((2, 3))
         self._in_a_row = 0                          # epochs that were rejected
-        self._ahead = 1
+        # n0 and the point of linearisation hold for so many epochs, of which so many are left.
+        self._point: Array | None = None
+        self._ahead = self._left = 1
         self._wait(epoch, imu)
 
     def _remember(self, learnt: Learnt) -> None:
@@ -213,7 +215,7 @@ class Bank:
         """Let n0 be the local level at an epoch; the next one is linearised anew."""
         self._n0_ns, self._C_nn0 = epoch.stamp_ns, np.eye(3)
         self._inertial = InertialTrack.start(epoch.latitude, epoch.longitude, epoch.altitude)
-        self._point: Array | None = None
+        self._point = None
         self._left = self._ahead
 
     def _track_of(self, epochs: Sequence[AntennaEpoch]) -> tuple[InertialTrack, Track]:
@@ -409,8 +411,9 @@ class Bank:
         if self._filters is None:
             return Fit(self._offered, delay=self._config.gnss_delay)
         words, contradicted = self._doubt()
-        return Fit(self._offered, 3 * (self._offered - self._rejected[2]), self._misfit,
-                   self._nis, self._innovation, *self._rejected,
+        velocity, position, either = self._rejected
+        return Fit(self._offered, 3 * (self._offered - either), self._misfit,
+                   self._nis, self._innovation, velocity, position, either,
                    delay=self._config.gnss_delay + float(self._body()[0][DELAY]),
                    objection=words if contradicted else '', noise=self._noise_in_words())
 

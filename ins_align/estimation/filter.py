@@ -140,12 +140,16 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool) 
     F[..., PHI, PHI] = F[..., XI, XI] = F[..., RHO, RHO] = T
     F[..., XI, PHI], F[..., RHO, PHI] = -T @ skew(moved[..., :3]), -T @ skew(moved[..., 3:])
     F[..., RHO, XI] = interval.duration[:, None, None, None] * T
-    J[..., RHO, DELAY] -= moved[..., :3]
     for rows in (PHI, XI, RHO):
         F[..., rows, FIRST:] = T @ J[..., rows, :]
-    J[..., RHO, DELAY] = 0.0                    # bilinear in the means: `propagate` has it
+    # What is gained late is missing in the position, with all its errors.
+    delay = point[:, DELAY, None, None]
+    F[..., RHO, PHI] -= delay * F[..., XI, PHI]
+    F[..., RHO, FIRST:] -= delay * F[..., XI, FIRST:]
+    F[..., RHO, FIRST + DELAY] = -apply(T, moved[..., :3])
     turn = np.zeros((K, M, 9, 9))
     turn[..., PHI, PHI] = turn[..., XI, XI] = turn[..., RHO, RHO] = T
+    turn[..., RHO, XI] = -delay * T
     seen = _Seen(point, interval, size)
     H, expected = np.zeros((K, 2, M, 3, FIRST + m)), np.zeros((K, 2, M, 3))
     H[:, 0], expected[:, 0] = seen.velocity()
