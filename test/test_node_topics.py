@@ -58,7 +58,8 @@ class NavsatTransform:
         return abs(np.degrees(np.remainder(error + np.pi, 2.0 * np.pi) - np.pi))
 
 
-@pytest.mark.parametrize('gnss_rate', [1.0, 5.0, 10.0])
+@pytest.mark.parametrize('gnss_rate', [5.0, *(
+    pytest.param(rate, marks=pytest.mark.campaign) for rate in (1.0, 10.0))])
 def test_who_listens_gets_the_heading_whenever_it_joins(gnss_rate, tmp_path):
     simulation = simulate('flight', imu_grade='tactical', seed=3, duration=DURATION,
                           gnss_rate=gnss_rate)
