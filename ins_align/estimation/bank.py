@@ -151,6 +151,7 @@ class Bank:
         done = 0
         while done < len(epochs):
             if self._filters is None:
+                self._choose(epochs[done])
                 self._wait(epochs[done], imu.take(slice(done, done + 1)))
                 done += 1
                 yield epochs[done - 1]

@@ -243,9 +243,6 @@ class Declaration:
         """Return what in the data contradicts the model; empty when nothing does."""
         if fit.rows < MIN_ROWS:
             return ''
-        if fit.rejected > REJECTED_SHARE * fit.offered:
-            return (f'{fit.rejected} of {fit.offered} GNSS epochs do not fit the rest: check the '
-                    'velocity frame, the IMU axes and signs, the lever arm, the GNSS delay')
         config = self.config
         unexplained = abs(fit.delay - config.gnss_delay)
         if unexplained > min(DELAY_SIGMAS * config.gnss_delay_std, UNEXPLAINED_DELAY) > 0:
@@ -254,6 +251,9 @@ class Declaration:
                     'the clocks, or set gnss_delay')
         if fit.objection:
             return fit.objection
+        if fit.rejected > REJECTED_SHARE * fit.offered:
+            return (f'{fit.rejected} of {fit.offered} GNSS epochs do not fit the rest: check the '
+                    'velocity frame, the IMU axes and signs, the lever arm, the GNSS delay')
         misfit = max(fit.misfit, self._recent_nis)
         if misfit > MAX_MISFIT:
             return (f'the residuals are {math.sqrt(misfit):.1f} times what the stated noise '
