@@ -4,13 +4,15 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OLDEST := .venv-oldest
+# A worker for each core; whoever has nothing left to do takes tests from another.
+PARALLEL := -n auto --maxprocesses 8 --dist worksteal
 
 # A ROS installation that is sourced in this shell must not mix with the wheels in .venv.
 unexport PYTHONPATH AMENT_PREFIX_PATH LD_LIBRARY_PATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help demo test test-oldest lint docs bench experiments lock clean
+.PHONY: help demo test test-all test-oldest lint docs bench experiments lock clean
 
 help:
 	@sed -n 's/^#: //p' Makefile
@@ -33,10 +35,18 @@ else
 	@echo 'Picture: build/demo/flight.png (the numbers are beside it: .json, .csv)'
 endif
 
-#: make test                   linters, types, tests and their coverage
+#: make test                   linters, types and tests, four minutes on two cores;
+#:                             ARGS='-k node' some of them
 test: $(VENV)/ready
-	@$(BIN)/python -m pytest -q --cov --cov-report=term $(ARGS) \
+	@$(BIN)/python -m pytest -q $(PARALLEL) -m 'not campaign' $(ARGS) \
 	    && echo 'make test: passed' || { echo 'make test: FAILED'; exit 1; }
+
+#: make test-all               all tests, the long campaigns too, with their coverage; then test-oldest
+test-all: $(VENV)/ready
+	@$(BIN)/python -m pytest -q $(PARALLEL) --cov --cov-report=term $(ARGS) \
+	    || { echo 'make test-all: FAILED'; exit 1; }
+	@$(MAKE) -s --no-print-directory test-oldest
+	@echo 'make test-all: passed'
 
 #: make test-oldest            the tests with numpy 1.26 and scipy 1.11, where Python 3.12 is there
 test-oldest:
@@ -44,7 +54,7 @@ test-oldest:
 	        $$(pyenv root 2>/dev/null)/versions/3.12*/bin/python3.12; do \
 	    if "$$python" -c '' 2>/dev/null; then \
 	        $(MAKE) -s --no-print-directory $(OLDEST)/ready PYTHON="$$python" || exit 1; \
-	        $(OLDEST)/bin/python -m pytest -q -m 'not linter' $(ARGS) \
+	        $(OLDEST)/bin/python -m pytest -q $(PARALLEL) -m 'not linter and not campaign' $(ARGS) \
 	            && echo 'make test-oldest: passed' && exit 0; \
 	        echo 'make test-oldest: FAILED'; exit 1; \
 	    fi; \

@@ -154,6 +154,7 @@ class Alignment:
                                                    method.unconfirmed)
                 if self._declaration.move_t0:
                     method.move_t0()
+                    initial = method.initial() or initial
             else:
                 verdict = self._declaration.update_without_gnss(silent_s, initial[1], current[1],
                                                                 fit)

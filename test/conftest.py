@@ -23,10 +23,16 @@ import random
 # processors have not.
 if version('numpy').startswith('1.') and platform.machine() == 'x86_64':
     os.environ.setdefault('OPENBLAS_CORETYPE', 'Haswell')
+# There is a worker for each core already.
+os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 # Before any test starts a node: its own domain, this machine only, so that neither a robot on
-# the network nor a second run of the tests is heard.
-os.environ['ROS_DOMAIN_ID'] = str(random.SystemRandom().randint(1, 101))
+# the network nor a second run of the tests is heard. Workers of pytest-xdist, which inherit the
+# first one's choice, take those that follow.
+worker = os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw')
+domain = (int(os.environ['ROS_DOMAIN_ID']) + 1 + int(worker) if worker
+          else random.SystemRandom().randint(0, 100))
+os.environ['ROS_DOMAIN_ID'] = str(domain % 101 + 1)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 

@@ -526,10 +526,12 @@ def test_streams_of_another_encoding(standing, tmp_path, command, encoding, name
     assert 'Traceback' not in done.stderr.decode(encoding)
 
 
-@pytest.mark.parametrize('command, status', [
-    (['replay', '--params'], 0), (['replay', '--duration', '2', '--params'], 1), (['info'], 0)])
-@pytest.mark.parametrize('buffered, number, errors_too', [
-    ([], 1, False), (['-u'], 1, False), (['-u'], 1, True), (['-u'], 3, False), ([], 3, True)])
+@pytest.mark.parametrize('command, status, buffered, number, errors_too', [
+    (['replay', '--params'], 0, [], 1, False), (['replay', '--params'], 0, ['-u'], 1, True),
+    (['replay', '--params'], 0, ['-u'], 3, False),
+    (['replay', '--duration', '2', '--params'], 1, ['-u'], 1, False),
+    (['replay', '--duration', '2', '--params'], 1, [], 3, True),
+    (['info'], 0, [], 1, False), (['info'], 0, ['-u'], 3, True)])
 def test_reader_that_leaves(flight, tmp_path, command, status, buffered, number, errors_too):
     """As in ``ins_align replay ... | head -1``: neither files nor status change."""
     if command[-1] == '--params':

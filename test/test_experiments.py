@@ -166,7 +166,7 @@ def test_recordings_and_their_files(folder, tmp_path, capsys):
     experiments.run('recordings', tmp_path, data_dir=folder, jobs=1)
     text = (tmp_path / 'recordings.md').read_text('utf-8')
     assert 'ins_align experiment recordings --out DIR --data DIR' in text
-    assert 'driven, map' in text
+    assert 'driven, bank' in text
     numbers = json.loads((tmp_path / 'recordings.json').read_text('utf-8'))
     assert [window['start_s'] for window in numbers['driven']['bank']] == [0.0, 10.0, 20.0]
     assert (tmp_path / 'recordings.png').stat().st_size > 10_000

@@ -139,7 +139,8 @@ def as_twist(msg, kind):
     return other
 
 
-@pytest.mark.parametrize('kind', ['TwistStamped', 'Odometry'])
+@pytest.mark.parametrize('kind', [
+    pytest.param('TwistStamped', marks=pytest.mark.campaign), 'Odometry'])
 def test_velocity_of_another_type_north_east_down(kind, tmp_path):
     simulation = flight()
     messages = [(time_ns, topic, as_twist(msg, kind) if topic == VELOCITY else msg)

