@@ -40,9 +40,6 @@ PHI, XI, RHO, PHI0, FIRST = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12),
 LEVER_ARM, DELAY, GYRO = slice(0, 3), 3, 4          # in the parameters
 # A delay within these (s) is followed along the recent motion; from there it goes straight on.
 MIN_DELAY, MAX_DELAY = -0.1, AGES[-1]
-# Weights of headings forget feigned information so many times faster than it comes: it is as large
-# as its expectation only on average, and without motion nothing else is in them.
-FORGET = 20.0
 # Normalised innovation squared of three rows above which a measurement is an outlier: one good
 # one in 60 000 is (chi-square with three degrees of freedom).
 GATE = 25.0
@@ -399,7 +396,7 @@ class Filters:
         left = 1 - np.clip(np.trace(gain[:, XI], axis1=1, axis2=2) / 3, 0.0, 1.0)
         self.feigned = (left ** 2)[:, None, None] * V
         if len(self.C) > len(self.ids):
-            self.weight *= (1 - np.minimum(FORGET * feigned, 1.0))[self.place]
+            self.weight *= (1 - np.minimum(feigned, 1.0))[self.place]
             self._weigh_evenly()
 
     def _weigh_evenly(self) -> None:
