@@ -22,7 +22,7 @@ from collections import Counter
 
 from ins_align.config import Config
 from ins_align.estimation.bank import Bank, Learnt
-from ins_align.estimation.declaration import Declaration, Fit
+from ins_align.estimation.declaration import Declaration
 from ins_align.estimation.formula import NoteMethod
 from ins_align.intake import Afresh, Located, Loss, Run, Start, Step, Wait
 from ins_align.plausibility import ForceCheck
