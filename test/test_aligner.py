@@ -43,7 +43,7 @@ def result(flight):
 
 
 def check_same(epochs, others):
-    """The same epochs, states and attitudes, but for rounding: a thousandth of a sigma."""
+    """Check that epochs are the same but for rounding: a thousandth of a sigma."""
     assert [(e.stamp_ns, e.state) for e in epochs] == [(e.stamp_ns, e.state) for e in others]
     for epoch, other in zip(epochs, others):
         assert (epoch.current is None) == (other.current is None)

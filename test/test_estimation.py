@@ -19,7 +19,7 @@ from alignment import aligned, config_for, normalised_error, simulated
 from ins_align.aligner import State
 from ins_align.config import Config
 from ins_align.estimation.bank import Bank, RESOLVED_STD
-from ins_align.estimation.filter import DELAY, FIRST, Filters, GYRO, linearised, PHI, PHI0
+from ins_align.estimation.filter import DELAY, Filters, FIRST, GYRO, linearised, PHI, PHI0
 from ins_align.estimation.rivals import SIGNS
 from ins_align.experiments.dense import bound, dense_solution
 from ins_align.intake import Intake, Run, Start
