@@ -136,7 +136,7 @@ class Config:
     gyro_scale_std: float = _parameter(
         0.0, 'scale factor error of the gyroscopes, 1 sigma per axis, 0.01 is one percent; 0: the '
         "preset's; where that is above 0 it is estimated, as are, 3 tenths of it, misalignment "
-        'and the errors of the accelerometers; g-sensitivity counts as noise', '1',
+        'and the errors of the accelerometers', '1',
         minimum=0.0, maximum=0.5)
     rate_random_walk: float = _parameter(
         0.0, "rate random walk of the gyroscopes: how their biases change; 0: the preset's",

@@ -119,8 +119,8 @@ def test_command_line_starts_without_anything_optional():
     assert not imported_by(['cli']) & {*OPTIONAL, 'rclpy'}
 
 
-def test_readme_lists_every_parameter_with_its_default():
-    rows = dict(re.findall(r'^\| `(\w+)` \| `([^`]+)` \|', read('README.md'), re.MULTILINE))
+def test_page_lists_every_parameter_with_its_default():
+    rows = dict(re.findall(r'^\| `(\w+)` \| `([^`]+)` \|', read('docs/parameters.md'), re.MULTILINE))
     defaults = {}
     for parameter in parameters():
         value = list(parameter.default) if isinstance(parameter.default, tuple) \
@@ -129,10 +129,15 @@ def test_readme_lists_every_parameter_with_its_default():
     assert rows == defaults
 
 
-def test_readme_names_no_file_that_is_not_there():
-    links = re.findall(r'\]\((?!https?:|#)([^)#]+)', read('README.md'))
-    assert links
-    assert [link for link in links if not (ROOT / link).exists()] == []
+@pytest.mark.parametrize('page', ['README.md', *(
+    f'docs/{path.name}' for path in sorted((ROOT / 'docs').glob('*.md')))])
+def test_page_names_no_file_that_is_not_there(page):
+    links = re.findall(r'\]\((?!https?:|#)([^)#]+)', read(page))
+    assert [link for link in links if not ((ROOT / page).parent / link).exists()] == []
+
+
+def test_readme_is_short():
+    assert len(read('README.md').splitlines()) <= 150
 
 
 def test_topics_are_listened_to_before_there_is_a_node():

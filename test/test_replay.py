@@ -127,14 +127,14 @@ def test_json_and_csv_agree(result):
 
 
 def documented(title):
-    """Return the names in the first column of the README's table with this title."""
-    readme = (Path(__file__).parents[1] / 'README.md').read_text(encoding='utf-8')
-    table = re.search(rf'^\| {title} \|.*\n\|[-|]+\n((?:\|.*\n)+)', readme, re.MULTILINE)
+    """Return the names in the first column of the table with this title."""
+    page = (Path(__file__).parents[1] / 'docs' / 'output.md').read_text(encoding='utf-8')
+    table = re.search(rf'^\| {title} \|.*\n\|[-|]+\n((?:\|.*\n)+)', page, re.MULTILINE)
     return [name for row in table[1].splitlines()
             for name in re.findall(r'`(\w+)`', row.split('|')[1])]
 
 
-def test_readme_names_every_field(result):
+def test_page_names_every_field(result):
     content = result.to_json()
     attitude = [name for name in content['final_attitude'] if name != 'stamp']
     fields = documented('field')
@@ -145,7 +145,7 @@ def test_readme_names_every_field(result):
     assert documented('column')[10:] == [columns[10], columns[-1]]
 
 
-def test_readme_names_every_count(result):
+def test_page_names_every_count(result):
     counts = documented('count')
     assert set(result.status.counts) <= set(counts)
     source = ''.join(path.read_text() for path in Path(ins_align.__file__).parent.glob('*.py'))
