@@ -11,8 +11,4 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-<<<<<<< HEAD
 """The estimate: the note's formulas, a bank of filters, its rivals, and the declaration."""
-=======
-"""What is estimated from epochs and intervals, and when it is declared."""
->>>>>>> tests-a
