@@ -120,7 +120,8 @@ def test_command_line_starts_without_anything_optional():
 
 
 def test_page_lists_every_parameter_with_its_default():
-    rows = dict(re.findall(r'^\| `(\w+)` \| `([^`]+)` \|', read('docs/parameters.md'), re.MULTILINE))
+    page = read('docs/parameters.md')
+    rows = dict(re.findall(r'^\| `(\w+)` \| `([^`]+)` \|', page, re.MULTILINE))
     defaults = {}
     for parameter in parameters():
         value = list(parameter.default) if isinstance(parameter.default, tuple) \
@@ -137,7 +138,7 @@ def test_page_names_no_file_that_is_not_there(page):
 
 
 def test_readme_is_short():
-    assert len(read('README.md').splitlines()) <= 150
+    assert len(read('README.md').splitlines()) <= 130
 
 
 def test_topics_are_listened_to_before_there_is_a_node():
