@@ -405,7 +405,8 @@ def run_replay(arguments: argparse.Namespace) -> int:
     objects = []
     statuses = []
     with progress_bar(len(tasks)) as progress:
-        for bag, outcome in zip(arguments.bags, _outcomes(tasks, arguments, progress)):
+        # To the very end: a pool of processes that is dropped on the way is torn down in a race.
+        for outcome, bag in zip(_outcomes(tasks, arguments, progress), arguments.bags):
             if outcome.error:
                 if not several:
                     raise UsageError(_of(bag, outcome.error))
