@@ -64,6 +64,8 @@ MAX_AHEAD = 64
 VELOCITY_STOPPED_NS, VELOCITY_BACK_NS = 10_000_000_000, 2_000_000_000
 # So many epochs in a row that do not fit show that the bank has gone astray.
 ASTRAY = 10
+# Attitudes are close when they differ by less than this (rad).
+CLOSE = 0.01
 # A heading that is known to this (rad) is resolved.
 RESOLVED_STD = 0.35
 NOTHING_NEW = np.full(3, math.nan)
@@ -386,10 +388,13 @@ class Bank:
         if len(use) == 1:
             return C[0], covariance[0]
         mean = C[np.argmax(share)]
-        for _ in range(2):
+        for _ in range(3):
             away = log_so3(C @ mean.T)
-            mean = exp_so3(share @ away / share.sum()) @ mean
-        away = log_so3(C @ mean.T)
+            shift = share @ away / share.sum()
+            mean = exp_so3(shift) @ mean
+            away = away - shift
+            if np.max(np.abs(away)) < CLOSE:        # the rotations add up like vectors
+                break
         total = covariance + away[:, :, None] * away[:, None]
         return mean, np.sum(share[:, None, None] * total, axis=0) / share.sum()
 
