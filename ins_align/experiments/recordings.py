@@ -53,6 +53,7 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
     targets_text(report, windows)
     declared_table(report, windows)
     time_table(report, windows)
+    whole_table(report, paths, jobs)
     report.figure(figure(windows), '', 'Heading error of all windows against time; declared '
                                        'parts of the bank drawn dark')
     numbers = {name: {method: [window_json(window) for window in each]
@@ -81,6 +82,25 @@ def run_task(task: tuple[Path, str, float]) -> Window:
     if told['method'] == 'vif' and not any(hasattr(m, 'velocity') for m in load(path).messages):
         told['method'] = 'pif'
     return run_window(path, start, LENGTH, **told)
+
+
+def run_whole(path: Path) -> Window:
+    """Run the default method on all of a recording."""
+    return run_window(path, 0.0, load(path).duration)
+
+
+def whole_table(report: Report, paths: list[Path], jobs: int | None) -> None:
+    """Print how right every epoch is that is called aligned, from end to end."""
+    rows = []
+    for path, window in zip(paths, parallel(run_whole, paths, jobs, 'whole recordings')):
+        held = window.sigmas[window.aligned].max(axis=1, initial=0.0)
+        rows.append([load(path).name, _median([window.declared_s or np.nan], '.0f'), len(held),
+                     f'{100 * np.mean(window.aligned):.0f}', bool(window.aligned[-1]),
+                     *(f'{100 * np.mean(held > limit):.1f}' if len(held) else None
+                       for limit in (3, 5)), f'{held.max(initial=0.0):.1f}'])
+    report.table('Whole recordings, bank: every epoch while ALIGNED', [
+        'recording', 'after, s', 'epochs', 'of all, %', 'at the end', '> 3 sigma, %',
+        '> 5 sigma, %', 'worst, sigma'], rows)
 
 
 def targets_text(report: Report, windows: dict[str, dict[str, list[Window]]]) -> None:
