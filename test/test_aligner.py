@@ -451,7 +451,8 @@ def test_positions_take_over_where_velocities_stop(use_position):
     assert (epochs[-1].current.sigma_deg[2] < 1.0) == (use_position == 'auto')
 
 
-@pytest.mark.parametrize('until_s', (5.0, 25.0))
+@pytest.mark.parametrize('until_s', (
+    5.0, pytest.param(25.0, marks=pytest.mark.campaign)))
 def test_velocities_that_come_late_are_used_without_positions(until_s):
     """Positions that wander are better than nothing, and worse than velocities alone."""
     s = simulated('hover', imu_grade='mems', duration=90.0, seed=1, position_std=0.5,
@@ -828,7 +829,8 @@ def test_while_the_imu_is_stuck_that_is_the_reason(flight):
     assert aligner.declared is None and aligner.attitude_now() is None
 
 
-@pytest.mark.parametrize('lateness', (0.0, 0.1, 1.0))
+@pytest.mark.parametrize('lateness', (
+    0.0, pytest.param(0.1, marks=pytest.mark.campaign), 1.0))
 def test_when_somebody_looks_does_not_matter_to_a_stuck_spiky_or_small_imu(flight, lateness):
     s = stick(flight, 10.0, 10.8)
     s.gyro[2000:2080, 1] = 1.5

@@ -232,7 +232,8 @@ def test_estimate_and_sigma_are_those_of_the_dense_solution(setting):
 
 
 @pytest.mark.parametrize('options', [
-    {}, {'position_std': 0.05}, {'position_std': 0.5, 'gnss_delay': 0.15}],
+    {}, pytest.param({'position_std': 0.05}, marks=pytest.mark.campaign),
+    pytest.param({'position_std': 0.5, 'gnss_delay': 0.15}, marks=pytest.mark.campaign)],
     ids=['velocities', 'sharp positions', 'late positions'])
 def test_errors_are_as_large_as_stated_and_sigmas_those_of_the_bound(options):
     """Of twenty flights; the quantiles of their squared errors are passed once in a thousand."""
@@ -403,7 +404,8 @@ def test_what_is_configured_for_certain_and_wrong_is_not_believed(scenario, opti
     assert status.state is not State.ALIGNED and words in status.reason
 
 
-@pytest.fixture(scope='module', params=('static', 'straight'))
+@pytest.fixture(scope='module', params=(
+    'static', pytest.param('straight', marks=pytest.mark.campaign)))
 def headless(request):
     """Align a MEMS IMU that rests or holds its course, for four minutes."""
     s = simulated(request.param, imu_grade='mems', duration=240.0, seed=2, gnss_rate=2.0,
