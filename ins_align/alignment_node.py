@@ -34,7 +34,7 @@ from ins_align.checks import InputChecks
 from ins_align.config import (
     Config, config_from_mapping, ConfigError, no_effect, NODE_NAME, parameters)
 from ins_align.diagnostics import (
-    diagnostic_status, in_words, LEVELS, parameter_descriptor, ReasonLog, topic_faults,
+    diagnostic_status, inputs_in_words, LEVELS, parameter_descriptor, ReasonLog, topic_faults,
     vector_msg)
 from ins_align.imu_bytes import ImuSample, read_imu, with_orientation
 from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
@@ -162,7 +162,7 @@ class AlignmentNode(Node):
             NavSatFix, FIX_TOPIC, _nothing, GNSS_DEPTH, OnDemand())
         self._velocity_subscription = self._subscribe_to(
             velocity_type, VELOCITY_TOPIC, _nothing, GNSS_DEPTH, OnDemand())
-        self.get_logger().info(in_words(self, self._inputs, self._config))
+        self.get_logger().info(inputs_in_words(self, self._inputs, self._config))
         self.create_service(Trigger, '~/reset', self._on_reset)
         # A signal between two waits of the executor wakes it from neither: it has to look.
         self.create_timer(1.0, _nothing, clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -14,6 +14,7 @@
 """Where the GNSS antenna is: GNSS messages put together to the epochs that a method takes."""
 
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
@@ -67,6 +68,11 @@ class AntennaEpoch:
     velocity_covariance: Array
     position_measured: bool
     position_covariance: Array
+
+
+def velocities_of(epochs: Sequence[AntennaEpoch]) -> Array:
+    """Return the velocities of K epochs, shape (K, 3), zero where there is none."""
+    return np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n for epoch in epochs])
 
 
 class Antenna:

@@ -45,10 +45,6 @@ BEYOND_THE_POLES = 'latitudes are beyond the poles: they are exchanged with the 
 CELLS, GNSS_MESSAGES = 600, 3000  # kept of the latest data: 5 minutes, at up to 10 Hz
 
 
-def turn_fault_placeholder() -> None:
-    """Be replaced."""
-
-
 def degrees_fault(max_rate: float, ratio: float | None) -> str:
     """
     Say that angular rates are in deg/s; empty where they are not.

@@ -45,7 +45,7 @@ class ReasonLog:
 
     def note(self, text: str, now: float) -> None:
         """Take a state with its reason for logged."""
-        kinds = [_NUMBER.sub('#', part) for part in text.split('; ')]
+        kinds = [_kind(part) for part in text.split('; ')]
         self._present.update(kinds)
         self._logged.update(dict.fromkeys(kinds, now))
 
@@ -65,12 +65,17 @@ class ReasonLog:
         """
         self._logged = {kind: when for kind, when in self._logged.items()
                         if now - when < LOG_AGAIN}
-        before, kinds = self._present, [_NUMBER.sub('#', part) for part in parts]
+        before, kinds = self._present, [_kind(part) for part in parts]
         self._present = set(kinds)
         found = [(part, kind in before) for part, kind in zip(parts, kinds)
                  if kind not in self._logged and (again or kind not in before)]
-        self._logged.update((_NUMBER.sub('#', part), now) for part, _ in found)
+        self._logged.update((_kind(part), now) for part, _ in found)
         return found
+
+
+def _kind(part: str) -> str:
+    """Return a part of a reason without its numbers."""
+    return _NUMBER.sub('#', part)
 
 
 def type_name(msg_type: type) -> str:
@@ -78,7 +83,7 @@ def type_name(msg_type: type) -> str:
     return f'{msg_type.__module__.split(".")[0]}/msg/{msg_type.__name__}'
 
 
-def in_words(node: Node, inputs: Mapping[str, type], config: Config) -> str:
+def inputs_in_words(node: Node, inputs: Mapping[str, type], config: Config) -> str:
     """Say what a node reads, and with which parameters."""
     topics = ', '.join(f'{node.resolve_topic_name(topic)} ({_short(type_name(msg_type))})'
                        for topic, msg_type in inputs.items())

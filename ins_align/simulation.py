@@ -167,15 +167,21 @@ def epochs_of(aligner: Any, simulation: Simulation, *, fix: bool = True,
               velocity: bool = True) -> Iterator[Any]:
     """Do as `feed`, and yield the epochs as they come."""
     for count, (kind, payload) in enumerate(simulation.messages()):
-        if kind == 'imu':
-            aligner.add_imu(*payload)
-        elif kind == 'fix' and fix:
-            aligner.add_fix(payload)
-        elif kind == 'velocity' and velocity:
-            aligner.add_velocity(payload)
+        if kind == 'imu' or (fix if kind == 'fix' else velocity):
+            give(aligner, kind, payload)
         if count % FEED_BLOCK == 0:
             yield from aligner.update()
     yield from aligner.flush()
+
+
+def give(aligner: Any, kind: str, payload: Any) -> None:
+    """Give an aligner one of the messages of a simulation."""
+    if kind == 'imu':
+        aligner.add_imu(*payload)
+    elif kind == 'fix':
+        aligner.add_fix(payload)
+    else:
+        aligner.add_velocity(payload)
 
 
 def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0,

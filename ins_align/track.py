@@ -13,8 +13,10 @@
 # limitations under the License.
 """The antenna's way in a frame that does not rotate."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from ins_align.antenna import AntennaEpoch
 from ins_align.earth import (
     earth_rate_n, gravitation_n, gravity_n, ground_velocity_n, LocalLevel, position_n)
 from ins_align.rotation import Array, cross, running_sum
@@ -109,6 +111,13 @@ class InertialTrack:
              - time[:, None] * self.origin_v - int_int_gravitation),
             seen(gravity_here), gravitation, int_gravitation, int_int_gravitation,
             self.origin_r, self.origin_v)
+
+    def along(self, epochs: Sequence[AntennaEpoch], t0_ns: int) -> 'InertialTrack':
+        """Follow the antenna through GNSS epochs; `t0_ns` is the stamp of t0."""
+        return self.extended(
+            np.array([epoch.stamp_ns - t0_ns for epoch in epochs]) * 1e-9,
+            *(np.array([getattr(epoch, name) for epoch in epochs])
+              for name in ('latitude', 'longitude', 'altitude')))
 
     def at(self, index: int | tuple[()]) -> 'InertialTrack':
         """Return one epoch of a track over many; () of a track that is of one."""

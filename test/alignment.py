@@ -36,16 +36,6 @@ def config_for(simulation, **changes):
     return exact_config_for(simulation, **{**settings, **changes})
 
 
-def give(aligner, kind, payload):
-    """Give an aligner one of the messages of a simulation."""
-    if kind == 'imu':
-        aligner.add_imu(*payload)
-    elif kind == 'fix':
-        aligner.add_fix(payload)
-    else:
-        aligner.add_velocity(payload)
-
-
 def aligned(simulation, *, fix=True, velocity=True, **changes):
     """Feed a simulation to an aligner; return it and its epochs."""
     aligner = Aligner(config_for(simulation, **changes))

@@ -22,12 +22,13 @@ from collections.abc import Iterator, Sequence
 import math
 from typing import NamedTuple
 
-from ins_align.antenna import AntennaEpoch
+from ins_align.antenna import AntennaEpoch, velocities_of
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimation.declaration import Fit
 from ins_align.estimation.filter import (
-    DELAY, Filters, FIRST, GYRO, Linearised, linearised, MAX_DELAY, MIN_DELAY, PHI, PHI0, Track)
-from ins_align.estimation.rivals import in_words, log_sum, Parameters, rivals_of
+    DELAY, Filters, FIRST, GYRO, Linearised, linearised, MAX_DELAY, MIN_DELAY, PHI, PHI0, Track,
+    triads)
+from ins_align.estimation.rivals import in_words, log_sum, Parameters, rivals_of, SHARE
 from ins_align.estimation.start import (
     all_headings, HEADINGS, LOUD, OPEN_POSITION, RoughAttitude, Start)
 from ins_align.preintegration import Intervals, SensorErrors
@@ -57,7 +58,7 @@ MEMORY, BELIEVED = 300, 30
 # Parameters are linearised anew when the likeliest mean has gone so far from the point: lever arm
 # (m), delay (s), bias and matrix of the gyros (rad/s, 1) and of the accelerometers (m/s^2, 1).
 _REACH = np.array([0.2] * 3 + [0.01] + [5e-4] * 3 + [0.02] * 9 + [0.1] * 3 + [0.02] * 9)
-MAX_AHEAD = 64
+MAX_SPAN = 64
 # Beside velocities positions gain little and hurt when their errors wander: where the bank may
 # choose, it takes them when no velocity came for this long (ns), and leaves them out again when
 # velocities have come for the second.
@@ -101,10 +102,9 @@ class Bank:
         self._use_position = use_position
         self._velocity_ns = epoch.stamp_ns          # the last one
         self._velocities_since_ns: int | None = None
-        self.moved = self.restarts = 0
+        self.moved = 0
         self._rivals = rivals_of(config)
         self._signs = np.array([rival.signs for rival in self._rivals])
-        self._share_of = np.array([rival.share for rival in self._rivals])
         self._prior = np.array([rival.prior for rival in self._rivals])
         self._wrong = np.array([rival.wrong for rival in self._rivals])
         self._offered = 0
@@ -119,8 +119,9 @@ class Bank:
         self._known = [Parameters.of(self._config, rival, force) for rival in self._rivals]
         if prior is not None:
             self._remember(prior)
-        size = (self._known[0].x.size - GYRO) // 2
-        self._reach = np.concatenate([_REACH[:4 + size], _REACH[16:16 + size]])
+        gyro, accel = triads(self._known[0].x.size)
+        errors = gyro.stop - gyro.start
+        self._reach = np.concatenate([_REACH[:gyro.stop], _REACH[16:16 + errors]])
         self._filters: Filters | None = None
         self._start = Start(self._config)
         self._last = epoch                          # the last epoch that was processed
@@ -133,7 +134,7 @@ class Bank:
         self._in_a_row = 0                          # epochs that were rejected
         # n0 and the point of linearisation hold for so many epochs, of which so many are left.
         self._point: Array | None = None
-        self._ahead = self._left = 1
+        self._span = self._left = 1
         self._wait(epoch, imu)
 
     def _remember(self, learnt: Learnt) -> None:
@@ -182,14 +183,13 @@ class Bank:
             self._last = epoch
             self._left -= 1
             if self._in_a_row >= ASTRAY:
-                self.restarts += 1
                 self._begin(epoch, imu.take(slice(k, k + 1)).end())
                 yield epoch
                 return
             changed = self._choose(epoch)
             if (changed or self._left == 0 or filters.ids.size != len(model.point) or np.any(
                     np.abs(filters.x[filters.lead] - model.point) > self._reach)):
-                self._ahead = 1 if self._left else min(2 * self._ahead, MAX_AHEAD)
+                self._span = 1 if self._left else min(2 * self._span, MAX_SPAN)
                 self._anchor(filters, inertial.at(k))
                 if changed and self._use_position:
                     filters.open_position(np.zeros(3), OPEN_POSITION)
@@ -219,20 +219,16 @@ class Bank:
         self._n0_ns, self._C_nn0 = epoch.stamp_ns, np.eye(3)
         self._inertial = InertialTrack.start(epoch.latitude, epoch.longitude, epoch.altitude)
         self._point = None
-        self._left = self._ahead
+        self._left = self._span
 
     def _track_of(self, epochs: Sequence[AntennaEpoch]) -> tuple[InertialTrack, Track]:
         """Return how epochs move in n0, and what the GNSS measures of it."""
-        track = self._inertial.extended(
-            np.array([epoch.stamp_ns - self._n0_ns for epoch in epochs]) * 1e-9,
-            *(np.array([getattr(epoch, name) for epoch in epochs])
-              for name in ('latitude', 'longitude', 'altitude')))
-        v_n = np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n for epoch in epochs])
+        track = self._inertial.along(epochs, self._n0_ns)
         covariance = np.array([[epoch.velocity_covariance, epoch.position_covariance]
                                for epoch in epochs])
         C_n0n = track.C_n0n[:, None]
         return track, Track(
-            np.stack([track.s_v(v_n), track.s_p], axis=1),
+            np.stack([track.s_v(velocities_of(epochs)), track.s_p], axis=1),
             C_n0n @ covariance @ C_n0n.swapaxes(-1, -2),
             [(epoch.v_n is not None, epoch.position_measured and self._use_position)
              for epoch in epochs], track.C_n0n)
@@ -245,10 +241,8 @@ class Bank:
 
     def _model(self, filters: Filters, point: Array, imu: Intervals) -> Linearised:
         """Linearise epochs."""
-        ids = filters.ids
-        shares = self._share_of[ids, None, None]
-        return linearised(point, imu.mirrored(self._signs[ids]),
-                          imu.Q[:, None] + shares * imu.Q_excess[:, None], self._use_position)
+        return linearised(point, imu.mirrored(self._signs[filters.ids]),
+                          (imu.Q + SHARE * imu.Q_excess)[:, None], self._use_position)
 
     def _anchor(self, filters: Filters, track: InertialTrack) -> None:
         """Freeze n0 at the last epoch that was processed; the track is there."""
@@ -286,8 +280,15 @@ class Bank:
 
     def _best(self, filters: Filters) -> int:
         """Return the place of the likeliest level."""
-        return int(np.argmax(np.where(self._wrong[filters.ids], -np.inf,
-                                      filters.evidence + self._prior[filters.ids])))
+        return int(np.argmax(self._of_levels(filters)))
+
+    def _posterior(self, filters: Filters) -> Array:
+        """Return the log of how likely each rival is, but for a constant, shape (M,)."""
+        return filters.evidence + self._prior[filters.ids]
+
+    def _of_levels(self, filters: Filters) -> Array:
+        """Return the same where those that are wrong are out of the question."""
+        return np.where(self._wrong[filters.ids], -np.inf, self._posterior(filters))
 
     def _hear(self, kind: int, square: float, normalised: Array) -> None:
         """Follow the noise of the receiver: how large it is, and how long errors last."""
@@ -315,7 +316,7 @@ class Bank:
         if len(filters.C) == 1:
             return
         wrong = self._wrong[ids]
-        level = filters.evidence + self._prior[ids]
+        level = self._posterior(filters)
         best = np.max(level[~wrong])
         filters.evidence = np.where(wrong, filters.evidence,
                                     np.maximum(level, best - LEAST) - self._prior[ids])
@@ -372,9 +373,8 @@ class Bank:
 
     def _shares_of(self, filters: Filters) -> Array:
         """Return the weight of each mean in the mixture."""
-        ids = filters.ids
-        evidence = np.where(self._wrong[ids], -np.inf, filters.evidence + self._prior[ids])
-        share = np.exp(evidence - evidence.max())
+        level = self._of_levels(filters)
+        share = np.exp(level - level.max())
         return (share / share.sum())[filters.place] * np.exp(filters.weight)
 
     def _mixture(self, C: Array, block: slice) -> tuple[Array, Array]:
@@ -437,8 +437,8 @@ class Bank:
     def _ahead_of(self, filters: Filters) -> Array:
         """Return how much likelier each rival that is wrong is than all levels, shape (M,)."""
         wrong = self._wrong[filters.ids]
-        evidence = filters.evidence + self._prior[filters.ids]
-        ahead = np.where(wrong, evidence - log_sum(evidence[~wrong]), -np.inf)
+        level = self._posterior(filters)
+        ahead = np.where(wrong, level - log_sum(level[~wrong]), -np.inf)
         return np.asarray(ahead / max(self._misfit, 1.0))
 
     def _doubt(self) -> tuple[str, bool]:
@@ -496,18 +496,17 @@ class Bank:
         """Return biases, lever arm and delay."""
         x, P = self._body()
         std = np.sqrt(np.diag(P))
-        size = (x.size - GYRO) // 2
-        gyro, accel = slice(GYRO, GYRO + 3), slice(GYRO + size, GYRO + size + 3)
+        gyro, accel = (slice(triad.start, triad.start + 3) for triad in triads(x.size))
         return Nuisance(x[gyro], std[gyro], x[accel], std[accel], x[:3], std[:3],
                         float(self._config.gnss_delay + x[DELAY]), float(std[DELAY]))
 
     def sensor_errors(self) -> SensorErrors:
         """Return the errors of gyros and accelerometers at the last epoch."""
         x, _ = self._body()
-        size = (x.size - GYRO) // 2
-        full = np.zeros(24)
-        full[:size], full[12:12 + size] = x[GYRO:GYRO + size], x[GYRO + size:]
-        return SensorErrors.of(full)
+        full = np.zeros((2, 12))
+        for errors, triad in zip(full, triads(x.size)):
+            errors[:triad.stop - triad.start] = x[triad]
+        return SensorErrors.of(full.ravel())
 
     def learnt(self) -> Learnt | None:
         """Return what a fresh start may keep; None where the bank has gone astray."""

@@ -46,6 +46,12 @@ GATE = 25.0
 _EYE = np.eye(3)
 
 
+def triads(m: int) -> tuple[slice, slice]:
+    """Return the places of the errors of gyros and accelerometers among m parameters."""
+    middle = (GYRO + m) // 2
+    return slice(GYRO, middle), slice(middle, m)
+
+
 @dataclass
 class Track:
     """
@@ -118,7 +124,7 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool) 
         `MAX_DELAY`.
     interval : Intervals
         Before each epoch, as each of the rivals has them: leading axes (K, M).
-    Q : ndarray, shape (K, M, 9, 9)
+    Q : ndarray, shape (K, 1, 9, 9)
         Covariance of (rotation, velocity, position), in the frame at the start.
     use_position : bool
         Whether positions are measurements.
@@ -126,8 +132,8 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool) 
     """
     M, m = point.shape
     K = interval.duration.size
-    size = (m - GYRO) // 2                      # errors of a triad: its bias, or its matrix too
-    gyro, accel = slice(GYRO, GYRO + size), slice(GYRO + size, m)
+    gyro, accel = triads(m)
+    size = m - accel.start                      # errors of a triad: its bias, or its matrix too
     J = np.zeros((K, M, 9, m))
     J[:, :, PHI, gyro], J[:, :, XI, gyro] = interval.J_Rg[..., :size], interval.J_vg[..., :size]
     J[:, :, RHO, gyro], J[:, :, XI, accel] = interval.J_pg[..., :size], interval.J_va[..., :size]
@@ -150,7 +156,7 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool) 
     turn = np.zeros((K, M, 9, 9))
     turn[..., PHI, PHI] = turn[..., XI, XI] = turn[..., RHO, RHO] = T
     turn[..., RHO, XI] = -delay * T
-    seen = _Seen(point, interval, size)
+    seen = _Seen(point, interval)
     H, expected = np.zeros((K, 2, M, 3, FIRST + m)), np.zeros((K, 2, M, 3))
     H[:, 0], expected[:, 0] = seen.velocity()
     if use_position:
@@ -162,10 +168,10 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool) 
 class _Seen:
     """What a receiver sees whose measurements are late, in the body frame; K epochs, M rivals."""
 
-    def __init__(self, point: Array, interval: Intervals, size: int) -> None:
+    def __init__(self, point: Array, interval: Intervals) -> None:
         """Lead back from the epochs to the moments that were measured."""
-        self.size, self.shape = size, interval.R.shape[:2] + (3, FIRST + point.shape[1])
-        gyro, accel = (point[:, GYRO + k * size:GYRO + (k + 1) * size] for k in (0, 1))
+        self.shape = interval.R.shape[:2] + (3, FIRST + point.shape[1])
+        gyro, accel = (point[:, triad] for triad in triads(point.shape[1]))
         self.lever = np.broadcast_to(point[:, LEVER_ARM], interval.omega.shape)
         self.delay = delay = float(point[0, DELAY])
         force, self.gained, self.gained_p = exact(interval.gained, delay)
@@ -176,7 +182,7 @@ class _Seen:
         def corrected(measured: Array, errors: Array, biases: float) -> Array:
             """Return what a triad measured without its errors."""
             true = measured - biases * errors[:, :3]
-            if size > 3:
+            if errors.shape[1] > 3:
                 true = true - apply(errors[:, 3:].reshape(-1, 3, 3), measured)
             return true
 
@@ -221,9 +227,9 @@ class _Seen:
         H = np.zeros(self.shape)
         x = H[..., FIRST:]
         H[..., PHI], x[..., LEVER_ARM], x[..., DELAY] = to_phi, to_lever, to_delay
-        gyro, accel = x[..., GYRO:GYRO + self.size], x[..., GYRO + self.size:]
+        gyro, accel = (x[..., triad] for triad in triads(x.shape[-1]))
         gyro[..., :3], accel[..., :3] = to_gyro_bias, to_accel_bias * _EYE
-        if self.size > 3:
+        if gyro.shape[-1] > 3:
             gyro[..., 3:] = by_row(to_rate, self.rate) + by_row(to_turn, self.turned)
             accel[..., 3:] = by_row(np.broadcast_to(_EYE, to_turn.shape), force)
         return H

@@ -310,7 +310,7 @@ class NoteMethod:
             self._body.advance(imu, k)
             time = (epoch.stamp_ns - self.t0_ns) * 1e-9
             place = epoch.latitude, epoch.longitude, epoch.altitude
-            self._track = self._track.extended(*np.array([time, *place])[:, None]).at(0)
+            self._track = self._track.along([epoch], self.t0_ns).at(0)
             if epoch.v_n is not None and self._navigation is not None:
                 self._navigation.advance(time, *place, epoch.v_n)
             self._pair(epoch)

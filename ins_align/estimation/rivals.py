@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import math
 
 from ins_align.config import Config, PRESETS
-from ins_align.estimation.filter import DELAY, FIRST, GYRO, LEVER_ARM
+from ins_align.estimation.filter import DELAY, FIRST, GYRO, LEVER_ARM, triads
 from ins_align.rotation import Array
 import numpy as np
 
@@ -54,8 +54,6 @@ class Rival:
         Of the gyros x, y, z and of the accelerometers.
     gyro : float
         Factor on the gyros' bias and rate random walk.
-    share : float
-        Of the IMU's measured noise beyond the stated one that is believed.
     lever_arm_std, gnss_delay_std, gyro_bias_std, accel_bias_std : float
         At least so much (SI).
     prior : float
@@ -67,7 +65,6 @@ class Rival:
     advice: str = 'check the IMU axes'
     signs: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     gyro: float = 1.0
-    share: float = SHARE
     lever_arm_std: float = 0.0
     gnss_delay_std: float = 0.0
     gyro_bias_std: float = 0.0
@@ -150,9 +147,9 @@ class Parameters:
 
         """
         noise = config.imu_noise
-        size = 12 if noise.gyro_scale_std > 0 else 3
-        accel = GYRO + size
-        x, std, walk = np.zeros((3, GYRO + 2 * size))
+        matrices = noise.gyro_scale_std > 0
+        x, std, walk = np.zeros((3, GYRO + (24 if matrices else 6)))
+        accel = triads(x.size)[1].start
         x[LEVER_ARM] = config.lever_arm
         std[LEVER_ARM] = max(config.lever_arm_std, rival.lever_arm_std)
         std[DELAY] = max(config.gnss_delay_std, rival.gnss_delay_std)
@@ -162,9 +159,9 @@ class Parameters:
         walk[GYRO:GYRO + 3] = (rival.gyro * noise.rate_random_walk) ** 2
         walk[accel:accel + 3] = (ACCEL_WANDER * noise.accel_bias_std) ** 2 / WANDER_TIME
         P = np.diag(std ** 2)
-        if size > 3:
-            matrix = noise.gyro_scale_std * np.where(np.eye(3) > 0, 1.0, GYRO_MISALIGNMENT)
-            P[GYRO + 3:accel, GYRO + 3:accel] = np.diag(matrix.ravel() ** 2)
+        if matrices:
+            P[GYRO + 3:accel, GYRO + 3:accel] = np.diag(
+                gyro_matrix_std(noise.gyro_scale_std).ravel() ** 2)
             # A force f makes b + M f of bias and matrix, which has the sigma of the bias.
             scale = ACCEL_ERRORS * noise.gyro_scale_std
             told = np.eye(12)
@@ -176,16 +173,21 @@ class Parameters:
 
 def in_words(rival: Rival, x: Array, gnss_delay: float) -> str:
     """Return a sentence on a rival that the data fit better, with its parameters x."""
-    size = (x.size - GYRO) // 2
+    gyro, accel = triads(x.size)
 
     def listed(vector: Array, digits: str) -> str:
         return ', '.join(format(number, digits) for number in vector.tolist())
 
     better = rival.better.format(
         lever=listed(x[LEVER_ARM], '.2f'), delay=gnss_delay + float(x[DELAY]),
-        gyro=listed(np.degrees(x[GYRO:GYRO + 3]), '.2g'),
-        accel=listed(x[GYRO + size:GYRO + size + 3], '.2g'))
+        gyro=listed(np.degrees(x[gyro][:3]), '.2g'),
+        accel=listed(x[accel][:3], '.2g'))
     return f'the data fit better with {better}: {rival.advice}'
+
+
+def gyro_matrix_std(scale_std: float) -> Array:
+    """Return sigmas of scale factors (diagonal) and misalignment of the gyros, shape (3, 3)."""
+    return scale_std * np.where(np.eye(3) > 0, 1.0, GYRO_MISALIGNMENT)
 
 
 def log_sum(values: Array) -> float:

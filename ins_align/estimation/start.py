@@ -22,7 +22,7 @@ from dataclasses import replace
 import math
 from typing import NamedTuple
 
-from ins_align.antenna import AntennaEpoch
+from ins_align.antenna import AntennaEpoch, velocities_of
 from ins_align.config import Config
 from ins_align.estimation.filter import FIRST, PHI, PHI0, RHO, XI
 from ins_align.estimation.formula import AttitudeMoments
@@ -153,19 +153,16 @@ class Start:
     def _pairs(self, kind: int) -> tuple[Array, Array, Array]:
         """Return the times and the vectors of the formula, free start, for all epochs."""
         epochs, imu, first = self.epochs, self.imu, self.epochs[0]
-        time = np.array([epoch.stamp_ns - first.stamp_ns for epoch in epochs]) * 1e-9
-        track = InertialTrack.start(first.latitude, first.longitude, first.altitude).extended(
-            time, *(np.array([getattr(epoch, name) for epoch in epochs])
-                    for name in ('latitude', 'longitude', 'altitude')))
+        track = InertialTrack.start(first.latitude, first.longitude, first.altitude).along(
+            epochs, first.stamp_ns)
         C = np.concatenate([np.eye(3)[None], cumulative_rotations(imu.R)])
         steps = apply(C[:-1], imu.v)
         v = np.cumsum(steps, axis=0)
         if kind:
             p = np.cumsum(imu.duration[:, None] * (v - steps) + apply(C[:-1], imu.p), axis=0)
-            return time, track.s_p, p + C[1:] @ self._lever
-        v_n = np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n for epoch in epochs])
+            return track.time, track.s_p, p + C[1:] @ self._lever
         swing = cross(imu.omega, np.broadcast_to(self._lever, imu.omega.shape))
-        return time, track.s_v(v_n), v + apply(C[1:], swing)
+        return track.time, track.s_v(velocities_of(epochs)), v + apply(C[1:], swing)
 
     def _variance(self, kind: int) -> Array:
         """Return what the receiver states; a vertical that is not measured is taken as steady."""

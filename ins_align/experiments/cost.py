@@ -24,7 +24,7 @@ from ins_align.aligner import Aligner
 from ins_align.config import Config
 from ins_align.experiments.common import config_for, exact_config_for, parallel, Report
 from ins_align.report import new_figure
-from ins_align.simulation import simulate
+from ins_align.simulation import give, simulate
 import numpy as np
 
 MINUTES = 60
@@ -72,13 +72,9 @@ def run_case(task: tuple[str, float]) -> dict[str, Any]:
     end_ns = simulation.imu_stamps_ns[0] + 60_000_000_000
     for kind, payload in simulation.messages():
         start = time.process_time()
+        give(aligner, kind, payload)
         if kind == 'imu':
-            aligner.add_imu(*payload)
             epochs += len(aligner.update())
-        elif kind == 'fix':
-            aligner.add_fix(payload)
-        else:
-            aligner.add_velocity(payload)
         used = time.process_time() - start
         spent += used
         largest = max(largest, used)

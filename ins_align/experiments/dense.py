@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import math
 
 from ins_align.config import ImuNoise, STANDARD_GRAVITY
-from ins_align.estimation.rivals import ACCEL_ERRORS, GYRO_MISALIGNMENT
+from ins_align.estimation.rivals import ACCEL_ERRORS, gyro_matrix_std
 from ins_align.messages import ENU_FROM_NED
 from ins_align.rotation import Array, Index, skew
 from ins_align.simulation import Simulation
@@ -541,8 +541,7 @@ def _prior(simulation: Simulation, noise: ImuNoise, use_position: bool, lever_ar
     std[START_VELOCITY] = math.inf
     std[START_POSITION] = math.inf if use_position else 0.0
     std[GYRO_BIAS] = noise.gyro_bias_std
-    std[GYRO_MATRIX] = noise.gyro_scale_std * np.where(
-        np.eye(3) > 0, 1.0, GYRO_MISALIGNMENT).ravel()
+    std[GYRO_MATRIX] = gyro_matrix_std(noise.gyro_scale_std).ravel()
     std[ACCEL_BIAS] = noise.accel_bias_std
     std[ACCEL_MATRIX] = ACCEL_ERRORS * noise.gyro_scale_std
     std[LEVER_ARM], std[DELAY] = lever_arm_std, delay_std

@@ -34,7 +34,7 @@ from ins_align.experiments.common import config_for, error_of, parallel, Report
 from ins_align.experiments.spoilt import SECOND, Stream, stream_of
 from ins_align.messages import Fix, Velocity
 from ins_align.rotation import Array
-from ins_align.simulation import simulate, Simulation
+from ins_align.simulation import give, simulate, Simulation
 import numpy as np
 
 RUNS = 24
@@ -301,11 +301,7 @@ def follow(aligner: Aligner, sent: Iterator[Message],
     for now, kind, payload in sent:
         if kind == 'imu':
             start = start or int(payload[0][0])
-            aligner.add_imu(*payload)
-        elif kind == 'fix':
-            aligner.add_fix(payload)
-        else:
-            aligner.add_velocity(payload)
+        give(aligner, kind, payload)
         if between or now >= due:
             seen += look(aligner, aligner.update(), between)
             due = now + round(UPDATE_EVERY * SECOND)
