@@ -65,7 +65,7 @@ setup(
     entry_points={
         'console_scripts': [
             'ins_align = ins_align.cli:main',
-            'ins_align_node = ins_align.node:main',
+            'ins_align_node = ins_align.ros.main:main',
         ],
     },
 )

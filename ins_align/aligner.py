@@ -23,15 +23,15 @@ from collections import Counter
 from copy import copy
 
 from ins_align.alignment import Alignment
-from ins_align.buffers import MAX_GAP_NS
 from ins_align.config import Config, ConfigError, parameters
-from ins_align.earth import EARTH_RATE
+from ins_align.geometry.earth import EARTH_RATE
+from ins_align.geometry.rotation import Array
+from ins_align.gnss.messages import Fix, Velocity
+from ins_align.imu.buffer import MAX_GAP_NS
+from ins_align.imu.plausibility import IMU_BEFORE, without_spikes
+from ins_align.imu.prediction import Prediction
 from ins_align.intake import Intake
-from ins_align.messages import Fix, Velocity
-from ins_align.plausibility import IMU_BEFORE, without_spikes
-from ins_align.prediction import Prediction
 from ins_align.results import Attitude, Epoch, Event, Severity, State, Status
-from ins_align.rotation import Array
 import numpy as np
 
 __all__ = ['Aligner', 'Attitude', 'Epoch', 'State', 'Status']

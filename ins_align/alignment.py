@@ -24,11 +24,10 @@ from ins_align.config import Config
 from ins_align.estimation.bank import Bank, Learnt
 from ins_align.estimation.declaration import Declaration
 from ins_align.estimation.formula import NoteMethod
+from ins_align.imu.plausibility import ForceCheck
+from ins_align.imu.preintegration import SensorErrors
 from ins_align.intake import Afresh, Located, Loss, Run, Start, Step, Wait
-from ins_align.plausibility import ForceCheck
-from ins_align.preintegration import SensorErrors
-from ins_align.results import (
-    Attitude, Epoch, Event, Nuisance, Severity, State, Status, Verdict)
+from ins_align.results import Attitude, Epoch, Event, Nuisance, Severity, State, Status, Verdict
 import numpy as np
 
 _DECLARED = {State.LEVELLED: 1, State.ALIGNED: 2}

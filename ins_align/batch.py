@@ -35,7 +35,7 @@ from typing import Any
 from ins_align.ahead import ProcessDied
 from ins_align.config import Config
 from ins_align.recordings import BagError
-from ins_align.replay import replay
+from ins_align.recordings.replay import replay
 from ins_align.report import plot, save_figure, summary, write_whole
 
 CONNECT_TIMEOUT = 10.0  # s, to the scheduler of a Dask cluster

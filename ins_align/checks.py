@@ -24,13 +24,14 @@ from collections.abc import Sequence
 import math
 from typing import Union
 
-from ins_align.buffers import fault_of_fix, MAX_ACCELERATION, MAX_RATE, usable_velocity
 from ins_align.config import Config
-from ins_align.messages import Fix, Velocity
-from ins_align.motion_survey import (
-    GRID, on_grid, Series, track, velocity_frame, velocity_from_positions,
-    VelocityFrame, without_wild_positions)
-from ins_align.rotation import Array, Index
+from ins_align.geometry.rotation import Array, Index
+from ins_align.gnss.messages import Fix, Velocity
+from ins_align.gnss.buffer import fault_of_fix, usable_velocity
+from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
+from ins_align.recordings.motion_survey import (
+    GRID, on_grid, Series, track, velocity_frame, velocity_from_positions, VelocityFrame,
+    without_wild_positions)
 import numpy as np
 
 MIN_COURSE_SPEED = 2.0  # m/s above which a course means something

@@ -348,7 +348,7 @@ def run_info(arguments: argparse.Namespace) -> int:
     """Run ``ins_align info``."""
     _check_writable(arguments.json, arguments.bags)
     from ins_align.recordings import BagError
-    from ins_align.info import describe, inspect
+    from ins_align.recordings.info import describe, inspect
 
     several = len(arguments.bags) > 1
     objects: list[dict[str, Any]] = []
@@ -566,8 +566,8 @@ def _missing(error: ModuleNotFoundError) -> UsageError:
 
 def run_simulate(arguments: argparse.Namespace) -> int:
     """Run ``ins_align simulate``."""
-    from ins_align.simulation import simulate, write_bag
-    from ins_align.simulation_arguments import SimulationError
+    from ins_align.simulation.arguments import SimulationError
+    from ins_align.simulation.simulate import simulate, write_bag
 
     options = {name: value for name, value in vars(arguments).items()
                if name not in ('command', 'run', 'parser', 'out', 'storage', 'scenario')}

@@ -22,15 +22,16 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import NamedTuple, Union
 
-from ins_align.antenna import Antenna, AntennaEpoch
-from ins_align.buffers import GnssBuffer, GnssEpoch, ImuBuffer, MAX_GAP_NS, PAIR_NS
 from ins_align.config import Config
-from ins_align.imu_steps import ImuCutter
-from ins_align.messages import Fix, Velocity
-from ins_align.plausibility import stuck
-from ins_align.preintegration import Intervals
+from ins_align.geometry.rotation import Array
+from ins_align.gnss.antenna import Antenna, AntennaEpoch
+from ins_align.gnss.messages import Fix, Velocity
+from ins_align.gnss.buffer import GnssBuffer, GnssEpoch, PAIR_NS
+from ins_align.imu.buffer import ImuBuffer, MAX_GAP_NS
+from ins_align.imu.cutter import ImuCutter
+from ins_align.imu.plausibility import stuck
+from ins_align.imu.preintegration import Intervals
 from ins_align.results import State, Verdict
-from ins_align.rotation import Array
 import numpy as np
 
 # Without GNSS an epoch without measurement is made this often, which bounds the buffer (ns).

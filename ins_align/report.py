@@ -29,7 +29,7 @@ from ins_align.results import Epoch, State
 import numpy as np
 
 if TYPE_CHECKING:
-    from ins_align.replay import ReplayResult
+    from ins_align.recordings.replay import ReplayResult
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 

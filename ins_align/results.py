@@ -18,7 +18,7 @@ from enum import Enum
 from functools import cached_property
 from typing import NamedTuple
 
-from ins_align.rotation import Array, quaternion_from_matrix, roll_pitch_yaw
+from ins_align.geometry.rotation import Array, quaternion_from_matrix, roll_pitch_yaw
 import numpy as np
 
 

@@ -17,8 +17,8 @@ from functools import lru_cache
 
 from ins_align.aligner import Aligner
 from ins_align.experiments.common import exact_config_for
-from ins_align.rotation import log_so3, matrix_from_quaternion
-from ins_align.simulation import feed, simulate
+from ins_align.geometry.rotation import log_so3, matrix_from_quaternion
+from ins_align.simulation.simulate import feed, simulate
 import numpy as np
 
 LEVER = (1.0, 1.0, 1.0)

@@ -26,9 +26,9 @@ import time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped, TwistWithCovarianceStamped
 from ins_align.config import Config
+from ins_align.geometry.rotation import log_so3, matrix_from_quaternion
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.reader import choose_topics
-from ins_align.rotation import log_so3, matrix_from_quaternion
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -49,7 +49,7 @@ class NodeProcess:
     """`ins_align_node` in a process of its own."""
 
     def __init__(self, parameters=(), arguments=()):
-        command = [sys.executable, '-m', 'ins_align.node', '--ros-args']
+        command = [sys.executable, '-m', 'ins_align.ros.main', '--ros-args']
         for parameter in parameters:
             command += ['-p', parameter]
         self._process = subprocess.Popen(

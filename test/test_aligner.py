@@ -16,14 +16,13 @@
 from dataclasses import replace
 import math
 
-from alignment import (aligned, config_for, error_deg, error_of, LEVER,
-                       normalised_error, simulated)
+from alignment import aligned, config_for, error_deg, error_of, LEVER, normalised_error, simulated
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config, ConfigError, ImuNoise, PRESETS
+from ins_align.geometry.rotation import exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw
 from ins_align.results import Severity
-from ins_align.rotation import exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw
-from ins_align.scenarios import Motion, Scenario, SCENARIOS
-from ins_align.simulation import feed, give
+from ins_align.simulation.scenarios import Motion, Scenario, SCENARIOS
+from ins_align.simulation.simulate import feed, give
 import numpy as np
 import pytest
 from scipy.stats import chi2

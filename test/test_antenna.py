@@ -16,10 +16,10 @@
 from collections import Counter
 import math
 
-from ins_align.antenna import Antenna, StatedNoise
-from ins_align.buffers import GnssEpoch, with_an_altitude
 from ins_align.config import Config
-from ins_align.messages import Fix, Velocity
+from ins_align.gnss.antenna import Antenna, StatedNoise
+from ins_align.gnss.messages import Fix, Velocity
+from ins_align.gnss.buffer import GnssEpoch, with_an_altitude
 import numpy as np
 import pytest
 

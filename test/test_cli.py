@@ -28,7 +28,7 @@ import sys
 import termios
 
 from ins_align.cli import _labels, main, SCENARIOS
-from ins_align.trajectory import trajectory_of
+from ins_align.simulation.trajectory import trajectory_of
 import pytest
 from recordings import FIX, IMU, messages_of, real_recording, TWIST, write_recording
 
@@ -190,7 +190,7 @@ def _killed(request):
 
 
 def test_a_process_that_is_killed_while_it_reads(flight, monkeypatch, capsys):
-    monkeypatch.setattr('ins_align.replay._prepared', _killed)
+    monkeypatch.setattr('ins_align.recordings.replay._prepared', _killed)
     assert main(['replay', str(flight), '--jobs', '2']) == 2
     error = capsys.readouterr().err
     assert error.count('\n') == 1 and 'a process died on the way' in error
@@ -383,7 +383,7 @@ def test_real_recordings(tmp_path, capsys, name, method):
 
 
 def test_failed_output_leaves_the_old_file(flight, tmp_path, capsys, monkeypatch):
-    from ins_align import replay
+    from ins_align.recordings import replay
     (tmp_path / 'a.csv').write_text('old')
     monkeypatch.setattr(replay.ReplayResult, 'to_csv', lambda self: 1 / 0)
     with pytest.raises(ZeroDivisionError):
@@ -421,7 +421,7 @@ def test_simulate_passes_its_options_on(tmp_path, capsys):
 
 
 def test_help_names_the_scenarios():
-    from ins_align.simulation import SCENARIOS as simulated
+    from ins_align.simulation.simulate import SCENARIOS as simulated
     assert SCENARIOS.split(', ') == list(simulated)
 
 

@@ -23,7 +23,7 @@ import threading
 import time
 
 from ins_align.cli import main
-from ins_align.simulation import simulate, write_bag
+from ins_align.simulation.simulate import simulate, write_bag
 import pytest
 
 distributed = pytest.importorskip('distributed')

@@ -13,8 +13,8 @@
 # limitations under the License.
 """The Earth against python-ins, closed forms and finite differences."""
 
-from ins_align import earth
-from ins_align.messages import ENU_FROM_NED
+from ins_align.geometry import earth
+from ins_align.gnss.messages import ENU_FROM_NED
 import numpy as np
 from pyins import earth as reference
 from pyins import transform

@@ -22,12 +22,12 @@ from ins_align.estimation.bank import Bank, RESOLVED_STD
 from ins_align.estimation.filter import DELAY, Filters, FIRST, GYRO, linearised, PHI, PHI0
 from ins_align.estimation.rivals import SIGNS
 from ins_align.experiments.dense import bound, dense_solution
-from ins_align.intake import Intake, Run, Start
-from ins_align.preintegration import (
+from ins_align.geometry.rotation import exp_so3, log_so3, skew
+from ins_align.imu.preintegration import (
     Intervals, Noise, preintegrate, SensorErrors, split_at_epochs)
-from ins_align.recent import recent_motion
+from ins_align.imu.recent import recent_motion
+from ins_align.intake import Intake, Run, Start
 from ins_align.results import Attitude
-from ins_align.rotation import exp_so3, log_so3, skew
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp

@@ -22,8 +22,8 @@ from ins_align.aligner import Aligner, Attitude, State
 from ins_align.config import PRESETS
 from ins_align.experiments import (
     bound, common, compare, cost, declare, note, recorded, spoilt, weak_spots)
-from ins_align.rotation import exp_so3, matrix_from_rpy
-from ins_align.simulation import simulate, write_bag
+from ins_align.geometry.rotation import exp_so3, matrix_from_rpy
+from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
 import pytest
 

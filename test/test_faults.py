@@ -18,7 +18,7 @@ import json
 from ins_align import experiments
 from ins_align.aligner import Aligner
 from ins_align.experiments import faults, spoilt
-from ins_align.simulation import simulate
+from ins_align.simulation.simulate import simulate
 import numpy as np
 import pytest
 

@@ -15,13 +15,13 @@
 
 from functools import lru_cache
 
-from ins_align.earth import EARTH_RATE, earth_rate_n
 from ins_align.estimation import formula
+from ins_align.estimation.track import InertialTrack
 from ins_align.experiments.dense import bound
 from ins_align.experiments.note import exact_lever_remainder
-from ins_align.preintegration import Noise, preintegrate, SensorErrors, split_at_epochs
-from ins_align.simulation import simulate
-from ins_align.track import InertialTrack
+from ins_align.geometry.earth import EARTH_RATE, earth_rate_n
+from ins_align.imu.preintegration import Noise, preintegrate, SensorErrors, split_at_epochs
+from ins_align.simulation.simulate import simulate
 import numpy as np
 import pytest
 from scipy.integrate import quad_vec
@@ -186,7 +186,7 @@ class ClosedForm:
 
 
 def test_positions_alone_are_the_integrated_velocity_form():
-    from ins_align.earth import gravity_n, LocalLevel
+    from ins_align.geometry.earth import gravity_n, LocalLevel
     course, end = ClosedForm(), 100.0
     start = course.lla(0.0)
     level = LocalLevel(*start[:2])
@@ -220,7 +220,7 @@ def test_positions_alone_are_the_integrated_velocity_form():
 
 def test_navigation_integrals_are_the_integrals_they_are_named_after():
     course, end, step = ClosedForm(), 20.0, 0.1
-    from ins_align.earth import gravity_n, LocalLevel
+    from ins_align.geometry.earth import gravity_n, LocalLevel
     level = LocalLevel(*course.lla(0.0)[:2])
     navigation = formula.NavigationIntegrals(*course.lla(0.0), course.v_n(0.0))
     for k in range(1, int(end / step) + 1):

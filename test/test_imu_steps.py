@@ -15,9 +15,9 @@
 
 from collections import Counter
 
-from ins_align.buffers import ImuBuffer
 from ins_align.config import ImuNoise
-from ins_align.imu_steps import GAP_ANGULAR_ACCELERATION, GAP_JERK, ImuCutter
+from ins_align.imu.buffer import ImuBuffer
+from ins_align.imu.cutter import GAP_ANGULAR_ACCELERATION, GAP_JERK, ImuCutter
 import numpy as np
 import pytest
 

@@ -18,9 +18,9 @@ from types import FunctionType, ModuleType
 
 from alignment import config_for, normalised_error, simulated
 from ins_align.aligner import Aligner, State
-from ins_align.earth import EARTH_RATE, matrix_earth_turned
-from ins_align.prediction import Prediction
-from ins_align.rotation import exp_so3, orthonormalized
+from ins_align.geometry.earth import EARTH_RATE, matrix_earth_turned
+from ins_align.geometry.rotation import exp_so3, orthonormalized
+from ins_align.imu.prediction import Prediction
 import numpy as np
 import pytest
 from scipy.stats import chi2

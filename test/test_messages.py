@@ -16,7 +16,7 @@
 from types import SimpleNamespace as Msg
 
 from ins_align.config import Config
-from ins_align.messages import (
+from ins_align.gnss.messages import (
     _usable_covariances, fix_from_msg, imu_from_msg, MessageError, stamp_from_msg,
     velocity_from_msg)
 import numpy as np

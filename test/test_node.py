@@ -62,7 +62,7 @@ def test_what_is_wrong_at_start_is_refused_with_a_sentence():
 def test_without_ros_it_says_what_to_do():
     hide = "import sys; sys.modules.update(dict.fromkeys(['rclpy', 'diagnostic_msgs']))"
     done = subprocess.run(
-        [sys.executable, '-c', f'{hide}; from ins_align.node import main; sys.exit(main([]))'],
+        [sys.executable, '-c', f'{hide}; from ins_align.ros.main import main; sys.exit(main([]))'],
         capture_output=True, text=True)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
     assert 'source /opt/ros/jazzy/setup.bash' in done.stderr

@@ -19,8 +19,8 @@ import re
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
-from ins_align.rotation import matrix_from_quaternion
-from ins_align.simulation import simulate
+from ins_align.geometry.rotation import matrix_from_quaternion
+from ins_align.simulation.simulate import simulate
 from nav_msgs.msg import Odometry
 from node_harness import (
     attitude_error_deg, FIX, IMU, Listener, play, RELIABLE, running_node, script_of,

@@ -15,7 +15,7 @@
 
 import json
 
-from ins_align.simulation import simulate, write_bag
+from ins_align.simulation.simulate import simulate, write_bag
 from node_harness import (
     attitude_error_deg, bag_script, Listener, overrides, play, RELIABLE, replayed, running_node,
     stamp_ns, values_of)

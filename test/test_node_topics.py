@@ -17,9 +17,9 @@ from dataclasses import replace
 import re
 
 from geometry_msgs.msg import TwistStamped, Vector3Stamped
-from ins_align.diagnostics import ReasonLog
-from ins_align.rotation import matrix_from_quaternion, roll_pitch_yaw
-from ins_align.simulation import simulate
+from ins_align.geometry.rotation import matrix_from_quaternion, roll_pitch_yaw
+from ins_align.ros.diagnostics import ReasonLog
+from ins_align.simulation.simulate import simulate
 from node_harness import (
     Listener, playing, RELIABLE, running_node, script_of, simulated_messages, stamp_ns, values_of)
 import numpy as np

@@ -25,9 +25,8 @@ from ins_align.config import parameters
 import pytest
 
 ROOT = Path(__file__).parents[1]
-CORE = ('rotation', 'earth', 'preintegration', 'track', 'estimation.formula', 'estimation.bank',
-        'estimation.declaration', 'buffers', 'plausibility', 'intake', 'alignment', 'aligner',
-        'config', 'messages')
+CORE = ('aligner', 'config', 'results', 'geometry.earth', 'imu.prediction', 'gnss.antenna',
+        'estimation.bank', 'estimation.formula', 'estimation.declaration')
 OPTIONAL = ('rosbags', 'matplotlib', 'pyins', 'pandas', 'numba', 'scipy', 'tqdm')
 
 
@@ -111,7 +110,7 @@ def test_core_needs_numpy_only():
 def test_node_needs_nothing_optional():
     """A robot without rosbags, matplotlib and python-ins."""
     pytest.importorskip('rclpy')
-    assert not imported_by(['node']) & set(OPTIONAL)
+    assert not imported_by(['ros.main']) & set(OPTIONAL)
 
 
 def test_command_line_starts_without_anything_optional():

@@ -13,8 +13,9 @@
 # limitations under the License.
 """Checks on units and frames that need no alignment."""
 
-from ins_align.plausibility import (BEYOND_END, BLIND_ANGLE, END_TIMES, FORCE_SAMPLES, FORCE_TIME,
-                                    ForceCheck, RangeCheck, stuck, VelocityCheck, without_spikes)
+from ins_align.imu.plausibility import (
+    BEYOND_END, BLIND_ANGLE, END_TIMES, FORCE_SAMPLES, FORCE_TIME, ForceCheck, RangeCheck, stuck,
+    VelocityCheck, without_spikes)
 import numpy as np
 import pytest
 

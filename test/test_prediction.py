@@ -13,7 +13,7 @@
 # limitations under the License.
 """Attitudes carried on with gyros: against SciPy's rotations, one by one and many at once."""
 
-from ins_align.prediction import Follower, MAX_GAP_NS, Prediction
+from ins_align.imu.prediction import Follower, MAX_GAP_NS, Prediction
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

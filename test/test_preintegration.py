@@ -13,8 +13,8 @@
 # limitations under the License.
 """Preintegration against quadrature of closed-form motion, re-integration and Monte Carlo."""
 
-from ins_align.preintegration import (Intervals, Noise, preintegrate, SensorErrors,
-                                      split_at_epochs, Steps, white_noise)
+from ins_align.imu.preintegration import (
+    Intervals, Noise, preintegrate, SensorErrors, split_at_epochs, Steps, white_noise)
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp

@@ -17,8 +17,8 @@ from alignment import aligned, config_for, error_of, LEVER, simulated
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from ins_align.aligner import Aligner
-from ins_align.rotation import exp_so3, matrix_from_quaternion
-from ins_align.simulation import feed, give
+from ins_align.geometry.rotation import exp_so3, matrix_from_quaternion
+from ins_align.simulation.simulate import feed, give
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -13,8 +13,8 @@
 # limitations under the License.
 """Motion just before an epoch against the integral of the motion itself."""
 
-from ins_align import recent as recent_module
-from ins_align.recent import AGES, exact, Recent, recent_motion, RUNGS, smooth
+from ins_align.imu import recent as recent_module
+from ins_align.imu.recent import AGES, exact, Recent, recent_motion, RUNGS, smooth
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp

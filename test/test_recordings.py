@@ -18,10 +18,12 @@ import shutil
 import sqlite3
 import struct
 
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from ins_align.config import Config
-from ins_align.messages import fix_from_msg, imu_from_msg, MessageError, velocity_from_msg
-from ins_align.recordings import bag as bags, BagError, Topic
+from ins_align.gnss.messages import fix_from_msg, imu_from_msg, MessageError, velocity_from_msg
+from ins_align.recordings import bag as bags
+from ins_align.recordings import BagError, Topic
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import (
     decode_gnss, decode_imu, decode_orientations, deserialize, GNSS_TYPES, Refused)

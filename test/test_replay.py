@@ -22,11 +22,11 @@ import sqlite3
 import ins_align
 from ins_align.aligner import Aligner, Attitude
 from ins_align.config import Config
+from ins_align.geometry.rotation import exp_so3, matrix_from_rpy, quaternion_from_matrix
 from ins_align.recordings import bag, BagError
 from ins_align.recordings.decode import Attitudes, Orientations
-from ins_align.replay import CSV_HEADER, Reference, replay
-from ins_align.rotation import exp_so3, matrix_from_rpy, quaternion_from_matrix
-from ins_align.simulation import feed, simulate, Simulation, write_bag
+from ins_align.recordings.replay import CSV_HEADER, Reference, replay
+from ins_align.simulation.simulate import feed, simulate, Simulation, write_bag
 import numpy as np
 import pytest
 from recordings import real_recording, write_recording

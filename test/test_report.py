@@ -21,12 +21,12 @@ import re
 from types import SimpleNamespace
 
 from ins_align.config import Config
-from ins_align.replay import replay
+from ins_align.recordings.replay import replay
 from ins_align.report import (
     DECLARED_GREEN, declared_spans, format_table, plot, save_figure, STATE_COLOURS, summary,
     write_whole)
 from ins_align.results import State
-from ins_align.simulation import simulate, write_bag
+from ins_align.simulation.simulate import simulate, write_bag
 from matplotlib.colors import to_rgb
 import numpy as np
 import pytest

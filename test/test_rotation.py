@@ -15,7 +15,7 @@
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ins_align import rotation
+from ins_align.geometry import rotation
 import numpy as np
 import pytest
 from scipy.linalg import expm

@@ -15,7 +15,7 @@
 
 import threading
 
-from ins_align.worker import Worker
+from ins_align.ros.worker import Worker
 import pytest
 
 LONG = 20.0                     # s, for what takes no time at all

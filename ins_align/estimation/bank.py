@@ -22,7 +22,6 @@ from collections.abc import Iterator, Sequence
 import math
 from typing import NamedTuple
 
-from ins_align.antenna import AntennaEpoch, velocities_of
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimation.declaration import Fit
 from ins_align.estimation.filter import (
@@ -31,10 +30,11 @@ from ins_align.estimation.filter import (
 from ins_align.estimation.rivals import in_words, log_sum, Parameters, rivals_of, SHARE
 from ins_align.estimation.start import (
     all_headings, HEADINGS, LOUD, OPEN_POSITION, RoughAttitude, Start)
-from ins_align.preintegration import Intervals, SensorErrors
+from ins_align.estimation.track import InertialTrack
+from ins_align.geometry.rotation import Array, exp_so3, log_so3
+from ins_align.gnss.antenna import AntennaEpoch, velocities_of
+from ins_align.imu.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
-from ins_align.rotation import Array, exp_so3, log_so3
-from ins_align.track import InertialTrack
 import numpy as np
 
 # Means whose log weight is so much below the likeliest's are dropped, and so are rivals that are

@@ -23,8 +23,8 @@ from dataclasses import dataclass, field
 import math
 
 from ins_align.config import Config
+from ins_align.geometry.rotation import Array
 from ins_align.results import State, Verdict
-from ins_align.rotation import Array
 import numpy as np
 
 # Mean square of normalised residuals above which the model is contradicted.

@@ -29,9 +29,9 @@ differ in their heading share one covariance (docs, "Theory").
 
 from dataclasses import dataclass
 
-from ins_align.preintegration import Intervals
-from ins_align.recent import AGES, exact, smooth
-from ins_align.rotation import apply, Array, by_row, cross, exp_so3, Index, log_so3, skew
+from ins_align.geometry.rotation import apply, Array, by_row, cross, exp_so3, Index, log_so3, skew
+from ins_align.imu.preintegration import Intervals
+from ins_align.imu.recent import AGES, exact, smooth
 import numpy as np
 
 # Places in the error state; the parameters follow from FIRST on: lever arm, delay, errors of the

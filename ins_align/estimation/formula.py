@@ -22,14 +22,14 @@ adds (docs, "Theory").
 from collections.abc import Iterator, Sequence
 import math
 
-from ins_align.antenna import AntennaEpoch
 from ins_align.config import Config
-from ins_align.earth import earth_rate_n, gravity_n, LocalLevel
 from ins_align.estimation.declaration import Fit
-from ins_align.preintegration import Intervals, SensorErrors
+from ins_align.estimation.track import InertialTrack
+from ins_align.geometry.earth import earth_rate_n, gravity_n, LocalLevel
+from ins_align.geometry.rotation import Array, cross, matrix_from_quaternion, orthonormalized
+from ins_align.gnss.antenna import AntennaEpoch
+from ins_align.imu.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
-from ins_align.rotation import Array, cross, matrix_from_quaternion, orthonormalized
-from ins_align.track import InertialTrack
 import numpy as np
 
 # Sigma of an angle that may be any, radians.

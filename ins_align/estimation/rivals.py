@@ -24,7 +24,7 @@ import math
 
 from ins_align.config import Config, PRESETS
 from ins_align.estimation.filter import DELAY, FIRST, GYRO, LEVER_ARM, triads
-from ins_align.rotation import Array
+from ins_align.geometry.rotation import Array
 import numpy as np
 
 # Over the error of the gyros' scale factors: their misalignment; scale factors and misalignment of

@@ -22,13 +22,13 @@ from dataclasses import replace
 import math
 from typing import NamedTuple
 
-from ins_align.antenna import AntennaEpoch, velocities_of
 from ins_align.config import Config
 from ins_align.estimation.filter import FIRST, PHI, PHI0, RHO, XI
 from ins_align.estimation.formula import AttitudeMoments
-from ins_align.preintegration import Intervals
-from ins_align.rotation import apply, Array, cross, cumulative_rotations, exp_so3, Index
-from ins_align.track import InertialTrack
+from ins_align.estimation.track import InertialTrack
+from ins_align.geometry.rotation import apply, Array, cross, cumulative_rotations, exp_so3, Index
+from ins_align.gnss.antenna import AntennaEpoch, velocities_of
+from ins_align.imu.preintegration import Intervals
 import numpy as np
 
 # A start takes so many epochs, fewer leave the formula no redundancy, and waits for no more.

@@ -35,7 +35,7 @@ from typing import Any
 
 from ins_align.aligner import Aligner
 from ins_align.experiments.common import config_for, Report
-from ins_align.simulation import epochs_of, simulate, Simulation
+from ins_align.simulation.simulate import epochs_of, simulate, Simulation
 import numpy as np
 
 MINUTES = 60
@@ -119,7 +119,7 @@ def node_rows(folder: Path) -> list[list[str]]:
         with ExitStack() as stack:
             other = stack.enter_context(_process('-m', NODES, name))
             ours = stack.enter_context(_process(
-                '-m', 'ins_align.node', '--ros-args', '-p', 'lever_arm:=[1.0, 1.0, 1.0]'))
+                '-m', 'ins_align.ros.main', '--ros-args', '-p', 'lever_arm:=[1.0, 1.0, 1.0]'))
             if name == 'republish':
                 stack.enter_context(_process('-m', NODES, 'listen'))
             time.sleep(3.0)

@@ -26,11 +26,10 @@ from typing import Any, NamedTuple
 
 from ins_align.aligner import Aligner
 from ins_align.experiments import dense
-from ins_align.experiments.common import (
-    error_of, exact_config_for, GRADES, parallel, Report, rms)
+from ins_align.experiments.common import error_of, exact_config_for, GRADES, parallel, Report, rms
+from ins_align.geometry.rotation import Array
 from ins_align.report import new_figure
-from ins_align.rotation import Array
-from ins_align.simulation import epochs_of, simulate, Simulation
+from ins_align.simulation.simulate import epochs_of, simulate, Simulation
 import numpy as np
 
 TIMES = (3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 30.0, 50.0, 70.0, 100.0)

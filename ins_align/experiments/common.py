@@ -27,9 +27,9 @@ from typing import Any, NamedTuple
 
 from ins_align.aligner import Attitude, Epoch, State
 from ins_align.config import Config
+from ins_align.geometry.rotation import Array, log_so3
 from ins_align.report import format_table, write_whole
-from ins_align.rotation import Array, log_so3
-from ins_align.simulation import Simulation
+from ins_align.simulation.simulate import Simulation
 from ins_align.threads import processors, VARIABLES
 import numpy as np
 

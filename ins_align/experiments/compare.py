@@ -20,9 +20,9 @@ from typing import Any
 
 from ins_align.aligner import Aligner
 from ins_align.experiments.common import config_for, error_of, parallel, Report
+from ins_align.geometry.rotation import Array
 from ins_align.report import new_figure
-from ins_align.rotation import Array
-from ins_align.simulation import epochs_of, simulate
+from ins_align.simulation.simulate import epochs_of, simulate
 import numpy as np
 
 TIMES = np.arange(1.0, 101.0)

@@ -24,7 +24,7 @@ from ins_align.aligner import Aligner
 from ins_align.config import Config
 from ins_align.experiments.common import config_for, exact_config_for, parallel, Report
 from ins_align.report import new_figure
-from ins_align.simulation import give, simulate
+from ins_align.simulation.simulate import give, simulate
 import numpy as np
 
 MINUTES = 60

@@ -30,7 +30,7 @@ from ins_align.config import Config
 from ins_align.experiments.bound import crossing_time
 from ins_align.experiments.common import (
     config_for, error_of, exact_config_for, first_in, GRADES, parallel, Report)
-from ins_align.simulation import epochs_of, SCENARIOS, simulate, Simulation
+from ins_align.simulation.simulate import epochs_of, SCENARIOS, simulate, Simulation
 import numpy as np
 
 FAULTS = ('none', 'outliers', 'outages', 'delay', 'lever arm left out', 'several of these',

@@ -30,9 +30,9 @@ import math
 
 from ins_align.config import ImuNoise, STANDARD_GRAVITY
 from ins_align.estimation.rivals import ACCEL_ERRORS, gyro_matrix_std
-from ins_align.messages import ENU_FROM_NED
-from ins_align.rotation import Array, Index, skew
-from ins_align.simulation import Simulation
+from ins_align.geometry.rotation import Array, Index, skew
+from ins_align.gnss.messages import ENU_FROM_NED
+from ins_align.simulation.simulate import Simulation
 import numpy as np
 
 # Places of the unknowns.

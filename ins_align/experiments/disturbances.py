@@ -26,8 +26,8 @@ import math
 
 from ins_align.config import PRESETS
 from ins_align.experiments.spoilt import SECOND, Stream
-from ins_align.rotation import Array
-from ins_align.trajectory import displaced
+from ins_align.geometry.rotation import Array
+from ins_align.simulation.trajectory import displaced
 import numpy as np
 
 Random = np.random.Generator

@@ -34,8 +34,8 @@ from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
 from ins_align.experiments.common import config_for, error_of, GRADES, parallel, Report
 from ins_align.experiments.spoilt import FAULTS, SECOND, Stream, stream_of
-from ins_align.messages import fix_from_msg, imu_from_msg, MessageError, velocity_from_msg
-from ins_align.simulation import SCENARIOS, simulate, Simulation
+from ins_align.gnss.messages import fix_from_msg, imu_from_msg, MessageError, velocity_from_msg
+from ins_align.simulation.simulate import SCENARIOS, simulate, Simulation
 import numpy as np
 
 DURATION = 60.0

@@ -29,7 +29,7 @@ import time
 from typing import Any
 
 from geometry_msgs.msg import TwistWithCovarianceStamped
-from ins_align.simulation import Simulation
+from ins_align.simulation.simulate import Simulation
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -104,7 +104,7 @@ def _play(path: str, rate: float) -> None:
 
 
 def _timed(path: str) -> int:
-    from ins_align import alignment_node, node
+    from ins_align.ros import main, node
 
     held: list[float] = []
 
@@ -118,9 +118,9 @@ def _timed(path: str) -> int:
         return call
 
     for name in ('_on_imu', '_on_reset'):
-        setattr(alignment_node.AlignmentNode, name,
-                _like(timed(getattr(alignment_node.AlignmentNode, name)), name))
-    status = node.main(['--ros-args', '-p', 'lever_arm:=[1.0, 1.0, 1.0]'])
+        setattr(node.AlignmentNode, name,
+                _like(timed(getattr(node.AlignmentNode, name)), name))
+    status = main.main(['--ros-args', '-p', 'lever_arm:=[1.0, 1.0, 1.0]'])
     Path(path).write_text(json.dumps(held))
     return status
 

@@ -24,12 +24,12 @@ from pathlib import Path
 from typing import Any
 
 from ins_align.aligner import Aligner
-from ins_align.earth import EARTH_RATE, earth_rate_n, LocalLevel
 from ins_align.experiments import dense
 from ins_align.experiments.common import exact_config_for, parallel, Report, rms
+from ins_align.geometry.earth import EARTH_RATE, earth_rate_n, LocalLevel
+from ins_align.geometry.rotation import Array, cross, roll_pitch_yaw, skew
 from ins_align.report import new_figure
-from ins_align.rotation import Array, cross, roll_pitch_yaw, skew
-from ins_align.simulation import epochs_of, simulate
+from ins_align.simulation.simulate import epochs_of, simulate
 import numpy as np
 
 DURATION = 100.0

@@ -22,15 +22,15 @@ from typing import Any, NamedTuple
 
 from ins_align.aligner import Aligner
 from ins_align.config import Config
-from ins_align.earth import ecef_from_lla, matrix_en
 from ins_align.experiments.common import Error, error_of
+from ins_align.geometry.earth import ecef_from_lla, matrix_en
+from ins_align.geometry.rotation import Array
 from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import ImuSamples, joined, Orientations, Refused
 from ins_align.recordings.reader import choose_topics, read, Request
-from ins_align.replay import Reference
+from ins_align.recordings.replay import Reference
 from ins_align.results import Epoch
-from ins_align.rotation import Array
 import numpy as np
 
 # What is known beside the recording, by the beginning of its name: the lever arm, and how well

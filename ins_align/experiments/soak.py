@@ -31,7 +31,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from ins_align.experiments.common import Report
 from ins_align.experiments.nodes import script_of, TYPES
-from ins_align.simulation import simulate
+from ins_align.simulation.simulate import simulate
 import rclpy
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
@@ -43,7 +43,8 @@ PAUSE_NS = 1_000_000_000  # between rounds, shorter than a gap that counts
 LEAD = 1500  # IMU messages on the way, of 2000 that the node's queue holds
 RATE = 15.0  # times real time: more would fill the queue between two reports of the node
 TIMEOUT = 60.0  # s
-NODE = [sys.executable, '-m', 'ins_align.node', '--ros-args', '-p', 'lever_arm:=[1.0, 1.0, 1.0]',
+NODE = [sys.executable, '-m', 'ins_align.ros.main', '--ros-args',
+        '-p', 'lever_arm:=[1.0, 1.0, 1.0]',
         # The same delay on the way is longer on the clock of data that is played faster.
         '-p', 'gnss_lateness:=5.0']
 RELIABLE = [f'qos_overrides./{topic}.subscription.reliability:=reliable' for topic in TYPES]

@@ -25,10 +25,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ins_align.config import Config
-from ins_align.messages import ENU_FROM_NED
-from ins_align.rotation import Array
-from ins_align.simulation import Simulation
-from ins_align.trajectory import displaced
+from ins_align.geometry.rotation import Array
+from ins_align.gnss.messages import ENU_FROM_NED
+from ins_align.simulation.simulate import Simulation
+from ins_align.simulation.trajectory import displaced
 import numpy as np
 
 SECOND = 1_000_000_000

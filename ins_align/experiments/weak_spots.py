@@ -29,12 +29,13 @@ from typing import Any, NamedTuple
 
 from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
-from ins_align.experiments import disturbances as of, recorded
+from ins_align.experiments import disturbances as of
+from ins_align.experiments import recorded
 from ins_align.experiments.common import config_for, error_of, parallel, Report
 from ins_align.experiments.spoilt import SECOND, Stream, stream_of
-from ins_align.messages import Fix, Velocity
-from ins_align.rotation import Array
-from ins_align.simulation import give, simulate, Simulation
+from ins_align.geometry.rotation import Array
+from ins_align.gnss.messages import Fix, Velocity
+from ins_align.simulation.simulate import give, simulate, Simulation
 import numpy as np
 
 RUNS = 24

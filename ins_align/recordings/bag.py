@@ -33,7 +33,8 @@ from ins_align.recordings import BagError, one_line, Topic
 from ins_align.recordings.limits import (
     MAX_CHUNK_BYTES, MAX_HELD_BYTES, MAX_MESSAGE_BYTES, MAX_METADATA_BYTES, MAX_TOPICS,
     max_unpacked_bytes, unpack, ZSTD_MAGIC, ZSTD_MODULE)
-from ins_align.recordings.salvage import MAGIC as MCAP_MAGIC, SalvagedMcap
+from ins_align.recordings.salvage import MAGIC as MCAP_MAGIC
+from ins_align.recordings.salvage import SalvagedMcap
 import numpy as np
 from rosbags import rosbag1, rosbag2
 from rosbags.rosbag2 import storage_mcap

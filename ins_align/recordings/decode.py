@@ -22,7 +22,7 @@ from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
 from ins_align.config import Config
-from ins_align.messages import Fix, fixes, MessageError, velocities, Velocity
+from ins_align.gnss.messages import Fix, fixes, MessageError, velocities, Velocity
 from ins_align.recordings import Topic
 import numpy as np
 from rosbags.typesys import get_typestore, Stores

@@ -23,7 +23,7 @@ import os
 from typing import NamedTuple
 
 from ins_align.config import Config
-from ins_align.messages import Fix, MessageError, Velocity, velocity_from_msg
+from ins_align.gnss.messages import Fix, MessageError, Velocity, velocity_from_msg
 from ins_align.recordings import BagError, Topic
 from ins_align.recordings.bag import Bag, Block
 from ins_align.recordings.decode import (

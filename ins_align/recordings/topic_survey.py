@@ -21,16 +21,16 @@ from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
 
-from ins_align.buffers import (
-    fault_of_fix, MAX_ACCELERATION, MAX_RATE, usable_velocity, with_an_altitude)
 from ins_align.config import Config
-from ins_align.messages import Fix, MessageError, Velocity
+from ins_align.geometry.rotation import Array
+from ins_align.gnss.messages import Fix, MessageError, Velocity
+from ins_align.gnss.buffer import fault_of_fix, usable_velocity, with_an_altitude
+from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.recordings import Topic
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import (
     decode_gnss, decode_imu, deserialize, GNSS_TYPES, IMU_TYPE, Refused)
 from ins_align.recordings.reader import may_be_velocity, REFERENCE_NAMESPACE
-from ins_align.rotation import Array
 import numpy as np
 
 KINDS = ('imu', 'fix', 'velocity')

@@ -23,13 +23,13 @@ from collections import Counter
 from dataclasses import dataclass
 import math
 
-from ins_align.buffers import ImuBuffer
 from ins_align.config import ImuNoise
-from ins_align.plausibility import IMU_BEFORE, RangeCheck, without_spikes
-from ins_align.preintegration import (Intervals, Noise, preintegrate, SensorErrors,
-                                      split_at_epochs, Steps, white_noise)
-from ins_align.recent import Recent, recent_motion
-from ins_align.rotation import Array, Index
+from ins_align.geometry.rotation import Array, Index
+from ins_align.imu.buffer import ImuBuffer
+from ins_align.imu.plausibility import IMU_BEFORE, RangeCheck, without_spikes
+from ins_align.imu.preintegration import (
+    Intervals, Noise, preintegrate, SensorErrors, split_at_epochs, Steps, white_noise)
+from ins_align.imu.recent import Recent, recent_motion
 import numpy as np
 
 # A step this many times the usual one holds lost samples; what the motion can do meanwhile

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import math
 from typing import NamedTuple
 
-from ins_align.rotation import Array
+from ins_align.geometry.rotation import Array
 import numpy as np
 
 EARTH_RADIUS = 6_371_000.0  # m, mean sphere: distances to 0.5 percent

@@ -14,8 +14,8 @@
 """
 Simulated recordings: sensors of a moving vehicle with truth.
 
-Perfect sensors come from `ins_align.trajectory`; here they get their errors, the GNSS receiver its
-rate, latency, outages and outliers, and the whole becomes a recording.
+Perfect sensors come from `trajectory`; here they get their errors, the GNSS receiver its rate,
+latency, outages and outliers, and the whole becomes a recording.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from ins_align import scenarios
 from ins_align.config import Config, ImuNoise, PRESETS
-from ins_align.messages import ENU_FROM_NED, Fix, Velocity
-from ins_align.rotation import Array, matrix_from_rpy, quaternion_from_matrix
-from ins_align.simulation_arguments import (
+from ins_align.geometry.rotation import Array, matrix_from_rpy, quaternion_from_matrix
+from ins_align.gnss.messages import ENU_FROM_NED, Fix, Velocity
+from ins_align.simulation import scenarios
+from ins_align.simulation.arguments import (
     checked_arguments, IMU_AXES, LATENESS_MARGIN, SimulationError)
-from ins_align.trajectory import displaced, START_NS, Trajectory, trajectory_of, wrapped
+from ins_align.simulation.trajectory import displaced, START_NS, Trajectory, trajectory_of, wrapped
 import numpy as np
 
 SCENARIOS = tuple(scenarios.SCENARIOS)

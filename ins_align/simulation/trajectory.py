@@ -26,10 +26,10 @@ from functools import lru_cache
 import math
 from typing import NamedTuple
 
-from ins_align import scenarios
-from ins_align.earth import ECCENTRICITY2, matrix_en, SEMI_MAJOR_AXIS
-from ins_align.messages import ENU_FROM_NED
-from ins_align.rotation import Array, cross, log_so3, matrix_from_rpy
+from ins_align.geometry.earth import ECCENTRICITY2, matrix_en, SEMI_MAJOR_AXIS
+from ins_align.geometry.rotation import Array, cross, log_so3, matrix_from_rpy
+from ins_align.gnss.messages import ENU_FROM_NED
+from ins_align.simulation import scenarios
 import numpy as np
 
 FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])

@@ -18,7 +18,7 @@ import math
 from typing import Any
 
 from ins_align.config import ImuNoise, parameters, PRESETS
-from ins_align.scenarios import SCENARIOS
+from ins_align.simulation.scenarios import SCENARIOS
 import numpy as np
 
 VELOCITY_FRAMES = ('enu', 'ned')

@@ -23,8 +23,9 @@ from collections.abc import Sequence
 import copy
 import math
 
-from ins_align.buffers import MAX_GAP_NS, MAX_RATE
-from ins_align.rotation import apply, Array, matrix_from_quaternion, quaternion_from_matrix
+from ins_align.geometry.rotation import (
+    apply, Array, matrix_from_quaternion, quaternion_from_matrix)
+from ins_align.imu.buffer import MAX_GAP_NS, MAX_RATE
 import numpy as np
 
 # So many samples are kept until it is known from which of them on to carry.

@@ -22,7 +22,7 @@ the epoch back to that moment. They are kept at a ladder of ages that follows a 
 from dataclasses import dataclass
 import math
 
-from ins_align.rotation import Array, cross, Index, rotated
+from ins_align.geometry.rotation import Array, cross, Index, rotated
 import numpy as np
 
 # Seconds between the ages, and how many there are: all of them as long as delays are.

@@ -18,12 +18,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
-from ins_align.buffers import GnssEpoch
 from ins_align.config import Config
-from ins_align.earth import carried, GRAVITY_EQUATOR, Place, SEMI_MAJOR_AXIS, way
-from ins_align.messages import Fix, Velocity
-from ins_align.plausibility import VelocityCheck
-from ins_align.rotation import Array
+from ins_align.geometry.earth import carried, GRAVITY_EQUATOR, Place, SEMI_MAJOR_AXIS, way
+from ins_align.geometry.rotation import Array
+from ins_align.gnss.messages import Fix, Velocity
+from ins_align.gnss.buffer import GnssEpoch
+from ins_align.imu.plausibility import VelocityCheck
 import numpy as np
 
 # A fix this far (m) from where the last one and the velocity lead, and as much again for every

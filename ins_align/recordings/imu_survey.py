@@ -20,11 +20,11 @@ import math
 
 from ins_align.checks import degrees_fault, turn_ratio
 from ins_align.config import PRESETS
-from ins_align.earth import EARTH_RATE
-from ins_align.motion_survey import GRID, Series
-from ins_align.plausibility import force_fault, RangeCheck
+from ins_align.geometry.earth import EARTH_RATE
+from ins_align.geometry.rotation import Array
+from ins_align.imu.plausibility import force_fault, RangeCheck
 from ins_align.recordings.decode import ImuSamples
-from ins_align.rotation import Array
+from ins_align.recordings.motion_survey import GRID, Series
 import numpy as np
 
 WINDOW = 2.0  # s in which noise is measured

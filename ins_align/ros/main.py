@@ -59,7 +59,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
     # Now that the above holds: importing starts the threads and takes a while.
     try:
-        from ins_align.alignment_node import AlignmentNode
+        from ins_align.ros.node import AlignmentNode
     except ModuleNotFoundError as error:
         return _refused(f'the Python package {error.name} is not installed here: source the ROS '
                         'installation first (source /opt/ros/jazzy/setup.bash), or, without one, '

@@ -22,12 +22,12 @@ of an interval, and all intervals of a batch, are handled as arrays.
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
-from ins_align.recent import Recent, RUNGS
-from ins_align.rotation import (apply, Array, cross, cumulative_rotations, exp_and_left_jacobian,
-                                exp_so3, Index, log_so3, orthonormalized, product, skew)
+from ins_align.geometry.rotation import (
+    apply, Array, cross, cumulative_rotations, exp_and_left_jacobian, exp_so3, Index, log_so3,
+    orthonormalized, product, skew)
+from ins_align.imu.recent import Recent, RUNGS
 import numpy as np
 from numpy.typing import ArrayLike
-
 
 # Neighbouring steps whose lengths differ by more than this share are taken as one to the slope.
 UNEVEN = 0.1

@@ -16,8 +16,8 @@
 from collections import deque
 import math
 
-from ins_align.earth import Place, way
-from ins_align.rotation import Array, Index
+from ins_align.geometry.earth import Place, way
+from ins_align.geometry.rotation import Array, Index
 import numpy as np
 
 # The specific force averages gravity, over this time (s) and so many samples, unless the vehicle

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import struct
 from typing import NamedTuple
 
-from ins_align.messages import imu_from_msg
+from ins_align.gnss.messages import imu_from_msg
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu
 

@@ -33,15 +33,15 @@ from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
 from ins_align.checks import InputChecks
 from ins_align.config import (
     Config, config_from_mapping, ConfigError, no_effect, NODE_NAME, parameters)
-from ins_align.diagnostics import (
+from ins_align.gnss.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
+from ins_align.imu.prediction import Follower, Prediction
+from ins_align.results import Severity
+from ins_align.ros.diagnostics import (
     diagnostic_status, inputs_in_words, LEVELS, parameter_descriptor, ReasonLog, topic_faults,
     vector_msg)
-from ins_align.imu_bytes import ImuSample, read_imu, with_orientation
-from ins_align.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
-from ins_align.on_demand import OnDemand, queued
-from ins_align.prediction import Follower, Prediction
-from ins_align.results import Severity
-from ins_align.worker import Worker
+from ins_align.ros.imu_bytes import ImuSample, read_imu, with_orientation
+from ins_align.ros.on_demand import OnDemand, queued
+from ins_align.ros.worker import Worker
 from nav_msgs.msg import Odometry
 import numpy as np
 from rcl_interfaces.msg import SetParametersResult

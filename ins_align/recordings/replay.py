@@ -26,16 +26,16 @@ from typing import Any, NamedTuple
 
 from ins_align.ahead import run_ahead
 from ins_align.alignment import Alignment
-from ins_align.buffers import fault_of_fix
 from ins_align.checks import InputChecks
 from ins_align.config import Config
+from ins_align.geometry.rotation import (
+    Array, exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw)
+from ins_align.gnss.messages import Fix
+from ins_align.gnss.buffer import fault_of_fix
 from ins_align.intake import Intake, Step
-from ins_align.messages import Fix
 from ins_align.recordings.decode import Attitudes, Refused
 from ins_align.recordings.reader import Part, read, Request, Topics
 from ins_align.results import Attitude, Epoch, State, Status
-from ins_align.rotation import (
-    Array, exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw)
 import numpy as np
 
 MAX_REFERENCE_GAP_NS = 1_500_000_000  # the reference is not interpolated over more

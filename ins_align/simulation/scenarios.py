@@ -22,7 +22,7 @@ FLU, axes ENU, angles radians, yaw counter-clockwise from east.
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from ins_align.rotation import Array, matrix_from_rpy
+from ins_align.geometry.rotation import Array, matrix_from_rpy
 import numpy as np
 
 _Rows = Sequence[tuple[float, float, float]]

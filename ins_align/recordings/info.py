@@ -23,21 +23,22 @@ import os
 import shlex
 from typing import Any
 
-from ins_align.buffers import MAX_AHEAD_NS, MAX_GAP_NS
 from ins_align.checks import (
     BEYOND_THE_POLES, beyond_the_poles, exchange_fault, lateness_advice, MAX_LATENESS)
 from ins_align.config import Config, config_from_mapping, parse_override
-from ins_align.earth import normal_gravity
-from ins_align.imu_survey import ImuFacts, survey_imu
-from ins_align.motion_survey import (
-    find_manoeuvres, MANOEUVRE_SPEED, MANOEUVRE_TIME, Manoeuvres, on_grid, Series, track,
-    velocity_frame, velocity_from_positions, VelocityFrame, WEAK_SPEED, without_wild_positions)
+from ins_align.geometry.earth import normal_gravity
+from ins_align.gnss.buffer import MAX_AHEAD_NS
+from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import ImuSamples
+from ins_align.recordings.imu_survey import ImuFacts, survey_imu
+from ins_align.recordings.motion_survey import (
+    find_manoeuvres, MANOEUVRE_SPEED, MANOEUVRE_TIME, Manoeuvres, on_grid, Series, track,
+    velocity_frame, velocity_from_positions, VelocityFrame, WEAK_SPEED, without_wild_positions)
 from ins_align.recordings.reader import choose_topics
+from ins_align.recordings.topic_survey import KINDS, MAX_ASTRAY, read_candidates, Recorded, Timing
 from ins_align.report import format_table
-from ins_align.topic_survey import KINDS, MAX_ASTRAY, read_candidates, Recorded, Timing
 import numpy as np
 
 MIN_RATE = 1e9 / MAX_GAP_NS  # Hz

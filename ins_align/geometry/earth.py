@@ -20,7 +20,7 @@ Latitude and longitude are radians, altitude is metres above the ellipsoid; ever
 
 import math
 
-from ins_align.rotation import Array, cross
+from ins_align.geometry.rotation import Array, cross
 import numpy as np
 from numpy.typing import ArrayLike
 
