@@ -26,8 +26,8 @@ from typing import Union
 
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array, Index
-from ins_align.gnss.messages import Fix, Velocity
 from ins_align.gnss.buffer import fault_of_fix, usable_velocity
+from ins_align.gnss.messages import Fix, Velocity
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.recordings.motion_survey import (
     GRID, on_grid, Series, track, velocity_frame, velocity_from_positions, VelocityFrame,

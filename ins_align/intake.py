@@ -25,8 +25,8 @@ from typing import NamedTuple, Union
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.antenna import Antenna, AntennaEpoch
-from ins_align.gnss.messages import Fix, Velocity
 from ins_align.gnss.buffer import GnssBuffer, GnssEpoch, PAIR_NS
+from ins_align.gnss.messages import Fix, Velocity
 from ins_align.imu.buffer import ImuBuffer, MAX_GAP_NS
 from ins_align.imu.cutter import ImuCutter
 from ins_align.imu.plausibility import stuck

@@ -18,8 +18,8 @@ import math
 
 from ins_align.config import Config
 from ins_align.gnss.antenna import Antenna, StatedNoise
-from ins_align.gnss.messages import Fix, Velocity
 from ins_align.gnss.buffer import GnssEpoch, with_an_altitude
+from ins_align.gnss.messages import Fix, Velocity
 import numpy as np
 import pytest
 

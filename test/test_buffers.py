@@ -18,8 +18,8 @@ import math
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ins_align.gnss.messages import Fix, Velocity
 from ins_align.gnss.buffer import GnssBuffer, PAIR_NS
+from ins_align.gnss.messages import Fix, Velocity
 from ins_align.imu.buffer import ImuBuffer, KEPT_BEFORE
 import numpy as np
 import pytest

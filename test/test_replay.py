@@ -148,7 +148,8 @@ def test_page_names_every_field(result):
 def test_page_names_every_count(result):
     counts = documented('count')
     assert set(result.status.counts) <= set(counts)
-    source = ''.join(path.read_text() for path in Path(ins_align.__file__).parent.glob('*.py'))
+    package = Path(ins_align.__file__).parent
+    source = ''.join(path.read_text() for path in package.rglob('*.py'))
     named = re.findall(r"""(?:counts\[|reject\()'(\w+)'[\])]""", source)
     assert len(named) > 20
     assert set(named) <= set(counts)

@@ -21,8 +21,8 @@ import math
 from ins_align.config import Config
 from ins_align.geometry.earth import carried, GRAVITY_EQUATOR, Place, SEMI_MAJOR_AXIS, way
 from ins_align.geometry.rotation import Array
-from ins_align.gnss.messages import Fix, Velocity
 from ins_align.gnss.buffer import GnssEpoch
+from ins_align.gnss.messages import Fix, Velocity
 from ins_align.imu.plausibility import VelocityCheck
 import numpy as np
 

@@ -30,8 +30,8 @@ from ins_align.checks import InputChecks
 from ins_align.config import Config
 from ins_align.geometry.rotation import (
     Array, exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw)
-from ins_align.gnss.messages import Fix
 from ins_align.gnss.buffer import fault_of_fix
+from ins_align.gnss.messages import Fix
 from ins_align.intake import Intake, Step
 from ins_align.recordings.decode import Attitudes, Refused
 from ins_align.recordings.reader import Part, read, Request, Topics

@@ -23,8 +23,8 @@ from typing import Any, NamedTuple
 
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array
-from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.gnss.buffer import fault_of_fix, usable_velocity, with_an_altitude
+from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.recordings import Topic
 from ins_align.recordings.bag import Bag
