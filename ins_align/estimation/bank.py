@@ -57,7 +57,7 @@ MENTIONED = 1.5
 MEMORY, BELIEVED = 300, 30
 # Parameters are linearised anew when the likeliest mean has gone so far from the point: lever arm
 # (m), delay (s), bias and matrix of the gyros (rad/s, 1) and of the accelerometers (m/s^2, 1).
-_REACH = np.array([0.2] * 3 + [0.01] + [5e-4] * 3 + [0.02] * 9 + [0.1] * 3 + [0.02] * 9)
+_REACH = np.array([0.2] * 3 + [0.01] + [3e-3] * 3 + [0.02] * 9 + [0.1] * 3 + [0.02] * 9)
 MAX_SPAN = 64
 # Beside velocities positions gain little and hurt when their errors wander: where the bank may
 # choose, it takes them when no velocity came for this long (ns), and leaves them out again when
@@ -123,6 +123,7 @@ class Bank:
         errors = gyro.stop - gyro.start
         self._reach = np.concatenate([_REACH[:gyro.stop], _REACH[16:16 + errors]])
         self._filters: Filters | None = None
+        self._mixed: tuple[Array, Array] | None = None      # the attitudes, once asked for
         self._start = Start(self._config)
         self._last = epoch                          # the last epoch that was processed
         self._C_nn0 = np.eye(3)
@@ -247,9 +248,11 @@ class Bank:
     def _anchor(self, filters: Filters, track: InertialTrack) -> None:
         """Freeze n0 at the last epoch that was processed; the track is there."""
         filters.turned(track.C_n0n.T, track.still_v, track.s_p)
+        self._mixed = None
         self._freeze(self._last)
 
     def _step(self, filters: Filters, model: Linearised, k: int, track: Track) -> None:
+        self._mixed = None
         filters.propagate(model, k)
         self._nis, self._innovation = math.nan, NOTHING_NEW
         if not any(track.present[k]):
@@ -321,10 +324,9 @@ class Bank:
         filters.evidence = np.where(wrong, filters.evidence,
                                     np.maximum(level, best - LEAST) - self._prior[ids])
         filters.evidence = filters.evidence - best
-        if len(filters.C) > len(ids):
-            keep = filters.weight > filters.weight[filters.lead][filters.place] - UNLIKELY
-        else:
-            keep = np.ones(len(filters.C), bool)
+        if len(filters.C) == len(ids) and not wrong.any():
+            return
+        keep = filters.weight > filters.weight[filters.lead][filters.place] - UNLIKELY
         keep &= (~wrong | (filters.evidence > -HOPELESS))[filters.place]
         if not keep.all():
             filters.keep(keep)
@@ -377,40 +379,52 @@ class Bank:
         share = np.exp(level - level.max())
         return (share / share.sum())[filters.place] * np.exp(filters.weight)
 
-    def _mixture(self, C: Array, block: slice) -> tuple[Array, Array]:
-        """Return the mean of attitudes and its covariance in the axes that they are in."""
+    def _attitudes(self) -> tuple[Array, Array]:
+        """
+        Return the attitudes at t0 and now, C_n0b, and their covariances in the axes of n0.
+
+        Returns
+        -------
+        mean, covariance : ndarray, shape (2, 3, 3)
+            Of the mixture of all means.
+
+        """
+        if self._mixed is not None:
+            return self._mixed
         filters = self._filters
         assert filters is not None
         share = self._shares_of(filters)
         use = np.flatnonzero(share > 1e-6)
-        share, C = share[use], C[use]
-        covariance = C @ filters.P[filters.place[use], block, block] @ C.swapaxes(1, 2)
-        if len(use) == 1:
-            return C[0], covariance[0]
-        mean = C[np.argmax(share)]
-        for _ in range(3):
-            away = log_so3(C @ mean.T)
-            shift = share @ away / share.sum()
-            mean = exp_so3(shift) @ mean
-            away = away - shift
-            if np.max(np.abs(away)) < CLOSE:        # the rotations add up like vectors
-                break
-        total = covariance + away[:, :, None] * away[:, None]
-        return mean, np.sum(share[:, None, None] * total, axis=0) / share.sum()
+        share = share[use] / share[use].sum()
+        P = filters.P[filters.place[use]]
+        C = np.stack([filters.C0[use], filters.C[use]])
+        covariance = C @ np.stack([P[:, PHI0, PHI0], P[:, PHI, PHI]]) @ C.swapaxes(-1, -2)
+        mean = C[:, np.argmax(share)]
+        if len(use) > 1:
+            for _ in range(3):
+                away = log_so3(C @ mean[:, None].swapaxes(-1, -2))
+                shift = share @ away
+                mean = exp_so3(shift) @ mean
+                away = away - shift[:, None]
+                if np.abs(away).max() < CLOSE:      # the rotations add up like vectors
+                    break
+            covariance = covariance + away[..., :, None] * away[..., None, :]
+        self._mixed = mean, np.sum(share[:, None, None] * covariance, axis=1)
+        return self._mixed
 
     def initial(self) -> tuple[Array, Array] | None:
         """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
         if self._filters is None:
             return None
-        C, P = self._mixture(self._filters.C0, PHI0)
-        return C, self.factor * P
+        C, P = self._attitudes()
+        return C[0], self.factor * P[0]
 
     def current(self) -> tuple[Array, Array] | None:
         """Return ``C_nb`` at the last epoch and the covariance of its error in ENU."""
         if self._filters is None:
             return None
-        C, P = self._mixture(self._filters.C, PHI)
-        return self._C_nn0 @ C, self.factor * self._C_nn0 @ P @ self._C_nn0.T
+        C, P = self._attitudes()
+        return self._C_nn0 @ C[1], self.factor * self._C_nn0 @ P[1] @ self._C_nn0.T
 
     def fit(self) -> Fit:
         """Return how well the data fit."""
@@ -427,6 +441,7 @@ class Bank:
         """Move t0 to the last epoch."""
         assert self._filters is not None
         self._filters.clone(self._C_nn0.T)
+        self._mixed = None
         self.moved += 1
         self.t0_ns = self._last.stamp_ns
 
@@ -454,16 +469,15 @@ class Bank:
 
         """
         filters = self._filters
-        if filters is None:
+        if filters is None or not self._wrong[filters.ids].any():
             return '', False
         ahead = self._ahead_of(filters)
         if not np.any(ahead > -MARGIN):
             return '', False
-        harm = np.zeros(len(ahead))
-        for C, block in ((filters.C, PHI), (filters.C0, PHI0)):
-            mean, P = self._mixture(C, block)
-            away = log_so3(C[filters.lead] @ mean.T) / np.sqrt(np.diag(P))
-            harm = np.maximum(harm, np.abs(away).max(axis=1))
+        mean, P = self._attitudes()
+        C = np.stack([filters.C0[filters.lead], filters.C[filters.lead]], axis=1)
+        away = log_so3(C @ mean.swapaxes(-1, -2)) / np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        harm = np.abs(away).max(axis=(1, 2))
         worst = int(np.argmax(np.where(harm > HARMLESS, ahead, -np.inf)))
         if harm[worst] <= HARMLESS or ahead[worst] <= -MARGIN:
             return '', False
@@ -513,7 +527,7 @@ class Bank:
         if self._filters is None or self._in_a_row:
             return None
         x, P = (array.copy() for array in self._body())
-        if self._mixture(self._filters.C, PHI)[1][2, 2] > RESOLVED_STD ** 2:
+        if self._attitudes()[1][1, 2, 2] > RESOLVED_STD ** 2:
             # Without a change of speed nothing shows lever arm and delay but the noise of the
             # IMU, which feigns a swing that the GNSS does not see.
             antenna = slice(0, GYRO)

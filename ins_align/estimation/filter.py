@@ -412,20 +412,21 @@ class Filters:
 
     def _move(self, d: Array) -> None:
         """Correct the means, and turn the covariances' frames with the likeliest of them."""
-        C = self.C
+        C, lead = self.C, self.lead
+        B, M = len(C), len(lead)
         self.u = self.u + apply(C, d[:, XI])
         self.w = self.w + apply(C, d[:, RHO])
-        self.C = C @ exp_so3(d[:, PHI])
-        self.C0 = self.C0 @ exp_so3(d[:, PHI0])
         self.x = self.x + d[:, FIRST:]
-        phi, phi0 = d[self.lead, PHI], d[self.lead, PHI0]
+        phi, phi0 = d[lead, PHI], d[lead, PHI0]
+        start = apply(C[lead].swapaxes(1, 2) @ self.C0[lead], phi0)
+        turns = exp_so3(np.concatenate([d[:, PHI], d[:, PHI0], 0.5 * start - phi, -phi,
+                                        -0.5 * phi0]))
+        self.C, self.C0 = C @ turns[:B], self.C0 @ turns[B:2 * B]
         if max(np.abs(phi).max(), np.abs(phi0).max()) > 1e-4:
-            lead = self.lead
-            start = apply(C[lead].swapaxes(1, 2) @ self.C0[lead], phi0)
-            G = np.zeros((len(phi), 12, 12))
-            G[:, PHI, PHI] = exp_so3(0.5 * start - phi)
-            G[:, XI, XI] = G[:, RHO, RHO] = exp_so3(-phi)
-            G[:, PHI0, PHI0] = exp_so3(-0.5 * phi0)
+            G = np.zeros((M, 12, 12))
+            to_phi, to_motion, to_phi0 = turns[2 * B:].reshape(3, M, 3, 3)
+            G[:, PHI, PHI], G[:, PHI0, PHI0] = to_phi, to_phi0
+            G[:, XI, XI] = G[:, RHO, RHO] = to_motion
             rows = G @ self.P[:, :FIRST]
             self.P[:, :FIRST] = rows
             self.P[:, FIRST:, :FIRST] = rows[:, :, FIRST:].swapaxes(1, 2)
@@ -461,9 +462,8 @@ class Filters:
                           apply(C, self.w - self.w[lead]), log_so3(C0 @ self.C0),
                           self.x - self.x[lead]])
         variance = np.diagonal(self.P, axis1=1, axis2=2)[self.place]
-        near = np.all(away[:, np.r_[PHI, PHI0]] ** 2
-                      < alike ** 2 * variance[:, np.r_[PHI, PHI0]], axis=1)
-        near = np.minimum.reduceat(near, self.first)
+        near = np.all(away[:, PHI] ** 2 < alike ** 2 * variance[:, PHI], axis=1)
+        near = np.minimum.reduceat(near, self.first) & (np.bincount(self.place) > 1)
         if not near.any():
             return
         share = np.exp(self.weight)[:, None]

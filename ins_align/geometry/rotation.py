@@ -142,20 +142,17 @@ def cross(a: ArrayLike, b: ArrayLike) -> Array:
     return result
 
 
-def _trigonometric_factors(angle2: Array) -> tuple[Array, Array, Array]:
-    """sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 of x^2."""
-    series = (1 - angle2 / 6 * (1 - angle2 / 20 * (1 - angle2 / 42)),
-              0.5 - angle2 / 24 * (1 - angle2 / 30 * (1 - angle2 / 56)),
-              1 / 6 - angle2 / 120 * (1 - angle2 / 42 * (1 - angle2 / 72)))
+def _trigonometric_factors(angle2: Array) -> tuple[Array, Array]:
+    """sin(x)/x and (1 - cos x)/x^2 of x^2."""
+    a = 1 - angle2 / 6 * (1 - angle2 / 20 * (1 - angle2 / 42))
+    b = 0.5 - angle2 / 24 * (1 - angle2 / 30 * (1 - angle2 / 56))
     small = angle2 < _SERIES_ANGLE ** 2
-    if np.all(small):
-        return series
+    if small.all():
+        return a, b
     x2 = np.where(small, 1.0, angle2)
     x = np.sqrt(x2)
-    sine = np.sin(x)
-    a, b, c = (np.where(small, near, far) for near, far in zip(series, (
-        sine / x, 2 * np.sin(x / 2) ** 2 / x2, (x - sine) / (x * x2))))
-    return a, b, c
+    return (np.where(small, a, np.sin(x) / x),
+            np.where(small, b, 2 * np.sin(x / 2) ** 2 / x2))
 
 
 def exp_and_left_jacobian(vector: ArrayLike) -> tuple[Array, Array]:
@@ -167,7 +164,10 @@ def exp_and_left_jacobian(vector: ArrayLike) -> tuple[Array, Array]:
     """
     v = np.asarray(vector, dtype=float)
     angle2 = _squared_norm(v)
-    a, b, c = _trigonometric_factors(angle2)
+    a, b = _trigonometric_factors(angle2)
+    small = angle2 < _SERIES_ANGLE ** 2
+    c = np.where(small, 1 / 6 - angle2 / 120 * (1 - angle2 / 42 * (1 - angle2 / 72)),
+                 (1 - a) / np.where(small, 1.0, angle2))        # (x - sin x)/x^3
     return _rodrigues(v, angle2, a, b), _rodrigues(v, angle2, b, c)
 
 
@@ -210,7 +210,7 @@ def exp_so3(vector: ArrayLike) -> Array:
     v = np.asarray(vector, dtype=float)
     if v.ndim > 1:
         squares = _squared_norm(v)
-        return _rodrigues(v, squares, *_trigonometric_factors(squares)[:2])
+        return _rodrigues(v, squares, *_trigonometric_factors(squares))
     x, y, z = v.tolist()                          # a single one is quicker without arrays
     angle2 = x * x + y * y + z * z
     if angle2 < _SMALL_ANGLE ** 2:
@@ -238,7 +238,7 @@ def rotated(rotation: Array, vectors: Array) -> Array:
     ndarray, shape (..., 3)
 
     """
-    a, b, _ = _trigonometric_factors(_squared_norm(rotation))
+    a, b = _trigonometric_factors(_squared_norm(rotation))
     sideways = cross(rotation, vectors)
     return vectors + a[..., None] * sideways + b[..., None] * cross(rotation, sideways)
 
@@ -247,7 +247,8 @@ def log_so3(matrix: ArrayLike) -> Array:
     """
     Rotation vector of a rotation matrix, angle in [0, pi].
 
-    Goes through the quaternion, which keeps full precision at small angles and near pi.
+    Up to a right angle from sine and cosine, beyond it through the quaternion, which keeps full
+    precision near pi.
 
     Parameters
     ----------
@@ -260,7 +261,18 @@ def log_so3(matrix: ArrayLike) -> Array:
         Radians.
 
     """
-    q = quaternion_from_matrix(matrix)
+    m = np.asarray(matrix, dtype=float)
+    cosine = 0.5 * (m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2] - 1)
+    if (cosine > 0).all():
+        axis = np.empty(m.shape[:-1])
+        axis[..., 0] = m[..., 2, 1] - m[..., 1, 2]
+        axis[..., 1] = m[..., 0, 2] - m[..., 2, 0]
+        axis[..., 2] = m[..., 1, 0] - m[..., 0, 1]
+        sine = 0.5 * np.sqrt(_squared_norm(axis))
+        small = sine < 1e-12
+        scale = np.where(small, 0.5, 0.5 * _arctan2(sine, cosine) / np.where(small, 1.0, sine))
+        return axis * scale[..., None]
+    q = quaternion_from_matrix(m)
     sine = np.sqrt(np.sum(q[..., :3] ** 2, axis=-1))
     angle = 2 * _arctan2(sine, q[..., 3])
     small = sine < 1e-12
