@@ -338,7 +338,7 @@ def test_doubt_is_not_asked_about_before_everything_else_holds():
 @pytest.mark.parametrize('told, delay, believed', [
     ({}, 0.29, True), ({}, -0.31, False), ({'gnss_delay': 0.5, 'gnss_delay_std': 0.05}, 0.6, True),
     ({'gnss_delay': 0.5, 'gnss_delay_std': 0.05}, 0.7, False),
-    ({'gnss_delay_std': 1.0}, 0.4, False),
+    ({'gnss_delay_std': 0.3}, 0.8, True), ({'gnss_delay_std': 0.3}, 1.0, False),
     ({'gnss_delay': 0.5, 'gnss_delay_std': 0.0}, 0.5, True)])
 def test_delay_far_from_what_was_told_is_a_contradiction(told, delay, believed):
     declaration = Declaration(Config(**told))

@@ -29,7 +29,7 @@ from ins_align.estimation.filter import (
     triads)
 from ins_align.estimation.rivals import in_words, log_sum, Parameters, rivals_of, SHARE
 from ins_align.estimation.start import (
-    all_headings, HEADINGS, LOUD, OPEN_POSITION, RoughAttitude, Start)
+    all_headings, HEADINGS, LEAST_NOISE, LOUD, OPEN_POSITION, RoughAttitude, Start)
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.rotation import Array, exp_so3, log_so3
 from ins_align.gnss.antenna import AntennaEpoch, velocities_of
@@ -232,7 +232,7 @@ class Bank:
             np.stack([track.s_v(velocities_of(epochs)), track.s_p], axis=1),
             C_n0n @ covariance @ C_n0n.swapaxes(-1, -2),
             [(epoch.v_n is not None, epoch.position_measured and self._use_position)
-             for epoch in epochs], track.C_n0n)
+             for epoch in epochs], [epoch.stated for epoch in epochs], track.C_n0n)
 
     def _point_of(self, filters: Filters) -> Array:
         """Return the parameters of the likeliest mean of each rival, with one delay for all."""
@@ -268,7 +268,7 @@ class Bank:
             best = self._best(filters)
             square = float(new.nis[best]) / 3
             normalised = new.residual[best] / np.sqrt(np.diagonal(new.covariance[best]))
-            self._hear(kind, square, normalised)
+            self._hear(kind, square, normalised, track.stated[k][kind])
             rejected = not new.taken[best]
             self._rejected[kind] += rejected
             bad |= rejected
@@ -293,12 +293,13 @@ class Bank:
         """Return the same where those that are wrong are out of the question."""
         return np.where(self._wrong[filters.ids], -np.inf, self._posterior(filters))
 
-    def _hear(self, kind: int, square: float, normalised: Array) -> None:
+    def _hear(self, kind: int, square: float, normalised: Array, stated: bool) -> None:
         """Follow the noise of the receiver: how large it is, and how long errors last."""
         east, north, up = np.square(normalised).tolist()
         noise = self._noise[kind]
-        noise += FOLLOW * (np.minimum([0.5 * (east + north), up], CLIP) - LOUD)
-        np.maximum(noise, 0.0, out=noise)
+        noise += FOLLOW * (np.minimum([0.5 * (east + north), up], CLIP)
+                           - (LOUD if stated else 1.0))
+        np.maximum(noise, 0.0 if stated else math.log(LEAST_NOISE), out=noise)
         self._heard += 1
         share = 1 / min(self._heard, MEMORY)
         self._misfit += share * (min(square, CLIP) - self._misfit)
@@ -366,7 +367,8 @@ class Bank:
             one = slice(k, k + 1)
             model = self._model(filters, self._point_of(filters), imu.take(one))
             self._step(filters, model, 0, Track(track.s[one], track.covariance[one],
-                                                track.present[one], track.C_n0n[one]))
+                                                track.present[one], track.stated[one],
+                                                track.C_n0n[one]))
         self._start = Start(self._config)
         self._last = epochs[-1]
         self._anchor(filters, inertial.at(len(epochs) - 1))
@@ -497,6 +499,16 @@ class Bank:
         if self._lasting - CHANCE > max(MENTIONED, self._misfit):
             more += ('; errors of the GNSS last from epoch to epoch: sigmas are '
                      f'{math.sqrt(self.factor):.1f} times larger')
+        worst = self._rivals[0]
+        if self._filters is not None:
+            worst = self._rivals[self._filters.ids[self._best(self._filters)]]
+        noise = self._config.imu_noise
+        if worst.gyro > 1:
+            more += ('; the gyros are worse than configured: set gyro_bias_std to '
+                     f'{worst.gyro * math.degrees(noise.gyro_bias_std):.2g}')
+        if worst.accel > 1:
+            more += ('; the accelerometers are worse than configured: set accel_bias_std to '
+                     f'{worst.accel * noise.accel_bias_std:.2g}')
         return more
 
     def _body(self) -> tuple[Array, Array]:

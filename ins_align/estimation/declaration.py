@@ -35,9 +35,8 @@ REJECTED_SHARE = 0.25
 WITHDRAWN_AT = 2.0
 # Redundant rows before anything is declared.
 MIN_ROWS = 12
-# A delay is to be expected within so many of its sigmas; and further off (s) it is more than a
-# correction to the model, whatever the sigma.
-DELAY_SIGMAS, UNEXPLAINED_DELAY = 3.0, 0.3
+# A delay is to be expected within so many of its sigmas.
+DELAY_SIGMAS = 3.0
 # Conditions that have to hold are seen to hold at epochs that are no further apart than this (s).
 MAX_SILENCE = 30.0
 # Epochs over which the latest innovations are averaged.
@@ -222,7 +221,7 @@ class Declaration:
         if tilt > config.tilt_std_threshold and not self.levelled:
             return Verdict(State.ALIGNING,
                            f'tilt sigma {_above(tilt, config.tilt_std_threshold)}: wait, or turn '
-                           'or change speed')
+                           f'or change speed{fit.noise}')
         state = State.LEVELLED if self.levelled else State.ALIGNING
         if heading > config.heading_std_threshold:
             return Verdict(state, f'heading sigma {_above(heading, config.heading_std_threshold)}'
@@ -245,7 +244,7 @@ class Declaration:
             return ''
         config = self.config
         unexplained = abs(fit.delay - config.gnss_delay)
-        if unexplained > min(DELAY_SIGMAS * config.gnss_delay_std, UNEXPLAINED_DELAY) > 0:
+        if unexplained > DELAY_SIGMAS * config.gnss_delay_std > 0:
             return (f'the GNSS stamps seem to be {fit.delay:.2f} s late, gnss_delay is '
                     f'{config.gnss_delay:g} and gnss_delay_std {config.gnss_delay_std:g}: check '
                     'the clocks, or set gnss_delay')

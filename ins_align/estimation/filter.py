@@ -64,6 +64,8 @@ class Track:
     covariance : ndarray, shape (K, 2, 3, 3)
     present : list of (bool, bool)
         Whether there is a velocity, a position.
+    stated : list of (bool, bool)
+        Whether the receiver states its noise.
     C_n0n : ndarray, shape (K, 3, 3)
 
     """
@@ -71,6 +73,7 @@ class Track:
     s: Array
     covariance: Array
     present: list[tuple[bool, bool]]
+    stated: list[tuple[bool, bool]]
     C_n0n: Array
 
 

@@ -52,8 +52,8 @@ class Rival:
         What to do then.
     signs : tuple of float
         Of the gyros x, y, z and of the accelerometers.
-    gyro : float
-        Factor on the gyros' bias and rate random walk.
+    gyro, accel : float
+        Factor on the gyros' bias and rate random walk; on the accelerometers' bias.
     lever_arm_std, gnss_delay_std, gyro_bias_std, accel_bias_std : float
         At least so much (SI).
     prior : float
@@ -65,6 +65,7 @@ class Rival:
     advice: str = 'check the IMU axes'
     signs: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     gyro: float = 1.0
+    accel: float = 1.0
     lever_arm_std: float = 0.0
     gnss_delay_std: float = 0.0
     gyro_bias_std: float = 0.0
@@ -77,8 +78,12 @@ class Rival:
         return bool(self.better)
 
 
-CONFIGURED = Rival()
-LEVELS = (Rival(gyro=3.0, prior=-5.5), Rival(gyro=10.0, prior=-11.0))
+# An IMU may be so many times worse than configured, in the biases of its gyros and of its
+# accelerometers, at such a log prior; the first level is the configuration.
+WORSE_GYROS = (1.0, 0.0), (3.0, -5.5), (10.0, -11.0)
+WORSE_ACCELS = (1.0, 0.0), (3.0, -3.0), (10.0, -5.0)
+LEVELS = tuple(Rival(gyro=gyro, accel=accel, prior=for_gyro + for_accel)
+               for accel, for_accel in WORSE_ACCELS for gyro, for_gyro in WORSE_GYROS)
 SIGNS = (
     Rival('the accelerations reversed (sign of gravity instead of specific force?)',
           signs=(1.0, 1.0, 1.0, -1.0)),
@@ -109,7 +114,7 @@ def rivals_of(config: Config) -> tuple[Rival, ...]:
     """Return the rivals of a configuration, which itself comes first."""
     stated = vars(config) | config.imu_noise._asdict()
     told = tuple(rival for name, std, rival in TOLD if stated[name] < std)
-    return (CONFIGURED, *LEVELS, *(() if config.trust_imu_axes else SIGNS), *told)
+    return (*LEVELS, *(() if config.trust_imu_axes else SIGNS), *told)
 
 
 @dataclass
@@ -154,10 +159,11 @@ class Parameters:
         std[LEVER_ARM] = max(config.lever_arm_std, rival.lever_arm_std)
         std[DELAY] = max(config.gnss_delay_std, rival.gnss_delay_std)
         std[GYRO:GYRO + 3] = max(rival.gyro * noise.gyro_bias_std, rival.gyro_bias_std)
-        std[accel:accel + 3] = accel_std = max(noise.accel_bias_std, rival.accel_bias_std)
+        accel_std = max(rival.accel * noise.accel_bias_std, rival.accel_bias_std)
+        std[accel:accel + 3] = accel_std
         walk[DELAY] = (DELAY_WANDER * config.gnss_delay_std) ** 2 / WANDER_TIME
         walk[GYRO:GYRO + 3] = (rival.gyro * noise.rate_random_walk) ** 2
-        walk[accel:accel + 3] = (ACCEL_WANDER * noise.accel_bias_std) ** 2 / WANDER_TIME
+        walk[accel:accel + 3] = (ACCEL_WANDER * accel_std) ** 2 / WANDER_TIME
         P = np.diag(std ** 2)
         if matrices:
             P[GYRO + 3:accel, GYRO + 3:accel] = np.diag(

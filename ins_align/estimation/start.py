@@ -38,6 +38,8 @@ START_RATIO = 20.0
 # Residuals in the mean square, over what the receiver states, above which its noise is taken to be
 # larger, or one epoch for an outlier if those of the others are so many times smaller without it.
 LOUD, OUTLYING = 2.0, 10.0
+# The noise of a receiver that states none is estimated; least factor on the configured variance.
+LEAST_NOISE = 1e-2
 # Headings, every two degrees, and their sigma over the step between them: the sum of such normal
 # densities is flat to 2e-6.
 HEADINGS, STEP_STD = 180, 0.6
@@ -132,7 +134,9 @@ class Start:
             usual = float(np.mean(variance[places]))
             noise = residual / (3 * (len(places) - 2 - kind) * usual)
             values, vectors = np.linalg.eigh(moments)
-            if values[-1] < START_RATIO ** 2 * usual * max(noise, 1.0):
+            stated = any(epochs[k].stated[kind] for k in places)
+            noise = max(noise, 1.0 if stated else LEAST_NOISE)
+            if values[-1] < START_RATIO ** 2 * usual * noise:
                 return None
             if noise < LOUD or len(places) <= FIRST_EPOCHS + kind:
                 break
@@ -148,7 +152,7 @@ class Start:
         if places[0] > 0:
             self._drop_first()
             return self.solve(use_position)
-        return RoughAttitude(C, vectors[:, -1], kind, noise if noise > LOUD else 1.0)
+        return RoughAttitude(C, vectors[:, -1], kind, noise if noise > LOUD or not stated else 1.0)
 
     def _pairs(self, kind: int) -> tuple[Array, Array, Array]:
         """Return the times and the vectors of the formula, free start, for all epochs."""

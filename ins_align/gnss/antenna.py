@@ -68,6 +68,7 @@ class AntennaEpoch:
     velocity_covariance: Array
     position_measured: bool
     position_covariance: Array
+    stated: tuple[bool, bool] = (True, True)
 
 
 def velocities_of(epochs: Sequence[AntennaEpoch]) -> Array:
@@ -149,7 +150,9 @@ class Antenna:
                 self._check.add(message.stamp_ns * 1e-9, self._place, v_n,
                                 math.sqrt(max(variances[:2])))
         return AntennaEpoch(message.stamp_ns, *self._place, v_n, self._covariance_of(velocity),
-                            believed, position_covariance)
+                            believed, position_covariance,
+                            (velocity is None or velocity.covariance is not None,
+                             fix is None or fix.covariance is not None))
 
     def _look_for_vertical(self, v_n: Array, measured: bool) -> None:
         """Notice a receiver that moves and never says anything but 0 of the vertical."""

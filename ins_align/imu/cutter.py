@@ -29,7 +29,7 @@ from ins_align.imu.buffer import ImuBuffer
 from ins_align.imu.plausibility import IMU_BEFORE, RangeCheck, without_spikes
 from ins_align.imu.preintegration import (
     Intervals, Noise, preintegrate, SensorErrors, split_at_epochs, Steps, white_noise)
-from ins_align.imu.recent import Recent, recent_motion
+from ins_align.imu.recent import AGES, Recent, recent_motion
 import numpy as np
 
 # A step this many times the usual one holds lost samples; what the motion can do meanwhile
@@ -44,6 +44,8 @@ JITTER_OF_MEDIAN = 1.4826 / math.sqrt(2)
 # Noise is measured over the interval and this long before it (ns); it counts when it is this
 # many times the stated one.
 NOISE_WINDOW_NS = 500_000_000
+# Samples are kept for that, and for as long as a receiver may be late.
+KEPT_NS = max(NOISE_WINDOW_NS, round(1e9 * AGES[-1]))
 NOISE_EXCESS = 1.25
 
 
@@ -85,7 +87,7 @@ class ImuCutter:
 
     def forget_before(self, stamp_ns: int) -> None:
         """Keep what an epoch at or after a stamp wants to look back at."""
-        self._buffer.forget_before(stamp_ns - NOISE_WINDOW_NS)
+        self._buffer.forget_before(stamp_ns - KEPT_NS)
         self._range.forget_before(stamp_ns)
 
     def check_range(self, upto_ns: int) -> list[int]:

@@ -26,7 +26,9 @@ from ins_align.geometry.rotation import Array, cross, Index, rotated
 import numpy as np
 
 # Seconds between the ages, and how many there are: all of them as long as delays are.
-RUNG, RUNGS = 0.025, 12
+RUNG, RUNGS = 0.025, 40
+# Between samples so far apart (s) nobody knows how the vehicle has moved.
+SILENCE = 0.3
 AGES = RUNG * np.arange(1, RUNGS + 1)
 # Steps of all epochs, each as many as the one with most, that are looked at in one go.
 MAX_STEPS = 65536
@@ -102,7 +104,7 @@ def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'A
     step = np.minimum(step, last[:, None] - 1)
     begin, end = ((stamps[step.T + k] - epochs).T * unit for k in (0, 1))
     # Nothing is known of a silence and what was before it.
-    heard = np.logical_and.accumulate((end - begin < AGES[-1])[:, ::-1], axis=1)[:, ::-1]
+    heard = np.logical_and.accumulate((end - begin < SILENCE)[:, ::-1], axis=1)[:, ::-1]
     dt = np.where(inside & heard, np.minimum(end, 0.0) - begin, 0.0)[..., None]
     samples = np.concatenate([gyro.T, accel.T])
     middle = (0.5 * (samples[:, :-1] + samples[:, 1:])).take(step.T, axis=1).T
