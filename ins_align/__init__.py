@@ -38,3 +38,37 @@ are integer nanoseconds. Attitude errors are small rotations about the axes of E
 Chain rule: ``C_nb(t) = C_n0n(t)^T C_nb(0) C_b0b(t)``; the one unknown is ``C_nb(0)``, the
 initial attitude.
 """
+
+from importlib import import_module
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ins_align.aligner import Aligner
+    from ins_align.config import Config, ConfigError
+    from ins_align.gnss.messages import Fix, Velocity
+    from ins_align.offline import align
+    from ins_align.recordings.info import inspect
+    from ins_align.recordings.replay import replay
+    from ins_align.results import Attitude, Epoch, State, Status
+    from ins_align.simulation.simulate import simulate
+
+# The public names and where they are. They are imported when they are used (PEP 562), so that
+# nobody needs what only another name needs: a robot no rosbags, the help of a command no numpy.
+_MODULES = {
+    'align': 'offline', 'Aligner': 'aligner', 'Attitude': 'results', 'Config': 'config',
+    'ConfigError': 'config', 'Epoch': 'results', 'Fix': 'gnss.messages',
+    'inspect': 'recordings.info', 'replay': 'recordings.replay',
+    'simulate': 'simulation.simulate', 'State': 'results', 'Status': 'results',
+    'Velocity': 'gnss.messages'}
+__all__ = ['Aligner', 'Attitude', 'Config', 'ConfigError', 'Epoch', 'Fix', 'State', 'Status',
+           'Velocity', 'align', 'inspect', 'replay', 'simulate']
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    return getattr(import_module(f'{__name__}.{_MODULES[name]}'), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

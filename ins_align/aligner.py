@@ -14,29 +14,42 @@
 """
 The aligner: messages in, attitudes and states out.
 
-An intake and an alignment behind one face; replay uses the two themselves. Messages are buffered;
-an epoch is processed when IMU samples `gnss_lateness` newer than it have come, so that late
-messages find their place and the results depend on the messages alone.
+A message's way, in eight steps: 1 the caller turns it into numbers (`gnss.messages`,
+`ros.imu_bytes`, `recordings.decode`); 2 it waits in a queue until nothing late can precede it;
+3 queue and antenna give an epoch; 4 preintegration gives the IMU's interval before it; 5 the bank
+propagates and updates; 6 the rivals are heard; 7 the declaration decides; 8 an `Epoch` goes out.
+
+An epoch is processed when IMU samples `gnss_lateness` newer than it have come, so that the results
+depend on the messages alone and not on when `update` is called.
 """
 
 from collections import Counter
 from copy import copy
 
-from ins_align.alignment import Alignment
 from ins_align.config import Config, ConfigError, parameters
+from ins_align.estimation.bank import Bank, Learnt
+from ins_align.estimation.declaration import Declaration, Fit
+from ins_align.estimation.formula import NoteMethod
 from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import Array
+from ins_align.gnss.antenna import Antenna, AntennaEpoch
+from ins_align.gnss.buffer import GnssBuffer, GnssEpoch, PAIR_NS
 from ins_align.gnss.messages import Fix, Velocity
-from ins_align.imu.buffer import MAX_GAP_NS
-from ins_align.imu.plausibility import IMU_BEFORE, without_spikes
+from ins_align.imu.buffer import ImuBuffer
+from ins_align.imu.cutter import ImuCutter, NO_SAMPLE
+from ins_align.imu.plausibility import ForceCheck
 from ins_align.imu.prediction import Prediction
-from ins_align.intake import Intake
-from ins_align.results import Attitude, Epoch, Event, Severity, State, Status
+from ins_align.results import Attitude, Epoch, Event, Nuisance, Severity, State, Status, Verdict
 import numpy as np
 
 __all__ = ['Aligner', 'Attitude', 'Epoch', 'State', 'Status']
 
-MAX_TOLD = 100  # sentences on messages that were rejected
+# Without GNSS there is an epoch without measurement this often, which bounds the queues (ns).
+DRY_INTERVAL_NS = 2_000_000_000
+# Positions alone are used when no velocity came for this long (ns).
+NO_VELOCITY_NS = 2_000_000_000
+MAX_WARNINGS = 100      # different sentences about messages that could not be used
+_DECLARED = {State.LEVELLED: 1, State.ALIGNED: 2}
 
 
 class Aligner:
@@ -46,36 +59,61 @@ class Aligner:
     Parameters
     ----------
     config : Config, optional
+        By default all parameters at their defaults.
+
+    Attributes
+    ----------
+    config : Config
+    declared : Attitude or None
+        The initial attitude as it was declared; None while none is.
 
     """
 
     def __init__(self, config: Config | None = None) -> None:
         """Wait for the first messages."""
         self.config = Config() if config is None else config
-        self._intake = Intake(self.config)
-        self._alignment = Alignment(self.config)
+        self._counts: Counter[str] = Counter()      # of messages, by what became of them
         self._events: list[Event] = []
-        self._told: set[str] = set()                # of messages that were rejected
-        self._done: list[Epoch] = []
-        self._now: Prediction | None = None
+        self._warned: set[str] = set()
+        self._done: list[Epoch] = []                # not returned yet
+        self._delay_ns = round(self.config.gnss_delay * 1e9)
+        self._method: Bank | NoteMethod | None = None
+        self._forget_all()
 
-    @property
-    def declared(self) -> Attitude | None:
-        """Return the initial attitude as it was declared, None while none is."""
-        return self._alignment.declared
+    def _forget_all(self) -> None:
+        """Forget everything but the counts."""
+        lateness_ns = round(self.config.gnss_lateness * 1e9) + max(self._delay_ns, 0)
+        self._imu = ImuBuffer(lateness_ns, self._counts)
+        self._gnss = GnssBuffer(lateness_ns, self._counts,
+                                0 if self.config.use_velocity is False else PAIR_NS)
+        self._cutter = ImuCutter(self.config.imu_noise, self._imu, self._counts)
+        self._refusal = ''                          # why velocities cannot be used
+        self._first_t0_ns: int | None = None
+        self._forget(None)
 
-    @property
-    def counts(self) -> Counter[str]:
-        """Return what became of messages and epochs, by name."""
-        return Counter(self.status().counts)
+    def _forget(self, learnt: Learnt | None) -> None:
+        """Wait for another t0; the queues stay, and what was learnt of sensors and antenna."""
+        if self._method is not None:
+            self._counts.update(_epoch_counts(self._method))
+        self._learnt = learnt
+        self._method = None
+        self._antenna = Antenna(self.config, self._counts)
+        self._declaration = Declaration(self.config)
+        self._force_check = ForceCheck()
+        self._counts_before = Counter(self._counts)
+        self._first_fix_ns: int | None = None
+        self._lined_up: list[AntennaEpoch] = []     # epochs that wait for steps 4 to 8
+        self._last_ns: int | None = None            # the last epoch since t0; None before it
+        self._start_ns = self._measured_ns = 0      # t0 before it moves; the last measurement
+        self._without_velocity = ''                 # why velocities that came are of no use
+        self._verdict = Verdict(State.WAITING_FOR_IMU, 'no IMU sample yet')
+        self._time_to_align_s: float | None = None
+        self._initial: Attitude | None = None
+        self._current: Attitude | None = None
+        self.declared: Attitude | None = None
+        self._prediction: Prediction | None = None  # from `_current` on
 
-    @property
-    def newest_imu_ns(self) -> int | None:
-        """Return the stamp of the newest IMU sample of use, None where there is none."""
-        stamps = self._intake.imu.stamps
-        return int(stamps[-1]) if stamps.size else None
-
-    # Input
+    # Input: step 2
 
     def add_imu(self, stamp_ns: 'int | np.ndarray', gyro: Array, accel: Array) -> None:
         """
@@ -89,34 +127,52 @@ class Aligner:
             Angular rate, rad/s; specific force, m/s^2.
 
         """
-        if isinstance(stamp_ns, np.ndarray):
-            # Copies: they are looked at later.
-            self._intake.add_imu_array(np.array(stamp_ns, np.int64), np.array(gyro, float),
-                                       np.array(accel, float))
-        else:
-            self._intake.add_imu(stamp_ns, gyro, accel)
-        if self._intake.steps:                      # the clock has jumped
-            self._go()
+        if not isinstance(stamp_ns, np.ndarray):
+            self._imu.add(stamp_ns, gyro, accel)
+            if self._imu.jumped_to_ns is not None:
+                self._clock_jumped()
+                self._imu.add(stamp_ns, gyro, accel)
+            return
+        # Copies: they are used later.
+        stamps_ns = np.array(stamp_ns, np.int64)
+        gyro, accel = np.array(gyro, float), np.array(accel, float)
+        while (taken := self._imu.add_many(stamps_ns, gyro, accel)) < stamps_ns.size:
+            self._clock_jumped()
+            stamps_ns, gyro, accel = stamps_ns[taken:], gyro[taken:], accel[taken:]
 
     def add_fix(self, fix: Fix) -> None:
         """Take a GNSS position."""
-        self._intake.add_fix(fix)
+        self._gnss.add_fix(fix._replace(stamp_ns=fix.stamp_ns - self._delay_ns),
+                           self._imu.newest_ns)
 
     def add_velocity(self, velocity: Velocity) -> None:
         """Take a GNSS velocity."""
-        self._intake.add_velocity(velocity)
+        self._refusal = ''
+        self._gnss.add_velocity(velocity._replace(stamp_ns=velocity.stamp_ns - self._delay_ns),
+                                self._imu.newest_ns)
 
     def reject(self, reason: str, why: str = '') -> None:
-        """Count a message that an adapter could not use; `why`, in words, is told once."""
-        self._intake.reject(reason, why)
-        if why and why not in self._told and len(self._told) < MAX_TOLD:
-            self._told.add(why)
+        """Count a message that the caller could not use; `why`, in words, is an event, once."""
+        self._counts[reason] += 1
+        self._refusal = why or self._refusal
+        if why and why not in self._warned and len(self._warned) < MAX_WARNINGS:
+            self._warned.add(why)
             self._events.append(Event(Severity.WARNING, why))
 
     def reset(self, reason: str = 'on request') -> None:
-        """Start over."""
-        self._intake.reset(reason)
-        self._go()
+        """Start over, with nothing known; the reason in words."""
+        self._counts['resets'] += 1
+        self._start_over(f'alignment starts over: {reason}')
+
+    def _clock_jumped(self) -> None:
+        self._process()                             # what could have been asked for before
+        self._counts['clock_jumps'] += 1
+        # A recording that is played again says nothing new: what it said before is no prior.
+        self._start_over('the clock of the IMU jumped back: alignment starts over')
+
+    def _start_over(self, event: str) -> None:
+        self._events.append(Event(Severity.WARNING, event))
+        self._forget_all()
 
     def reconfigure(self, config: Config) -> None:
         """
@@ -133,42 +189,239 @@ class Aligner:
                                         != getattr(self.config, parameter.name)):
                 raise ConfigError(f'{parameter.name} cannot change while running: set it at '
                                   'start')
-        self.config = config
-        self._alignment.reconfigure(config)
+        self.config = self._declaration.config = config
 
-    # Processing
+    # Processing: steps 3 to 8
 
-    def update(self) -> list[Epoch]:
-        """Process what nothing late can precede any more; return the GNSS epochs in it."""
-        return self._process(last=False)
+    def update(self, dry: bool = False) -> list[Epoch]:
+        """
+        Process what nothing late can precede any more.
 
-    def flush(self) -> list[Epoch]:
-        """Process the rest, at the end of a recording; return the GNSS epochs in it."""
-        return self._process(last=True)
+        Parameters
+        ----------
+        dry : bool
+            Whether to return the epochs without measurement that divide an outage, too.
 
-    def _process(self, last: bool) -> list[Epoch]:
-        """Process what can be; return the GNSS epochs that were not returned yet."""
-        self._intake.prepare(last)
-        self._go()
+        Returns
+        -------
+        list of Epoch
+            Those that were not returned yet.
+
+        """
+        self._process()
+        return self._take_done(dry)
+
+    def flush(self, dry: bool = False) -> list[Epoch]:
+        """Process the rest, at the end of a recording; otherwise as `update`."""
+        self._process(last=True)
+        return self._take_done(dry)
+
+    def _take_done(self, dry: bool) -> list[Epoch]:
         done, self._done = self._done, []
-        return done
+        return [epoch for epoch in done if dry or not epoch.dry]
 
-    def _go(self) -> None:
-        """Go the steps that are prepared."""
-        for step in self._intake.take_steps():
-            self._done += [epoch for epoch in self._alignment.go(step) if not epoch.dry]
-            self._now = None
+    def _process(self, last: bool = False) -> None:
+        """Process the messages that wait, as far as nothing late can precede them any more."""
+        upto_ns = self._imu.settled_ns(last)
+        if upto_ns is None:
+            if left_out := self._imu.left_out(self._counts_before):
+                self._wait(State.WAITING_FOR_IMU, f'no IMU sample of use yet: {left_out}')
+            return
+        self._cutter.check(upto_ns)
+        for message in self._gnss.release(upto_ns, last):
+            self._bridge_outage(message.stamp_ns)
+            self._line_up(message)
+        waiting_ns = self._gnss.oldest_ns
+        self._bridge_outage(upto_ns if waiting_ns is None else min(upto_ns, waiting_ns))
+        self._align()
+        if self._last_ns is not None and self._imu.silent:
+            self._counts['imu_gap'] += 1
+            self._lose(NO_SAMPLE)
+        if self._last_ns is None:
+            self._cutter.forget_before(upto_ns)
+            if self._imu.silent:
+                self._wait(State.WAITING_FOR_IMU, NO_SAMPLE)
+            elif self._first_fix_ns is None:
+                left_out = self._gnss.left_out('fix', self._counts_before)
+                self._wait(State.WAITING_FOR_GNSS,
+                           'no GNSS position yet' + (left_out and f': {left_out}'))
+
+    def _line_up(self, message: GnssEpoch) -> None:
+        """Make an epoch of GNSS messages: t0, or one that follows it."""
+        if self._last_ns is not None and message.stamp_ns <= self._last_ns:
+            self._counts['gnss_out_of_order'] += 1
+            return
+        # 3. Queue and antenna give an epoch.
+        epoch = self._antenna.epoch(message)
+        if self._antenna.jumped:
+            self._lose('the position jumped')
+            epoch = self._antenna.epoch(message)
+        if self._last_ns is None:
+            if epoch is not None:
+                self._start(epoch)
+            self._counts['epochs_before_start'] += self._last_ns is None
+        elif epoch is not None:
+            if silence := self._cutter.silence(self._last_ns, epoch.stamp_ns):
+                self._counts[silence.counter] += 1
+                self._counts['epochs_before_start'] += not epoch.dry
+                self._lose(silence.why)
+            else:
+                self._lined_up.append(epoch)
+                self._last_ns = epoch.stamp_ns
+
+    def _align(self) -> None:
+        """Take the epochs that are lined up through steps 4 to 8, many at a time."""
+        epochs, self._lined_up = self._lined_up, []
+        method = self._method
+        if method is None or not epochs:
+            return
+        for part in self._cutter.parts([epoch.stamp_ns for epoch in epochs]):
+            # 4. Preintegration gives the IMU's interval before each.
+            imu, forces = self._cutter.cut([epoch.stamp_ns for epoch in epochs[part]],
+                                           [epoch.gravity_drift for epoch in epochs[part]])
+            # 5. The bank propagates and updates; each epoch comes when the estimates are its.
+            taken = method.advance(epochs[part], imu.integrated())
+            for epoch, force in zip(taken, forces):
+                self._force_check.add(*force)
+                self._judge(epoch, method)
+
+    def _judge(self, epoch: AntennaEpoch, method: Bank | NoteMethod) -> None:
+        """Decide what is declared after an epoch, and yield it."""
+        # 6. The rivals are heard: what they object is a part of the fit.
+        fit = method.fit()
+        # 7. The declaration decides the state and the words.
+        verdict = self._decide(epoch, method, fit)
+        if epoch.v_n is not None:
+            self._without_velocity = ''
+        if fault := self._force_check.fault or epoch.fault:
+            self._declaration.withdraw()
+            verdict = Verdict(State.FAULT, fault)
+        if self._without_velocity:
+            verdict = Verdict(verdict.state, f'{verdict.reason}; no GNSS velocity is used: '
+                                             f'{self._without_velocity}')
+        if verdict.state is State.ALIGNED and self.declared is None:
+            self.declared = self._initial
+            self._time_to_align_s = (epoch.stamp_ns - self._start_ns) * 1e-9
+        elif verdict.state is not State.ALIGNED and self.declared is not None:
+            self.declared = self._time_to_align_s = None
+            self._counts['withdrawals'] += 1
+        self._set_verdict(verdict)
+        # 8. The epoch goes out: to topics, or to a row of a table.
+        sensors = method.sensor_errors()
+        self._done.append(Epoch(
+            epoch.stamp_ns, (epoch.stamp_ns - (self._first_t0_ns or 0)) * 1e-9, verdict.state,
+            self._initial, self._current, fit.innovation, sensors.gyro_bias, sensors.accel_bias,
+            epoch.dry))
+
+    def _decide(self, epoch: AntennaEpoch, method: Bank | NoteMethod, fit: Fit) -> Verdict:
+        """Take over the attitudes after an epoch; return the verdict of the declaration."""
+        stamp_ns, declaration = epoch.stamp_ns, self._declaration
+        initial, current = method.initial(), method.current()
+        self._initial = self._current = self._prediction = None
+        measured = epoch.v_n is not None or epoch.position_measured
+        if measured:
+            self._measured_ns = stamp_ns
+        silent_s = (stamp_ns - self._measured_ns) * 1e-9
+        if initial is None or current is None:
+            return declaration.update_without_attitude(silent_s, fit)
+        if measured:
+            verdict = declaration.update((stamp_ns - self._start_ns) * 1e-9, initial[1],
+                                         current[1], fit, method.unconfirmed)
+            if declaration.move_t0:
+                method.move_t0()
+                initial = method.initial() or initial
+        else:
+            verdict = declaration.update_without_gnss(silent_s, initial[1], current[1], fit)
+        self._initial = Attitude(method.t0_ns, *initial)
+        self._current = Attitude(stamp_ns, *current)
+        return verdict
+
+    # Start, outages, loss
+
+    def _start(self, epoch: AntennaEpoch) -> None:
+        """Make an epoch t0 if it can be one, or say what it waits for."""
+        if not epoch.position_measured:
+            return
+        if self._first_fix_ns is None:
+            self._first_fix_ns = epoch.stamp_ns
+        config = self.config
+        wanted = config.use_velocity is not False
+        alone = not wanted or (config.use_velocity == 'auto' and config.method != 'vif'
+                               and epoch.stamp_ns - self._first_fix_ns >= NO_VELOCITY_NS)
+        no_velocity = self._refusal or self._gnss.left_out('velocity', self._counts_before)
+        if epoch.v_n is None and not alone:
+            self._wait(State.WAITING_FOR_GNSS,
+                       'no GNSS velocity yet' + (no_velocity and f': {no_velocity}'))
+            return
+        use_position = config.use_position
+        if use_position == 'auto':
+            # Beside velocities positions gain little and hurt when their errors wander or their
+            # stamps are a few milliseconds off.
+            use_position = epoch.v_n is None
+        if epoch.v_n is None and not use_position:
+            self._wait(State.WAITING_FOR_GNSS, 'no GNSS velocity yet, and use_position is false')
+            return
+        if self._imu.stamps[0] > epoch.stamp_ns:
+            return
+        if silence := self._cutter.silence(epoch.stamp_ns, epoch.stamp_ns):
+            self._wait(State.WAITING_FOR_IMU, silence.why)
+            return
+        self._last_ns = self._start_ns = epoch.stamp_ns
+        if self._first_t0_ns is None:
+            self._first_t0_ns = epoch.stamp_ns
+        self._without_velocity = no_velocity if wanted and epoch.v_n is None else ''
+        imu = self._cutter.start(epoch.stamp_ns).integrated()
+        if config.method == 'bank':
+            self._method = Bank(config, epoch, imu, bool(use_position), self._learnt)
+        else:
+            self._method = NoteMethod(config, epoch, imu, epoch.v_n is None)
+        self._judge(epoch, self._method)
+
+    def _bridge_outage(self, upto_ns: int) -> None:
+        """Go on without GNSS up to a stamp in steps of bounded length."""
+        while self._last_ns is not None and upto_ns - self._last_ns > DRY_INTERVAL_NS:
+            self._line_up(GnssEpoch(self._last_ns + DRY_INTERVAL_NS))
+
+    def _lose(self, why: str) -> None:
+        """Start over without the attitude; what was learnt of the sensors is kept."""
+        self._align()
+        learnt = self._learnt
+        if self._method is not None:
+            self._counts['restarts'] += 1
+            self._events.append(Event(Severity.WARNING, f'alignment starts over: {why}'))
+            learnt = self._method.learnt()
+        self._forget(learnt)
+
+    def _wait(self, state: State, reason: str) -> None:
+        self._set_verdict(Verdict(state, reason))
+
+    def _set_verdict(self, verdict: Verdict) -> None:
+        """Take over a verdict; another state is an event."""
+        before, state = self._verdict.state, verdict.state
+        if state is not before:
+            severity = Severity.INFO
+            if state is State.FAULT:
+                severity = Severity.ERROR
+            elif _DECLARED.get(state, 0) < _DECLARED.get(before, 0):
+                severity = Severity.WARNING
+            self._events.append(Event(severity, f'{state.value}: {verdict.reason}'))
+        self._verdict = verdict
 
     # Output
 
     def take_events(self) -> list[Event]:
         """Return and forget the events since the last call."""
-        events, self._events = self._events + self._alignment.take_events(), []
+        events, self._events = self._events, []
         return events
+
+    @property
+    def newest_imu_ns(self) -> int | None:
+        """Return the stamp of the newest IMU sample of use, None where there is none."""
+        return int(self._imu.stamps[-1]) if self._imu.stamps.size else None
 
     def attitude_now(self) -> Attitude | None:
         """
-        Return the current attitude carried on with the gyros to the newest IMU sample.
+        Return the current attitude, carried on with the gyros to the newest IMU sample.
 
         None before there is one, and after a gap of the IMU.
         """
@@ -177,30 +430,45 @@ class Aligner:
                                                         *prediction.matrices())
 
     def prediction(self) -> Prediction | None:
-        """Return the attitude at the newest IMU sample to be carried on by whoever asks."""
-        current, imu = self._alignment.current, self._intake.imu
-        if current is None:
+        """Return the attitude at the newest IMU sample, for the caller to carry on."""
+        current, method = self._current, self._method
+        if current is None or method is None:
             return None
-        imu.consolidate()
-        start_ns = current.stamp_ns if self._now is None else self._now.stamp_ns
-        stamps = imu.stamps
-        first = int(np.searchsorted(stamps, start_ns, side='right'))
-        if np.any(np.diff(stamps[first:], prepend=start_ns) > MAX_GAP_NS):
+        since = self._imu.rates_since(
+            current.stamp_ns if self._prediction is None else self._prediction.stamp_ns)
+        if since is None:
             return None                             # nobody knows how it has turned since
-        looked_at = max(first - IMU_BEFORE, 0)
-        samples, _ = without_spikes(stamps[looked_at:], imu.samples[looked_at:])
-        rates = samples[:, :3]
-        if self._now is None:
-            sensors = self._alignment.sensor_errors()
-            bias_std = float(np.max(self._alignment.nuisance().gyro_bias_std))
-            self._now = Prediction(
-                start_ns, current.C_nb, current.covariance, sensors.gyro_bias,
-                sensors.gyro_matrix,
-                self.config.imu_noise.angle_random_walk, bias_std ** 2 + EARTH_RATE ** 2,
-                [float(np.interp(0.0, stamps[looked_at:] - start_ns, rate)) for rate in rates.T])
-        self._now.carry_many(stamps[first:], rates[first - looked_at:])
-        return copy(self._now)
+        stamps, rates, rate = since
+        if self._prediction is None:
+            sensors = method.sensor_errors()
+            bias_std = float(np.max(method.nuisance().gyro_bias_std))
+            self._prediction = Prediction(
+                current.stamp_ns, current.C_nb, current.covariance, sensors.gyro_bias,
+                sensors.gyro_matrix, self.config.imu_noise.angle_random_walk,
+                bias_std ** 2 + EARTH_RATE ** 2, rate.tolist())
+        self._prediction.carry_many(stamps, rates)
+        return copy(self._prediction)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Return what became of messages and epochs, by name."""
+        counts = Counter(self._counts)
+        counts.update(_epoch_counts(self._method))
+        return counts
 
     def status(self) -> Status:
         """Return the state, the reason for it, the estimates and the counts."""
-        return self._alignment.status(self._intake.counts)
+        method = self._method
+        nuisance = Nuisance.configured(self.config) if method is None else method.nuisance()
+        return Status(self._verdict.state, self._verdict.reason, self._last_ns,
+                      None if method is None else method.t0_ns, self._time_to_align_s,
+                      self._initial, self._current, **vars(nuisance), counts=dict(self.counts))
+
+
+def _epoch_counts(method: Bank | NoteMethod | None) -> Counter[str]:
+    """Return what became of the epochs of an alignment."""
+    fit = Fit(0) if method is None else method.fit()
+    return Counter(epochs_used=fit.offered - fit.rejected,
+                   epochs_rejected_velocity=fit.rejected_velocity,
+                   epochs_rejected_position=fit.rejected_position,
+                   rebases=0 if method is None else method.moved)

@@ -13,13 +13,21 @@
 # limitations under the License.
 """What an alignment yields: its state, attitudes, epochs, events, the status."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-from typing import NamedTuple
+import io
+import math
+from typing import Any, NamedTuple
 
+from ins_align.config import Config
 from ins_align.geometry.rotation import Array, quaternion_from_matrix, roll_pitch_yaw
 import numpy as np
+
+_ATTITUDE_COLUMNS = 'qx,qy,qz,qw,sigma_e_deg,sigma_n_deg,sigma_u_deg'
+CSV_HEADER = 'stamp_ns,t_s,state,' + ','.join(
+    prefix + name for prefix in ('', 'current_') for name in _ATTITUDE_COLUMNS.split(','))
 
 
 class State(str, Enum):
@@ -168,6 +176,14 @@ class Nuisance:
     gnss_delay: float
     gnss_delay_std: float
 
+    @classmethod
+    def configured(cls, config: Config) -> 'Nuisance':
+        """Return what is known before the first epoch."""
+        noise, zero = config.imu_noise, np.zeros(3)
+        return cls(zero, np.full(3, noise.gyro_bias_std), zero, np.full(3, noise.accel_bias_std),
+                   np.array(config.lever_arm), np.full(3, config.lever_arm_std),
+                   config.gnss_delay, config.gnss_delay_std)
+
 
 @dataclass(frozen=True)
 class Status:
@@ -189,3 +205,104 @@ class Status:
     gnss_delay: float
     gnss_delay_std: float
     counts: dict[str, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """
+    What came of an alignment of recorded data.
+
+    Attributes
+    ----------
+    config : Config
+    status : Status
+        At the end.
+    epochs : tuple of Epoch
+        Those without GNSS, too.
+
+    """
+
+    config: Config
+    status: Status
+    epochs: tuple[Epoch, ...]
+
+    @property
+    def initial(self) -> Attitude | None:
+        """Return the attitude at t0 as it is known at the end."""
+        return self.status.initial
+
+    @property
+    def current(self) -> Attitude | None:
+        """Return the attitude at the last epoch."""
+        return self.status.current
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the recording ends with a declared alignment."""
+        return self.status.state is State.ALIGNED
+
+    @property
+    def declared(self) -> Attitude | None:
+        """Return the initial attitude as the node publishes it at the last declaration."""
+        declared, before = None, None
+        for epoch in self.epochs:
+            if epoch.state is State.ALIGNED and before is not State.ALIGNED:
+                declared = epoch.initial
+            before = epoch.state
+        return declared
+
+    @property
+    def first_t0_ns(self) -> int | None:
+        """Return the stamp from which `Epoch.t_s` is counted; None: there is no epoch."""
+        if not self.epochs:
+            return None
+        return self.epochs[0].stamp_ns - round(self.epochs[0].t_s * 1e9)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the object that ``--json`` writes; numbers that are not finite are None."""
+        status = self.status
+        final = _attitude_json(status.current)
+        if final is not None and status.current is not None:
+            final = {'stamp': status.current.stamp_ns, **final}
+        return {
+            'aligned': self.aligned,
+            'state': status.state.value,
+            'reason': status.reason,
+            't0': status.t0_ns,
+            'time_to_align_s': status.time_to_align_s,
+            'initial_attitude': _attitude_json(status.initial),
+            'final_attitude': final,
+            'gyro_bias_rad_s': _finite(status.gyro_bias),
+            'accel_bias_m_s2': _finite(status.accel_bias),
+            'lever_arm_m': _finite(status.lever_arm),
+            'gnss_delay_s': _finite([status.gnss_delay])[0],
+            'counts': dict(status.counts),
+        }
+
+    def to_csv(self) -> str:
+        """Return the table that ``--csv`` writes, a row per GNSS epoch."""
+        out = io.StringIO()
+        out.write(CSV_HEADER + '\n')
+        for epoch in self.epochs:
+            if epoch.dry:
+                continue
+            cells = [str(epoch.stamp_ns), f'{epoch.t_s:.9f}', epoch.state.value]
+            for attitude in (epoch.initial, epoch.current):
+                numbers = [math.nan] * 7 if attitude is None else [
+                    *attitude.quaternion_xyzw.tolist(), *attitude.sigma_deg.tolist()]
+                cells += [repr(number) if math.isfinite(number) else '' for number in numbers]
+            out.write(','.join(cells) + '\n')
+        return out.getvalue()
+
+
+def _attitude_json(attitude: Attitude | None) -> dict[str, Any] | None:
+    if attitude is None:
+        return None
+    roll, pitch, yaw = _finite([attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg])
+    return {'quaternion_xyzw': _finite(attitude.quaternion_xyzw), 'roll_deg': roll,
+            'pitch_deg': pitch, 'yaw_deg': yaw, 'sigma_deg': _finite(attitude.sigma_deg)}
+
+
+def _finite(values: Iterable[float]) -> list[float | None]:
+    """Return plain numbers as JSON has them: none that are not finite."""
+    return [float(value) if math.isfinite(value) else None for value in values]

@@ -359,7 +359,7 @@ def test_arrays_of_samples_may_be_filled_again(flight):
             array[:] = column[start:start + 10]
         aligner.add_imu(*arrays)
     aligner.update()
-    imu = aligner._intake.imu
+    imu = aligner._imu
     assert np.array_equal(imu.stamps, flight.imu_stamps_ns[200 - imu.stamps.size:200])
     assert np.array_equal(imu.samples, np.hstack(columns[1:])[200 - imu.stamps.size:200])
 
@@ -1033,7 +1033,7 @@ def test_memory_is_bounded_without_gnss(flight):
         stamps = np.arange(k * chunk, (k + 1) * chunk, dtype=np.int64) * 5_000_000
         aligner.add_imu(stamps, np.zeros((chunk, 3)), np.tile([0.0, 0.0, 9.8], (chunk, 1)))
         aligner.update()
-    assert aligner._intake.imu.stamps.size < 3 * chunk
+    assert aligner._imu.stamps.size < 3 * chunk
     assert aligner.status().state is State.WAITING_FOR_GNSS
 
 
@@ -1046,7 +1046,7 @@ def test_memory_is_bounded_when_gnss_stays_away(flight):
         stamps = last + np.arange(k * chunk + 1, (k + 1) * chunk + 1, dtype=np.int64) * 10_000_000
         aligner.add_imu(stamps, np.zeros((chunk, 3)), np.tile([0.0, 0.0, 9.8], (chunk, 1)))
         aligner.update()
-    assert aligner._intake.imu.stamps.size < 3 * chunk
+    assert aligner._imu.stamps.size < 3 * chunk
     current = aligner.status().current
     assert current is None or np.all(np.isfinite(current.covariance))
 

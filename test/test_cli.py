@@ -190,7 +190,7 @@ def _killed(request):
 
 
 def test_a_process_that_is_killed_while_it_reads(flight, monkeypatch, capsys):
-    monkeypatch.setattr('ins_align.recordings.replay._prepared', _killed)
+    monkeypatch.setattr('ins_align.recordings.replay.read', _killed)
     assert main(['replay', str(flight), '--jobs', '2']) == 2
     error = capsys.readouterr().err
     assert error.count('\n') == 1 and 'a process died on the way' in error

@@ -13,6 +13,7 @@
 # limitations under the License.
 """Filter, bank and rivals against numerical derivatives, the dense reference and the truth."""
 
+from collections import Counter
 from dataclasses import replace
 
 from alignment import aligned, config_for, normalised_error, simulated
@@ -23,10 +24,12 @@ from ins_align.estimation.filter import DELAY, Filters, FIRST, GYRO, linearised,
 from ins_align.estimation.rivals import SIGNS
 from ins_align.experiments.dense import bound, dense_solution
 from ins_align.geometry.rotation import exp_so3, log_so3, skew
-from ins_align.imu.preintegration import (
-    Intervals, Noise, preintegrate, SensorErrors, split_at_epochs)
+from ins_align.gnss.antenna import Antenna
+from ins_align.gnss.buffer import GnssBuffer
+from ins_align.imu.buffer import ImuBuffer
+from ins_align.imu.cutter import ImuCutter
+from ins_align.imu.preintegration import Noise, preintegrate, SensorErrors, split_at_epochs
 from ins_align.imu.recent import recent_motion
-from ins_align.intake import Intake, Run, Start
 from ins_align.results import Attitude
 import numpy as np
 import pytest
@@ -176,20 +179,19 @@ def test_merging_keeps_mean_and_covariance_of_the_mixture():
 def prepared(s, *, velocity=True, **changes):
     """Return a bank at its t0, the epochs behind it and the IMU intervals before each."""
     config = config_for(s, **changes)
-    intake = Intake(config)
+    counts = Counter()
+    samples, messages = ImuBuffer(0, counts), GnssBuffer(0, counts)
     for k in range(len(s.gnss_stamps_ns)):
-        intake.add_fix(s.fix(k))
+        messages.add_fix(s.fix(k), None)
         if velocity:
-            intake.add_velocity(s.velocity_measurement(k))
-    intake.add_imu_array(s.imu_stamps_ns, s.gyro, s.accel)
-    intake.prepare(True)
-    steps = list(intake.take_steps())
-    start, = (step for step in steps if isinstance(step, Start))
-    runs = [step for step in steps if isinstance(step, Run)]
-    imu = Intervals(**{name: np.concatenate([vars(run.imu)[name] for run in runs])
-                       for name in vars(runs[0].imu)})
-    bank = Bank(config, start.first.epoch, start.imu, start.use_position)
-    return bank, [located.epoch for run in runs for located in run.located], imu
+            messages.add_velocity(s.velocity_measurement(k), None)
+    samples.add_many(s.imu_stamps_ns, s.gyro, s.accel)
+    antenna = Antenna(config, counts)
+    first, *epochs = map(antenna.epoch, messages.release(samples.settled_ns(True), True))
+    cutter = ImuCutter(config.imu_noise, samples, counts)
+    bank = Bank(config, first, cutter.start(first.stamp_ns).integrated(), not velocity)
+    steps, _ = cutter.cut([epoch.stamp_ns for epoch in epochs], [0.0] * len(epochs))
+    return bank, epochs, steps.integrated()
 
 
 def went(bank, epochs, imu, block=1):

@@ -34,7 +34,7 @@ def cut(stamps_ns, samples, epochs=EPOCHS, drift=0.0):
     cutter = ImuCutter(ImuNoise(*STATED, gyro_bias_std=0.0, accel_bias_std=0.0), buffer, counts)
     buffer.add_many(stamps_ns, samples[:, :3], samples[:, 3:])
     buffer.consolidate()
-    cutter.check_range(int(epochs[-1]))
+    cutter.check(int(epochs[-1]))
     cutter.start(epochs[0])
     imu, forces = cutter.cut(epochs[1:], [drift] * (len(epochs) - 1))
     return imu, forces, counts

@@ -57,6 +57,14 @@ class AntennaEpoch:
         ENU.
     position_measured : bool
         Whether the position is a measurement to align with.
+    gravity_drift : float
+        Noise density of gravity because the place is not known, m/s/sqrt(s).
+    fault : str
+        Fault of the velocities up to here, in words; '' when none is known.
+    dry : bool
+        Whether there is no GNSS message at all: an epoch that divides an outage.
+    stated : (bool, bool)
+        Whether the receiver states the noise of the velocity and of the position.
 
     """
 
@@ -68,6 +76,9 @@ class AntennaEpoch:
     velocity_covariance: Array
     position_measured: bool
     position_covariance: Array
+    gravity_drift: float = 0.0
+    fault: str = ''
+    dry: bool = False
     stated: tuple[bool, bool] = (True, True)
 
 
@@ -150,7 +161,8 @@ class Antenna:
                 self._check.add(message.stamp_ns * 1e-9, self._place, v_n,
                                 math.sqrt(max(variances[:2])))
         return AntennaEpoch(message.stamp_ns, *self._place, v_n, self._covariance_of(velocity),
-                            believed, position_covariance,
+                            believed, position_covariance, self.gravity_drift(message.stamp_ns),
+                            self.fault, fix is None and velocity is None,
                             (velocity is None or velocity.covariance is not None,
                              fix is None or fix.covariance is not None))
 

@@ -39,6 +39,11 @@ NO_FIX, STATUS_UNKNOWN = -1, -2
 # A receiver without a fix does not know its velocity either, whatever it sends: none is taken
 # until the next fix, or for this long (ns).
 NO_FIX_NS = 2_000_000_000
+# Why messages were left out, by the end of the name under which they are counted.
+_LEFT_OUT = {'no_fix': 'without a fix', 'undecodable': 'that cannot be decoded',
+             'nan': 'without numbers',
+             'late': 'further behind the IMU than gnss_lateness allows',
+             'ahead': 'far ahead of the IMU'}
 
 
 def fault_of_fix(fix: Fix) -> str:
@@ -180,6 +185,21 @@ class GnssBuffer:
             del self._pending[oldest]
             self._counts['gnss_overflow'] += 1
         return self._pending.setdefault(stamp_ns, GnssEpoch(stamp_ns))
+
+    def left_out(self, kind: str, before: Counter[str]) -> str:
+        """
+        List in words what was left out since the counts were those `before`; '' if nothing.
+
+        `kind`: ``fix`` or ``velocity``.
+        """
+        parts = []
+        for ending, why in _LEFT_OUT.items():
+            name = f'{kind}_{ending}'
+            if count := self._counts[name] - before[name]:
+                off_ns = self.off_ns.get(name)
+                off = '' if off_ns is None else f' (the last one by {off_ns * 1e-9:.1f} s)'
+                parts.append(f'{count} {why}{off}')
+        return ', '.join(parts)
 
     @property
     def oldest_ns(self) -> int | None:

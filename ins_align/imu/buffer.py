@@ -15,8 +15,8 @@
 
 from collections import Counter
 
-from ins_align.geometry.rotation import Array
-from ins_align.imu.plausibility import IMU_BEFORE
+from ins_align.geometry.rotation import Array, Index
+from ins_align.imu.plausibility import IMU_BEFORE, without_spikes
 import numpy as np
 
 # Beyond these no sensor measures; such values would overflow the integrals (rad/s, m/s^2).
@@ -29,6 +29,11 @@ KEPT_BEFORE = 2 + IMU_BEFORE
 # So many IMU samples in a row that go in order, behind the newest one, through a time that others
 # have gone through before them: not late, but of a clock that was set back.
 SET_BACK_SAMPLES = 8
+# Why samples were left out, by the name under which they are counted.
+_LEFT_OUT = {'imu_undecodable': 'that cannot be decoded',
+             'imu_nan': 'without numbers or with impossible ones',
+             'imu_duplicate': 'with the stamp of another (does the driver set stamps?)',
+             'imu_late': 'too late'}
 
 
 class ImuBuffer:
@@ -47,7 +52,7 @@ class ImuBuffer:
 
     def __init__(self, lateness_ns: int, counts: Counter[str]) -> None:
         """Start empty."""
-        self._lateness_ns = lateness_ns
+        self.lateness_ns = lateness_ns
         self._reach_ns = max(lateness_ns, MAX_GAP_NS)
         self._counts = counts
         self.stamps = np.zeros(0, np.int64)
@@ -69,7 +74,7 @@ class ImuBuffer:
         """Append one sample."""
         if self._ahead is not None:
             ahead, self._ahead = self._ahead, None
-            if stamp_ns >= ahead[0] - self._lateness_ns:
+            if stamp_ns >= ahead[0] - self.lateness_ns:
                 self._append(*ahead)
             else:
                 self._counts['imu_ahead'] += 1
@@ -80,7 +85,7 @@ class ImuBuffer:
 
     def _append(self, stamp_ns: int, gyro: Array, accel: Array) -> None:
         newest = self.newest_ns
-        if newest is not None and stamp_ns < newest - self._lateness_ns:
+        if newest is not None and stamp_ns < newest - self.lateness_ns:
             self._old_sample(stamp_ns)
             return
         self._suspect_ns = None
@@ -184,6 +189,55 @@ class ImuBuffer:
             self._counts['imu_duplicate'] += int(np.count_nonzero(~first))
             stamps, samples = stamps[first], samples[:, first]
         self.stamps, self.samples = stamps, samples.T
+
+    def settled_ns(self, last: bool = False) -> int | None:
+        """
+        Return the stamp up to which epochs can be cut; None while there are too few samples.
+
+        Nothing late can precede it any more; `last`: nothing comes any more at all.
+        """
+        self.consolidate(last)
+        if self.newest_ns is None or self.stamps.size < 4:
+            return None
+        settled_ns = self.newest_ns - (0 if last else self.lateness_ns)
+        settled = int(np.searchsorted(self.stamps, settled_ns, side='right'))
+        # Interpolation at an epoch wants two samples after it, and whether they are spikes shows
+        # in the next one.
+        return int(self.stamps[max(settled, 3) - 3])
+
+    @property
+    def silent(self) -> bool:
+        """Whether samples come, but for too long none that could be used."""
+        return (self.newest_ns is not None and self.stamps.size > 0
+                and self.newest_ns - self.lateness_ns - int(self.stamps[-1]) > MAX_GAP_NS)
+
+    def left_out(self, before: Counter[str]) -> str:
+        """List in words what was left out since the counts were those `before`."""
+        return ', '.join(f'{count} {why}' for name, why in _LEFT_OUT.items()
+                         if (count := self._counts[name] - before[name]))
+
+    def rates_since(self, stamp_ns: int) -> tuple[Index, Array, Array] | None:
+        """
+        Return the angular rates after a stamp, without spikes; None where there is a gap.
+
+        Returns
+        -------
+        stamps : ndarray of int, shape (N,)
+        rates : ndarray, shape (N, 3)
+            rad/s.
+        rate : ndarray, shape (3,)
+            Interpolated at `stamp_ns`.
+
+        """
+        self.consolidate()
+        first = int(np.searchsorted(self.stamps, stamp_ns, side='right'))
+        if np.any(np.diff(self.stamps[first:], prepend=stamp_ns) > MAX_GAP_NS):
+            return None
+        looked_at = max(first - IMU_BEFORE, 0)
+        stamps = self.stamps[looked_at:]
+        rates = without_spikes(stamps, self.samples[looked_at:])[0][:, :3]
+        rate = np.array([np.interp(0.0, stamps - stamp_ns, axis) for axis in rates.T])
+        return stamps[first - looked_at:], rates[first - looked_at:], rate
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop samples before `stamp_ns`, but for those that are still looked at."""

@@ -22,11 +22,12 @@ that is not known.
 from collections import Counter
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 from ins_align.config import ImuNoise
 from ins_align.geometry.rotation import Array, Index
-from ins_align.imu.buffer import ImuBuffer
-from ins_align.imu.plausibility import IMU_BEFORE, RangeCheck, without_spikes
+from ins_align.imu.buffer import ImuBuffer, MAX_GAP_NS
+from ins_align.imu.plausibility import IMU_BEFORE, RangeCheck, stuck, without_spikes
 from ins_align.imu.preintegration import (
     Intervals, Noise, preintegrate, SensorErrors, split_at_epochs, Steps, white_noise)
 from ins_align.imu.recent import AGES, Recent, recent_motion
@@ -47,6 +48,18 @@ NOISE_WINDOW_NS = 500_000_000
 # Samples are kept for that, and for as long as a receiver may be late.
 KEPT_NS = max(NOISE_WINDOW_NS, round(1e9 * AGES[-1]))
 NOISE_EXCESS = 1.25
+# The IMU samples of epochs that are cut at one go, and what an epoch costs beside.
+MAX_CUT_SAMPLES, EPOCH_SAMPLES = 6144, 16
+NO_SAMPLE = f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s'
+
+
+class Silence(NamedTuple):
+    """A time in which the IMU says too little: stamps, the count's name, why in words."""
+
+    start_ns: int
+    end_ns: int
+    counter: str
+    why: str
 
 
 @dataclass(frozen=True)
@@ -84,21 +97,18 @@ class ImuCutter:
         self._range = RangeCheck()
         self._upto_ns = 0                   # up to where the IMU is cut
         self._checked_ns = 0                # and its range checked
+        self._silences: list[Silence] = []
 
     def forget_before(self, stamp_ns: int) -> None:
         """Keep what an epoch at or after a stamp wants to look back at."""
         self._buffer.forget_before(stamp_ns - KEPT_NS)
         self._range.forget_before(stamp_ns)
 
-    def check_range(self, upto_ns: int) -> list[int]:
+    def check(self, upto_ns: int) -> None:
         """
-        Look for samples up to a stamp that are at the end of the sensors' range, and count them.
+        Look for times in which the IMU says too little, in what is buffered.
 
-        Returns
-        -------
-        list of int
-            When the gyros have missed too much, ns.
-
+        Samples up to a stamp that are at the end of the sensors' range are counted.
         """
         stamps = self._buffer.stamps
         first, last = np.searchsorted(stamps, [self._checked_ns, upto_ns], side='right').tolist()
@@ -109,7 +119,29 @@ class ImuCutter:
         self._range.add(stamps[first:last], samples[first - context:last - context])
         self._counts['imu_saturated'] += self._range.stamps.size - before
         self._checked_ns = max(self._checked_ns, upto_ns)
-        return self._range.blind
+        gaps = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
+        self._silences = [Silence(start, end, 'imu_gap', NO_SAMPLE) for start, end in
+                          zip(stamps[gaps].tolist(), stamps[gaps + 1].tolist())]
+        # An epoch is taken when the IMU is ahead by the lateness: what is known by then, not what
+        # is known when somebody looks.
+        self._silences += [Silence(max(start, known - self._buffer.lateness_ns), end, 'imu_stuck',
+                                   'the IMU sends the same values again and again')
+                           for start, end, known in stuck(stamps, self._buffer.samples)]
+        self._silences += [Silence(stamp - 1, stamp, 'imu_blind', 'the gyros are at the end of '
+                                   'their range: let the driver set a larger one')
+                           for stamp in self._range.blind]
+
+    def silence(self, start_ns: int, end_ns: int) -> Silence | None:
+        """Return why the IMU says too little between two stamps, or at one."""
+        return next((silence for silence in self._silences
+                     if silence.start_ns < end_ns and silence.end_ns > start_ns), None)
+
+    def parts(self, epochs_ns: list[int]) -> list[slice]:
+        """Divide epochs into parts to be cut one after the other, so that memory is bounded."""
+        place = np.searchsorted(self._buffer.stamps, epochs_ns)
+        size = place - place[0] + EPOCH_SAMPLES * np.arange(len(epochs_ns))
+        starts = np.flatnonzero(np.diff(size // MAX_CUT_SAMPLES, prepend=-1)).tolist()
+        return [slice(*ends) for ends in zip(starts, [*starts[1:], len(epochs_ns)])]
 
     def start(self, stamp_ns: int) -> ImuSteps:
         """Return the steps of no length at the first epoch of an alignment."""

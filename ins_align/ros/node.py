@@ -14,8 +14,7 @@
 """
 The ROS 2 node: subscribes, hands over to the aligner, publishes what it says.
 
-Everything that decides anything is in the intake and the alignment that the aligner ties together;
-`ins_align replay` runs the same two.
+Everything that decides anything is in the aligner, which `ins_align replay` runs as well.
 """
 
 from __future__ import annotations

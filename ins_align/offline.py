@@ -1,0 +1,202 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Alignment of recorded data: of arrays, and of what replay reads from a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import dataclasses
+from typing import Any, TYPE_CHECKING, Union
+
+from ins_align.aligner import Aligner
+from ins_align.checks import InputChecks
+from ins_align.config import Config, config_from_mapping
+from ins_align.geometry.rotation import Array, Index
+from ins_align.gnss import messages
+from ins_align.gnss.messages import Fix, Velocity
+from ins_align.results import Epoch, Result, State, Status
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+# The aligner is asked after so many messages: many epochs cost less each than few.
+MESSAGES = 2500
+# Stamps that were seconds are below this (ns); those that were nanoseconds by mistake are not.
+MAX_STAMP_NS = 9e18
+
+
+class Recorded:
+    """
+    An aligner that takes recorded data, and collects what comes of it.
+
+    Parameters
+    ----------
+    config : Config
+
+    """
+
+    def __init__(self, config: Config) -> None:
+        """Start with no data."""
+        self.config = config
+        self._aligner = Aligner(config)
+        self._checks = InputChecks(config)
+        self._epochs: list[Epoch] = []
+        self._waiting = 0
+
+    def add(self, stamps_ns: Index, gyro: Array, accel: Array,
+            gnss: Sequence[tuple[int, Union[Fix, Velocity, tuple[str, str]]]]) -> None:
+        """
+        Take consecutive messages.
+
+        Parameters
+        ----------
+        stamps_ns : ndarray of int, shape (N,)
+            Of IMU samples.
+        gyro, accel : ndarray, shape (N, 3)
+            rad/s, m/s^2.
+        gnss : sequence of (int, Fix or Velocity or (str, str))
+            How many of the samples come before each message; of one that cannot be used the
+            arguments of `Aligner.reject`.
+
+        """
+        aligner, position = self._aligner, 0
+        for before, message in (*gnss, (len(stamps_ns), None)):
+            if before > position:
+                between = slice(position, before)
+                aligner.add_imu(stamps_ns[between], gyro[between], accel[between])
+                position = before
+            if isinstance(message, Fix):
+                aligner.add_fix(message)
+            elif isinstance(message, Velocity):
+                aligner.add_velocity(message)
+            elif message is not None:
+                aligner.reject(*message)
+        self._checks.add(stamps_ns, gyro, accel, [
+            (before, message) for before, message in gnss
+            if isinstance(message, (Fix, Velocity))])
+        self._waiting += len(stamps_ns) + len(gnss)
+        if self._waiting >= MESSAGES:
+            self._epochs += aligner.update(dry=True)
+            self._waiting = 0
+
+    def reject(self, reason: str, count: int) -> None:
+        """Count messages that cannot be used."""
+        for _ in range(count):
+            self._aligner.reject(reason)
+
+    def finish(self) -> tuple[Status, tuple[Epoch, ...]]:
+        """Return the status at the end, and all epochs."""
+        self._epochs += self._aligner.flush(dry=True)
+        status = self._aligner.status()
+        if status.state is not State.ALIGNED and (faults := self._checks.faults()):
+            status = dataclasses.replace(status, reason='; '.join([status.reason, *faults]))
+        return status, tuple(self._epochs)
+
+
+def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
+          fixes: ArrayLike | Sequence[Fix], velocities: ArrayLike | Sequence[Velocity] = (),
+          **config: Any) -> Result:
+    """
+    Align arrays.
+
+    Parameters
+    ----------
+    stamps : array_like, shape (N,)
+        When the IMU measured: seconds, or nanoseconds if they are integers.
+    gyro, accel : array_like, shape (N, 3)
+        Angular rate, rad/s, and specific force, m/s^2, forward-left-up.
+    fixes : array_like, shape (K, 4), (K, 7) or (K, 13); or sequence of Fix
+        Columns: stamp, in the unit of `stamps` and of the same clock; latitude, longitude,
+        degrees; altitude, m; if known three standard deviations, m, or nine covariances, m^2,
+        east-north-up.
+    velocities : array_like, shape (L, 4), (L, 7) or (L, 13); or sequence of Velocity
+        Columns: stamp; east, north, up, m/s; if known three standard deviations, m/s, or nine
+        covariances, m^2/s^2.
+    **config
+        Parameters by name: ``lever_arm=(1.0, 0.0, 0.5)``.
+
+    Returns
+    -------
+    Result
+        ``initial`` and ``current``, the attitudes at t0 and at the last epoch, with covariances;
+        ``aligned``, ``status`` with the reason in words, ``epochs``. Rows with nan are left out
+        and counted in ``status.counts``.
+
+    Raises
+    ------
+    ConfigError
+        If a parameter is not known or its value is wrong.
+    ValueError
+        If an array has the wrong shape or its stamps are no times.
+
+    """
+    settings = config_from_mapping(config)
+    unit_ns = 1.0 if np.asarray(stamps).dtype.kind in 'iu' else 1e9
+    stamps_ns = _nanoseconds('the IMU', np.asarray(stamps), unit_ns)
+    rates, forces = np.asarray(gyro, float), np.asarray(accel, float)
+    for name, array in (('gyro', rates), ('accel', forces)):
+        if stamps_ns.ndim != 1 or array.shape != (stamps_ns.size, 3):
+            raise ValueError(f'{name} has the shape {array.shape} and stamps {stamps_ns.shape}: '
+                             'they must be (N, 3) and (N,)')
+    gnss = _messages('fixes', fixes, Fix, unit_ns)
+    gnss += _messages('velocities', velocities, Velocity, unit_ns, settings)
+    gnss.sort(key=lambda message: message.stamp_ns)
+    # Each message comes behind the IMU samples that have its stamp or an older one.
+    before = np.searchsorted(np.maximum.accumulate(stamps_ns),
+                             [message.stamp_ns for message in gnss], side='right')
+    run = Recorded(settings)
+    first = 0
+    for start in range(0, stamps_ns.size, MESSAGES):
+        part = slice(start, start + MESSAGES)
+        last = int(np.searchsorted(before, start + MESSAGES, side='right'))
+        run.add(stamps_ns[part], rates[part], forces[part],
+                list(zip((before[first:last] - start).tolist(), gnss[first:last])))
+        first = last
+    status, epochs = run.finish()
+    return Result(config=settings, status=status, epochs=epochs)
+
+
+def _nanoseconds(name: str, stamps: np.ndarray, unit_ns: float) -> Index:
+    if stamps.dtype.kind not in 'iu':
+        stamps = np.round(stamps.astype(float) * unit_ns)
+        if not np.all(np.abs(stamps) < MAX_STAMP_NS):
+            raise ValueError(f'the stamps of {name} must be seconds, or nanoseconds if those of '
+                             'the IMU are integers, without nan')
+    return stamps.astype(np.int64)
+
+
+def _messages(name: str, given: Any, kind: type, unit_ns: float,
+              config: Config | None = None) -> list[Any]:
+    """Return fixes or velocities, of a table if that is given."""
+    if len(given) == 0 or all(isinstance(message, kind) for message in given):
+        return list(given)
+    table = np.asarray(given, float)
+    if table.ndim != 2 or table.shape[1] not in (4, 7, 13):
+        columns = 'latitude, longitude, altitude' if kind is Fix else 'east, north, up'
+        raise ValueError(f'{name} have the shape {table.shape}: it must be (K, 4), (K, 7) or '
+                         f'(K, 13), with stamp, {columns}, and three standard deviations or nine '
+                         'covariances if they are known')
+    stamps_ns = _nanoseconds(name, table[:, 0], unit_ns)
+    known = table.shape[1] > 4
+    covariances = np.zeros((len(table), 6, 6))
+    if table.shape[1] == 7:
+        covariances[:, [0, 1, 2], [0, 1, 2]] = np.square(table[:, 4:])
+    elif known:
+        covariances[:, :3, :3] = table[:, 4:].reshape(-1, 3, 3)
+    if config is not None:
+        return messages.velocities(stamps_ns, '', table[:, 1:4],
+                                   covariances if known else None, config)
+    kinds = np.full(len(table), int(known))
+    return messages.fixes(stamps_ns, table[:, 1:4], covariances[:, :3, :3], kinds, 0 * kinds)

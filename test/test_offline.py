@@ -1,0 +1,233 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Arrays: `align` against the truth, against replay, with tables of every form; public names."""
+
+from dataclasses import replace
+import json
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+from alignment import error_of, normalised_error, simulated
+import ins_align
+from ins_align.config import ConfigError
+from ins_align.recordings.replay import replay
+from ins_align.results import State
+from ins_align.simulation.simulate import write_bag
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+LEVER = {'lever_arm': (1.0, 1.0, 1.0)}
+
+
+@pytest.fixture(scope='module')
+def flight():
+    return simulated('flight', duration=30.0, seed=1)
+
+
+def tables(s, spread=''):
+    """Return fixes and velocities of a simulation as tables, stamps in ns."""
+    noises = s.position_covariance, s.velocity_covariance
+    result = []
+    for values, noise in zip((s.lla_deg, s.velocity), noises):
+        columns = [s.gnss_stamps_ns[:, None], values]
+        if spread == 'std':
+            columns.append(np.tile(np.sqrt(np.diag(noise)), (len(values), 1)))
+        elif spread == 'covariance':
+            columns.append(np.tile(noise.ravel(), (len(values), 1)))
+        result.append(np.hstack(columns))
+    return result
+
+
+def imu(s):
+    return s.imu_stamps_ns, s.gyro, s.accel
+
+
+@pytest.fixture(scope='module')
+def result(flight):
+    fixes = [flight.fix(k) for k in range(len(flight.gnss_stamps_ns))]
+    velocities = [flight.velocity_measurement(k) for k in range(len(flight.gnss_stamps_ns))]
+    return ins_align.align(*imu(flight), fixes, velocities, **LEVER)
+
+
+def test_attitudes_are_right_and_their_covariances_too(flight, result):
+    assert result.aligned and result.status.state is State.ALIGNED
+    for attitude in (result.initial, result.current, result.declared):
+        assert normalised_error(attitude, flight) < chi2.ppf(0.9999, 3)
+    assert result.initial.stamp_ns == result.status.t0_ns
+    assert result.current.stamp_ns == result.epochs[-1].stamp_ns
+    assert len(result.epochs) == len(flight.gnss_stamps_ns)
+
+
+def test_it_is_what_replay_says(flight, result, tmp_path):
+    write_bag(flight, tmp_path / 'flight')
+    replayed = replay(tmp_path / 'flight', result.config)
+    assert replayed.to_csv() == result.to_csv()
+    assert {**replayed.to_json(), 'bag': None} == {**result.to_json(), 'bag': None}
+
+
+@pytest.mark.parametrize('spread', ['std', 'covariance'])
+def test_tables_are_what_fixes_and_velocities_are(flight, result, spread):
+    """In nanoseconds a float has room for 256 of them, which at 30 m/s are 8 um."""
+    other = ins_align.align(*imu(flight), *tables(flight, spread), **LEVER)
+    assert np.allclose(other.current.C_nb, result.current.C_nb, atol=1e-6)
+    assert np.allclose(other.current.covariance, result.current.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_stamps_in_seconds(flight, result):
+    stamps, gyro, accel = imu(flight)
+    origin = int(stamps[0])
+    fixes, velocities = tables(flight, 'std')
+    for table in (fixes, velocities):
+        table[:, 0] = (flight.gnss_stamps_ns - origin) * 1e-9
+    other = ins_align.align((stamps - origin) * 1e-9, gyro, accel, fixes, velocities, **LEVER)
+    assert other.current.stamp_ns == result.current.stamp_ns - origin
+    assert np.allclose(other.current.C_nb, result.current.C_nb, atol=1e-6)
+
+
+def test_covariances_that_are_not_known_are_the_configured_ones(flight):
+    spread = {'velocity_std': 0.1, 'velocity_std_vertical': 0.1, 'position_std': 2.5,
+              'position_std_vertical': 2.5}
+    plain = ins_align.align(*imu(flight), *tables(flight), **LEVER, **spread)
+    values = [np.hstack([table, np.full((len(table), 3), std)])
+              for table, std in zip(tables(flight), (2.5, 0.1))]
+    stated = ins_align.align(*imu(flight), *values, **LEVER)
+    assert np.allclose(plain.current.covariance, stated.current.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_velocities_north_east_down(flight, result):
+    fixes, velocities = tables(flight, 'std')
+    ned = velocities[:, [0, 2, 1, 3, 5, 4, 6]] * [1, 1, 1, -1, 1, 1, 1]
+    other = ins_align.align(*imu(flight), fixes, ned, velocity_frame='ned', **LEVER)
+    assert np.allclose(other.current.C_nb, result.current.C_nb, atol=1e-6)
+
+
+def test_positions_alone():
+    s = simulated('car', duration=60.0, seed=1, position_std=0.02)
+    alone = ins_align.align(*imu(s), tables(s, 'std')[0], **LEVER)
+    assert alone.aligned and 'velocity' not in alone.status.counts
+    assert np.all(np.abs(error_of(alone.current, s))
+                  < 4 * np.sqrt(np.diag(alone.current.covariance)))
+
+
+def test_rows_with_nan_are_left_out_and_counted(flight):
+    stamps, gyro, accel = imu(flight)
+    gyro = np.where(np.arange(len(gyro))[:, None] % 100 == 50, np.nan, gyro)
+    fixes, velocities = tables(flight, 'std')
+    fixes[::10, 1], velocities[::15, 2] = np.nan, np.nan
+    spoilt = ins_align.align(stamps, gyro, accel, fixes, velocities, **LEVER)
+    counts = spoilt.status.counts
+    assert counts['imu_nan'] == np.isnan(gyro[:, 0]).sum()
+    assert counts['fix_nan'] == len(fixes[::10])
+    assert counts['velocity_nan'] == len(velocities[::15])
+    assert normalised_error(spoilt.current, flight) < chi2.ppf(0.9999, 3)
+
+
+def test_an_outage_is_in_the_epochs():
+    s = simulated('car', duration=40.0, seed=2, outages=((20.0, 30.0),))
+    epochs = ins_align.align(*imu(s), *tables(s, 'std'), **LEVER).epochs
+    dry = [epoch for epoch in epochs if epoch.dry]
+    assert 3 <= len(dry) <= 5 and all(19.0 < epoch.t_s < 31.0 for epoch in dry)
+    times = [epoch.stamp_ns for epoch in epochs]
+    assert times == sorted(times)
+
+
+def test_units_that_are_wrong_are_named():
+    car = simulated('car', duration=60.0, seed=2)
+    stamps, gyro, accel = imu(car)
+    wrong = ins_align.align(stamps, np.degrees(gyro), accel, *tables(car, 'std'), **LEVER)
+    assert not wrong.aligned and 'deg/s' in wrong.status.reason
+
+
+def test_no_data():
+    nothing = np.zeros((0, 3))
+    result = ins_align.align(np.zeros(0), nothing, nothing, [])
+    assert result.status.state is State.WAITING_FOR_IMU and result.epochs == ()
+    assert result.initial is None and result.current is None and not result.aligned
+
+
+@pytest.mark.parametrize('change, message', [
+    ({'gyro': np.zeros((5, 3))}, r'gyro has the shape \(5, 3\)'),
+    ({'accel': np.zeros(3001)}, r'accel has the shape \(3001,\)'),
+    ({'fixes': np.zeros((5, 3))}, r'fixes have the shape \(5, 3\).*latitude'),
+    ({'velocities': np.zeros((5, 8))}, r'velocities have the shape \(5, 8\).*north'),
+    ({'fixes': np.full((5, 4), np.nan)}, 'stamps of fixes must be seconds'),
+    ({'stamps': np.arange(3001.0) + 1.7e18}, 'stamps of the IMU must be seconds'),
+])
+def test_wrong_arrays_end_in_a_sentence(flight, change, message):
+    stamps, gyro, accel = imu(flight)
+    fixes, velocities = tables(flight)
+    arguments = {'stamps': stamps, 'gyro': gyro, 'accel': accel, 'fixes': fixes,
+                 'velocities': velocities, **change}
+    with pytest.raises(ValueError, match=message):
+        ins_align.align(**arguments)
+
+
+def test_wrong_parameters_end_in_a_sentence(flight):
+    with pytest.raises(ConfigError, match='did you mean lever_arm'):
+        ins_align.align(*imu(flight), *tables(flight), lever_arms=(1.0, 1.0, 1.0))
+
+
+def test_every_public_name_is_there():
+    for name in ins_align.__all__:
+        assert getattr(ins_align, name).__name__ == name
+        assert name in dir(ins_align)
+    assert not hasattr(ins_align, 'nothing')
+
+
+def test_the_package_imports_what_is_used():
+    code = ('import sys, ins_align; print(*sys.modules); ins_align.align; print(*sys.modules)')
+    alone, aligning = subprocess.run([sys.executable, '-c', code], check=True, text=True,
+                                     capture_output=True).stdout.splitlines()
+    assert 'numpy' not in alone.split()
+    assert not {'rosbags', 'scipy', 'matplotlib', 'rclpy'} & set(aligning.split())
+
+
+def test_the_example_of_the_readme_runs(flight, tmp_path, monkeypatch, capsys):
+    text = (Path(__file__).parents[1] / 'README.md').read_text(encoding='utf-8')
+    code, = re.findall(r'```python\n(.*?)```', text, re.DOTALL)
+    fixes, velocities = tables(flight)
+    seconds = (flight.imu_stamps_ns - flight.imu_stamps_ns[0]) * 1e-9
+    for table in (fixes, velocities):
+        table[:, 0] = (flight.gnss_stamps_ns - flight.imu_stamps_ns[0]) * 1e-9
+    for name, table in (('imu', np.column_stack([seconds, flight.gyro, flight.accel])),
+                        ('fix', fixes), ('velocity', velocities)):
+        np.savetxt(tmp_path / f'{name}.csv', table, delimiter=',')
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(compile(code, 'README.md', 'exec'), names)
+    assert capsys.readouterr().out.startswith('heading sigma')
+    assert names['result'].aligned
+
+
+def test_the_notebook_runs(tmp_path, monkeypatch, capsys):
+    """Its numbers are those of the simulation: a nose that points 8 deg left of the course."""
+    pytest.importorskip('matplotlib').use('Agg')
+    path = Path(__file__).parents[1] / 'docs' / 'notebooks' / 'align.ipynb'
+    cells = json.loads(path.read_text(encoding='utf-8'))['cells']
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for number, cell in enumerate(cells):
+        if cell['cell_type'] == 'code':
+            exec(compile(''.join(cell['source']), f'cell {number}', 'exec'), names)
+    names['plt'].close('all')
+    assert names['result'].aligned
+    assert normalised_error(
+        replace(names['result'].current,
+                stamp_ns=names['result'].current.stamp_ns + int(names['start_ns'])),
+        names['flight']) < chi2.ppf(0.9999, 3)
+    said = re.search(r'points (\S+) deg left', capsys.readouterr().out)[1]
+    assert float(said) == pytest.approx(8.0, abs=1.5)
