@@ -21,7 +21,7 @@ from ins_align import experiments
 from ins_align.aligner import Aligner, Attitude, State
 from ins_align.config import PRESETS
 from ins_align.experiments import (
-    bound, common, compare, cost, declare, note, recorded, spoilt, weak_spots)
+    bound, common, compare, cost, declare, declare_worse, note, recorded, spoilt, weak_spots)
 from ins_align.geometry.rotation import exp_so3, matrix_from_rpy
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
@@ -89,6 +89,25 @@ def test_trials_are_repeatable_and_cover_everything():
     assert trials[5] == declare.trial(5)
     seen = {(t['fault'], t['scenario'], t['simulate']['imu_grade']) for t in trials}
     assert len(seen) == combinations
+
+
+def test_imus_worse_than_configured(tmp_path, capsys):
+    names = {fault for combination in declare_worse.COMBINATIONS for fault in combination}
+    seeds = range(len(declare_worse.COMBINATIONS) * len(declare_worse.SCENARIOS))
+    drawn = [declare_worse.drawn(seed) for seed in seeds]
+    assert len({(d['faults'], d['scenario']) for d in drawn}) == len(drawn)
+    assert names == set(declare_worse.FAULTS)
+    clean = declare_worse.run_one(5, faults=(), scenario='flight')
+    assert clean == declare_worse.run_one(5, faults=(), scenario='flight')
+    assert clean['aligned']['current']['heading_sigmas'] < 5
+    biased = [declare_worse.run_one(seed, faults=('accelerometer bias x 10',), scenario='static',
+                                    trust_imu_axes=True) for seed in range(3)]
+    # Ten times 0.05 m/s^2 is some degrees of tilt, of which the aligner knows nothing.
+    assert max(np.abs(r['levelled']['initial']['error_deg'][:2]).max() for r in biased
+               if r['levelled'] is not None) > 1.0
+    declare_worse.write(tmp_path, [clean, *biased])
+    assert '100.0 %' in capsys.readouterr().out
+    assert len(json.loads((tmp_path / 'declare-worse.json').read_text())['runs']) == 4
 
 
 def test_a_declared_trial_is_judged_against_the_truth(monkeypatch):
