@@ -42,6 +42,15 @@ def test_filter_runs_on_our_data(monkeypatch):
     assert float(ratio) == pytest.approx(expected, abs=0.01)
 
 
+def test_every_epoch_is_timed(monkeypatch):
+    monkeypatch.setattr(bench, 'EPOCH_SECONDS', 6.0)
+    epochs, memory = bench.epoch_rows()
+    assert '30: median' in epochs[0]
+    median, longest = (float(cell.split()[0]) for cell in epochs[1:3])
+    assert 0.0 < median <= longest
+    assert float(memory[1].split()[0]) >= float(memory[2].split()[0]) >= 0.0
+
+
 def test_bare_pass_counts_the_recording(tmp_path, monkeypatch):
     monkeypatch.setattr(bench, 'REPEATS', 1)
     row = bench.replay_against_bare_pass(tmp_path, 'mcap', 1)

@@ -25,6 +25,7 @@ import json
 import os
 from pathlib import Path
 import pickle
+import resource
 import signal
 import statistics
 import subprocess
@@ -35,7 +36,7 @@ from typing import Any
 
 from ins_align.aligner import Aligner
 from ins_align.experiments.common import config_for, Report
-from ins_align.simulation.simulate import epochs_of, simulate, Simulation
+from ins_align.simulation.simulate import epochs_of, give, simulate, Simulation
 import numpy as np
 
 MINUTES = 60
@@ -43,6 +44,7 @@ REPEATS = 3
 CPU_SECONDS = 20.0
 HOLD_SECONDS, HOLD_RATE = 150.0, 4.0  # of data, times real time
 FILTER_SECONDS = 60.0
+EPOCH_SECONDS = 600.0
 NODES = 'ins_align.experiments.nodes'
 COUNT = """
 import sys
@@ -64,6 +66,7 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
         for storage in ('mcap', 'sqlite3'):
             rows.append(replay_against_bare_pass(Path(folder), storage, minutes))
         rows += node_rows(Path(folder))
+    rows += epoch_rows()
     rows.append(filter_row())
     rows.append(start_row())
     report.table('Ours, what it is measured against, their ratio and what it should be at most',
@@ -174,6 +177,27 @@ def _cpu_seconds(pid: int) -> float:
     """Processor time of a process, user and system."""
     fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def epoch_rows() -> list[list[str]]:
+    """Measure the time of every GNSS epoch with its IMU samples, and how memory grows."""
+    data = simulate('car', duration=EPOCH_SECONDS)
+    aligner = Aligner(config_for(data))
+    times, resident = [], []
+    start = time.process_time()
+    for kind, payload in data.messages():
+        give(aligner, kind, payload)
+        if kind == 'velocity':
+            aligner.update()
+            now = time.process_time()
+            times.append(1e3 * (now - start))
+            start = now
+            resident.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    grown = resident[-1] - resident[len(resident) // 10]
+    return [[f'GNSS epoch of the estimator, {len(times)}: median; longest',
+             f'{np.median(times):.3g} ms', f'{max(times):.3g} ms', '', '20 ms'],
+            [f'largest memory in {EPOCH_SECONDS / 60:g} min; its growth after a tenth of them',
+             f'{resident[-1]:.0f} MB', f'{grown:.1f} MB', '', '']]
 
 
 def filter_row() -> list[str]:
