@@ -21,7 +21,7 @@ from ins_align import experiments
 from ins_align.aligner import Aligner, Attitude, State
 from ins_align.config import PRESETS
 from ins_align.experiments import (
-    bound, common, declare, declare_worse, note, recorded, spoilt, weak_spots)
+    bound, common, declare, declare_worse, note, recordings, spoilt, weak_spots)
 from ins_align.geometry.rotation import exp_so3, matrix_from_rpy
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
@@ -155,16 +155,16 @@ def folder(tmp_path_factory):
 
 def test_window_of_a_recording_against_its_reference(folder):
     path = folder / 'driven'
-    assert recorded.recordings_in(folder) == [path, folder / 'hovering']
-    recording = recorded.load(path)
+    assert recordings.recordings_in(folder) == [path, folder / 'hovering']
+    recording = recordings.load(path)
     assert recording.duration == pytest.approx(32.0, abs=0.1)
-    window = recorded.run_window(path, 2.0, 25.0, method='bank')
+    window = recordings.run_window(path, 2.0, 25.0, method='bank')
     assert window.moves and not window.covers_minute
     assert window.declared_s is not None and window.declared.heading_sigmas < 5
     assert window.time[-1] == pytest.approx(25.0, abs=0.5)
     assert np.abs(window.error_deg[-1, 2]) < 3.0
     assert np.nanmedian(np.abs(window.course_deg)) < 3.0
-    assert not recorded.run_window(folder / 'hovering', 0.0, 25.0, method='bank').moves
+    assert not recordings.run_window(folder / 'hovering', 0.0, 25.0, method='bank').moves
 
 
 def test_recordings_and_their_files(folder, tmp_path, capsys):
@@ -175,7 +175,7 @@ def test_recordings_and_their_files(folder, tmp_path, capsys):
     numbers = json.loads((tmp_path / 'recordings.json').read_text('utf-8'))
     assert [window['start_s'] for window in numbers['driven']['bank']] == [0.0, 10.0, 20.0]
     assert (tmp_path / 'recordings.png').stat().st_size > 10_000
-    assert 'driven, note' in capsys.readouterr().out
+    assert 'driven, course' in capsys.readouterr().out
 
 
 def test_every_weak_spot_is_one_of_its_own():
@@ -220,7 +220,7 @@ def test_weak_spots_and_their_files(folder, tmp_path, monkeypatch):
         for case in weak_spots.CASES if case.name in chosen])
     monkeypatch.setattr(weak_spots, 'RECORDING', 'driven')
     monkeypatch.setattr(weak_spots, 'STARTS', (0.0,))
-    monkeypatch.setitem(recorded.KNOWN_LEVER_ARMS, 'driven', (0.0, 0.0, 0.0))
+    monkeypatch.setitem(recordings.KNOWN_LEVER_ARMS, 'driven', (0.0, 0.0, 0.0))
     experiments.run('weak-spots', tmp_path, folder, runs=1, jobs=1)
     assert 'weak-spots --out DIR --runs 1' in (tmp_path / 'weak-spots.md').read_text('utf-8')
     cases = json.loads((tmp_path / 'weak-spots.json').read_text('utf-8'))['cases']
