@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 import errno
 import gc
 import io
@@ -280,53 +281,39 @@ def _add_simulate(commands: Any) -> None:
     command = _add_command(commands, 'simulate', run_simulate,
                            'Write a recording of a simulated vehicle, with truth.',
                            SIMULATE_EPILOG)
+    from ins_align.simulation.arguments import Arguments
+
     command.add_argument('out', metavar='OUT_BAG', help='directory to make')
     command.add_argument('--scenario', default='flight', metavar='NAME',
                          help=f'one of {SCENARIOS} (default: flight)')
     command.add_argument('--imu', default='mems', metavar='GRADE', dest='imu_grade',
-                         help='navigation, tactical or mems (default: mems)')
+                         help='navigation, tactical, mems or chip (default: mems)')
     command.add_argument('--storage', default='mcap', choices=('mcap', 'sqlite3'))
     command.add_argument('--seed', type=int, default=0, help='of everything random (default: 0)')
     command.add_argument('--duration', type=_seconds, metavar='S',
                          help='default: what suits the scenario')
     command.add_argument('--ideal', action='store_true', help='no noise and no biases')
-    for group_name, options in SIMULATE_OPTIONS.items():
-        group = command.add_argument_group(group_name)
-        for option, count, metavar, text in options:
-            group.add_argument(option, type=float, metavar=metavar, help=text,
-                               nargs=count or None, default=argparse.SUPPRESS)
-    group.add_argument('--outage', type=float, nargs=2, action='append', default=[],
-                       metavar=('FROM', 'TO'), dest='outages',
-                       help='no GNSS between these seconds; repeatable')
-
-
-# Options that hand a number, or three, to the argument of the same name of
-# `simulation.simulate`, whose defaults hold where an option is not given.
-SIMULATE_OPTIONS = {
-    'IMU': (
-        ('--imu-rate', 0, 'HZ', 'default: 100'),
-        ('--lever-arm', 3, ('X', 'Y', 'Z'),
-         'IMU to antenna in the IMU frame, m (default: 1 1 1)'),
-        ('--mount-rpy-deg', 3, ('ROLL', 'PITCH', 'YAW'), 'attitude of the IMU in the vehicle'),
-        ('--gyro-scale-std', 0, 'S', 'scale-factor error of the gyros, 0.01 is one percent'),
-    ),
-    'motion': (
-        ('--latitude-deg', 0, 'DEG', 'where it starts (default: 48)'),
-        ('--longitude-deg', 0, 'DEG', 'where it starts (default: 11)'),
-        ('--altitude', 0, 'M', 'where it starts (default: 300)'),
-        ('--heading-deg', 0, 'DEG', 'course of the start, counter-clockwise from east'),
-        ('--crab-deg', 0, 'DEG', 'the nose points so far left of the course'),
-        ('--stand-still', 0, 'S', 'at rest before setting off'),
-    ),
-    'GNSS': (
-        ('--gnss-rate', 0, 'HZ', 'default: 5'),
-        ('--gnss-latency', 0, 'S', 'messages arrive so long after their stamp (up to 59.5)'),
-        ('--gnss-delay', 0, 'S', 'measurements are older than their stamp by this (up to 10)'),
-        ('--velocity-std', 0, 'M/S', 'default: 0.1'),
-        ('--position-std', 0, 'M', 'default: 2.5'),
-        ('--outlier-rate', 0, 'PART', 'part of the epochs that are spoilt'),
-    ),
-}
+    command.add_argument('--outage', type=float, nargs=2, action='append', default=[],
+                         metavar=('FROM', 'TO'), dest='outages',
+                         help='no GNSS between these seconds; repeatable')
+    groups: dict[str, Any] = {}
+    for field in fields(Arguments):
+        line = field.metadata
+        if not line:
+            continue
+        if line['group'] not in groups:
+            groups[line['group']] = command.add_argument_group(line['group'])
+        unit = line['unit'] if line['unit'] != '1' else ''
+        default = field.default
+        if isinstance(default, tuple):
+            default = ' '.join(map(str, default))
+        groups[line['group']].add_argument(
+            '--' + field.name.replace('_', '-'), default=argparse.SUPPRESS,
+            type=type(field.default) if line['choices'] else float,
+            nargs=len(line['names']) or None,
+            metavar=line['names'] or unit.upper() or ('NAME' if line['choices'] else 'X'),
+            help=line['text'] + (unit and f', {unit}')
+            + (f' (default: {default})' if default else ''))
 
 
 def _add_experiment(commands: Any) -> None:

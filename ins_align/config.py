@@ -62,6 +62,10 @@ PRESETS = {
     'tactical': _imu_noise(0.05, 0.03, 1.0 / 3600.0, 1e-3 * STANDARD_GRAVITY, 0.0005,
                            1.8 / 3600.0),
     'mems': _imu_noise(0.3, 0.09, 0.1, 0.05, 0.01, 0.15),
+    # Bare chips of autopilots and phones, from data sheets. MPU-6000 (PS-MPU-6000A-00): zero-g
+    # 50 to 80 mg, 400 ug/sqrt(Hz), scale 3 %, gyros 0.005 deg/s/sqrt(Hz). BMI055: zero-g 70 mg,
+    # zero-rate 1 deg/s, 0.014 deg/s/sqrt(Hz). Soldering and temperature come on top.
+    'chip': _imu_noise(0.9, 0.27, 1.0, 0.5, 0.03, 0.45),
 }
 
 

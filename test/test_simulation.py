@@ -201,15 +201,61 @@ def test_gnss_noise():
     np.testing.assert_allclose(np.diag(s.position_covariance), [4.0, 4.0, 16.0])
 
 
-def test_position_drift_is_first_order_gauss_markov():
-    s = simulate('static', duration=20000.0, imu_rate=1.0, gnss_rate=1.0, position_std=0.0,
-                 position_drift_std=3.0, position_drift_time=20.0)
-    drift = s.lla_deg[:, 2]
+@pytest.mark.parametrize('quantity', ['position', 'velocity'])
+def test_errors_that_last_are_first_order_gauss_markov(quantity):
+    s = simulate('static', duration=20000.0, imu_rate=1.0, gnss_rate=1.0, gnss_correlation=20.0,
+                 **{f'{quantity}_std': 0.0, f'{quantity}_drift_std': 3.0})
+    drift = (s.lla_deg if quantity == 'position' else s.velocity)[:, 2]
     drift = drift - drift.mean()
     assert drift.std() == pytest.approx(3.0, rel=0.1)
     for lag in (20, 40):
         assert np.mean(drift[lag:] * drift[:-lag]) / drift.var() == pytest.approx(
             math.exp(-lag / 20), abs=0.08)
+
+
+def test_correlated_velocity_errors_change_nothing_else():
+    s, clean = (simulate('car', duration=20.0, velocity_drift_std=std) for std in (0.3, 0.0))
+    assert not np.allclose(s.velocity, clean.velocity, atol=0.1)
+    for name in ('gyro', 'accel', 'lla_deg', 'velocity_covariance'):
+        np.testing.assert_array_equal(getattr(s, name), getattr(clean, name))
+
+
+def test_quantum_and_dead_band():
+    fine = simulate('car', duration=30.0)
+    quantum, band = (0.01, 0.05), (0.02, 0.3)
+    coarse = simulate('car', duration=30.0, quantum=quantum)
+    silent = simulate('car', duration=30.0, dead_band=band)
+    for name, step, limit in zip(('gyro', 'accel'), quantum, band):
+        exact = getattr(fine, name)
+        counts = getattr(coarse, name) / step
+        np.testing.assert_allclose(counts, np.rint(counts), atol=1e-9)
+        assert np.abs(getattr(coarse, name) - exact).max() <= step / 2 * (1 + 1e-9)
+        small = np.abs(exact) < limit
+        assert 0.01 < small.mean() < 0.99
+        np.testing.assert_array_equal(getattr(silent, name), np.where(small, 0.0, exact))
+
+
+def test_accelerometer_bias_that_is_given():
+    bias = [0.5, -0.3, 0.2]
+    s, drawn = simulate('car', duration=5.0, accel_bias=bias), simulate('car', duration=5.0)
+    np.testing.assert_array_equal(s.accel_bias, bias)
+    np.testing.assert_allclose(s.accel - drawn.accel, np.tile(bias - drawn.accel_bias, (501, 1)),
+                               atol=1e-12)
+    np.testing.assert_array_equal(s.gyro, drawn.gyro)
+
+
+def test_a_chip_has_the_errors_that_its_preset_states():
+    sim = [simulate('static', imu_grade='chip', seed=seed, duration=1.0, latitude_deg=0.0)
+           for seed in range(200)]
+    gravity = np.array([s.truth_accel[0] for s in sim])
+    # Of the force along z: scale in z, misalignment in x and y; the biases are known.
+    error = np.array([s.accel.mean(axis=0) - s.accel_bias for s in sim]) - gravity
+    noise = PRESETS['chip'].velocity_random_walk
+    expected = np.hypot(0.3 * PRESETS['chip'].gyro_scale_std * 9.78, noise)
+    np.testing.assert_allclose(error.std(axis=0), expected, rtol=0.2)
+    for name, std in (('accel_bias', PRESETS['chip'].accel_bias_std),
+                      ('gyro_bias', PRESETS['chip'].gyro_bias_std)):
+        assert np.std([getattr(s, name) for s in sim]) == pytest.approx(std, rel=0.15)
 
 
 def test_delay_latency_and_phase():
@@ -477,7 +523,7 @@ def test_bag_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     ({'scenario': 'submarine'}, 'scenario must be one of flight, car'),
     ({'imu_grade': 'best'}, 'imu_grade must be one of navigation, tactical, mems'),
     ({'imu_grade': ['mems']}, 'imu_grade must be'),
-    ({'imu_rate': -1.0}, 'imu_rate must be a number of Hz above 0'),
+    ({'imu_rate': -1.0}, 'imu_rate must be a finite number in Hz from 0.001 to 10000'),
     ({'gnss_rate': 0.0}, 'gnss_rate must be'),
     ({'gnss_rate': math.nan}, 'gnss_rate must be'),
     ({'duration': 0.0}, 'duration must be a number of seconds above 0'),
@@ -486,25 +532,29 @@ def test_bag_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     ({'imu_rate': 1.0, 'duration': 1e4, 'gnss_rate': 1e4}, 'at 10000 Hz are too many samples'),
     ({'seed': -1}, 'seed must be an integer'),
     ({'seed': 0.5}, 'seed must be an integer'),
-    ({'lever_arm': (1.0, 2.0)}, 'lever_arm must be three numbers of metres'),
-    ({'lever_arm': (1.0, 2.0, math.inf)}, 'lever_arm must be three numbers of metres'),
-    ({'lever_arm': None}, 'lever_arm must be three numbers of metres'),
-    ({'lever_arm': (1.0, 2.0, 2e3)}, 'lever_arm must be three numbers of metres from -1000'),
-    ({'gnss_delay': 100.0}, 'gnss_delay must be a number of seconds from 0 to 10, got 100'),
+    ({'lever_arm': (1.0, 2.0)}, 'lever_arm must be 3 numbers in m'),
+    ({'lever_arm': (1.0, 2.0, math.inf)}, 'lever_arm must be 3 numbers in m'),
+    ({'lever_arm': None}, 'lever_arm must be 3 numbers in m'),
+    ({'lever_arm': (1.0, 2.0, 2e3)}, 'lever_arm must be 3 numbers in m from -1000 to 1000'),
+    ({'gnss_delay': 100.0}, 'gnss_delay must be a finite number in s from 0 to 10, got 100'),
     ({'gnss_delay': -0.1}, 'gnss_delay must be'),
-    ({'gnss_latency': 100.0}, 'gnss_latency must be a number of seconds from 0 to 59.5, got 100'),
-    ({'gyro_scale_std': 1.0}, 'gyro_scale_std must be a number from 0 to 0.5'),
-    ({'altitude': 1e7}, 'altitude must be a number of metres from -1000 to 100000'),
-    ({'velocity_std': -0.1}, 'velocity_std must be a number, 0 or above'),
+    ({'gnss_latency': 100.0}, 'gnss_latency must be a finite number in s from 0 to 59.5, got 100'),
+    ({'gyro_scale_std': 1.0}, 'gyro_scale_std must be a finite number from 0 to 0.5'),
+    ({'altitude': 1e7}, 'altitude must be a finite number in m from -1000 to 100000'),
+    ({'velocity_std': -0.1}, 'velocity_std must be a finite number in m/s, 0 or above'),
     ({'imu_jitter': 0.5}, 'imu_jitter must be'),
     ({'outlier_rate': 2.0}, 'outlier_rate must be'),
     ({'outages': [(5.0, 4.0)]}, 'outages must be pairs'),
     ({'outages': (5.0, 6.0)}, 'outages must be pairs'),
     ({'latitude_deg': 90.0}, 'latitude_deg must be'),
-    ({'velocity_frame': 'body'}, 'velocity_frame must be enu or ned'),
+    ({'velocity_frame': 'body'}, 'velocity_frame must be one of enu, ned'),
     ({'flip_axis': 'w'}, 'flip_axis must be'),
     ({'flip_gyro': 'xy'}, 'flip_gyro must be'),
     ({'accel_sign': 0}, 'accel_sign must be'),
+    ({'quantum': 0.01}, 'quantum must be 2 numbers in rad/s and m/s.2, 0 or above'),
+    ({'dead_band': (0.01, -1.0)}, 'dead_band must be 2 numbers'),
+    ({'accel_bias': 0.5}, 'accel_bias must be 3 numbers in m/s.2'),
+    ({'gnss_correlation': 0.0}, 'gnss_correlation must be a finite number in s, 0.001 or above'),
 ])
 def test_bad_arguments_get_a_sentence(options, sentence):
     with pytest.raises(SimulationError, match=sentence) as caught:

@@ -23,10 +23,10 @@ import importlib
 from pathlib import Path
 
 # In the order in which `all` runs them.
-NAMES = ('note', 'bound', 'declare', 'faults', 'weak-spots', 'cost', 'compare', 'recordings')
+NAMES = ('note', 'bound', 'declare', 'declare-worse', 'faults', 'weak-spots', 'recordings')
 NEED_DATA = ('recordings',)
-# Only by name: they measure the machine too, and need ROS.
-MEASUREMENTS = ('bench', 'soak')
+# Only by name: it measures the machine too, and needs ROS.
+MEASUREMENTS = ('bench',)
 
 
 class ExperimentError(ValueError):

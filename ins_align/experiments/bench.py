@@ -21,10 +21,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, ExitStack
-import json
 import os
 from pathlib import Path
 import pickle
+import resource
 import signal
 import statistics
 import subprocess
@@ -35,19 +35,20 @@ from typing import Any
 
 from ins_align.aligner import Aligner
 from ins_align.experiments.common import config_for, Report
-from ins_align.simulation.simulate import epochs_of, simulate, Simulation
+from ins_align.simulation.simulate import give, simulate
 import numpy as np
 
 MINUTES = 60
 REPEATS = 3
 CPU_SECONDS = 20.0
-HOLD_SECONDS, HOLD_RATE = 150.0, 4.0  # of data, times real time
-FILTER_SECONDS = 60.0
+EPOCH_SECONDS = 600.0
+TARGETS = {'mcap': '2.0', 'sqlite3': '3.0'}     # of replay over a bare pass, by storage
 NODES = 'ins_align.experiments.nodes'
 COUNT = """
+from pathlib import Path
 import sys
-from rosbags.rosbag2 import Reader
-with Reader(sys.argv[1]) as reader:
+from rosbags.highlevel import AnyReader
+with AnyReader([Path(sys.argv[1])]) as reader:
     print(sum(1 for _ in reader.messages()))
 """
 
@@ -61,10 +62,10 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
                 'whole process while both run beside each other on the same messages.')
     rows: list[list[str]] = []
     with tempfile.TemporaryDirectory() as folder:
-        for storage in ('mcap', 'sqlite3'):
+        for storage in TARGETS:
             rows.append(replay_against_bare_pass(Path(folder), storage, minutes))
         rows += node_rows(Path(folder))
-    rows.append(filter_row())
+    rows += epoch_rows()
     rows.append(start_row())
     report.table('Ours, what it is measured against, their ratio and what it should be at most',
                  ['', 'ours', 'other', 'ratio', 'target'], rows)
@@ -98,7 +99,8 @@ def replay_against_bare_pass(folder: Path, storage: str, minutes: int) -> list[s
              str(60 * minutes), '--storage', storage)
     ours, bare = medians(_cli('replay', str(bag), '--params', str(bag / 'ins_align.yaml')),
                          [sys.executable, '-c', COUNT, str(bag)])
-    return row_of(f'replay of {minutes} min, {storage}; bare pass', ours, bare, 's', '2.0')
+    return row_of(f'replay of {minutes} min, {storage}; bare pass', ours, bare, 's',
+                  TARGETS[storage])
 
 
 def _cli(*arguments: str) -> list[str]:
@@ -110,7 +112,7 @@ def _command(*arguments: str) -> None:
 
 
 def node_rows(folder: Path) -> list[list[str]]:
-    """Compare processor times of nodes and look how long callbacks hold the executor."""
+    """Compare processor times of nodes."""
     script = folder / 'script.pickle'
     script.write_bytes(pickle.dumps(_script(CPU_SECONDS + 15.0)))
     rows = []
@@ -123,28 +125,14 @@ def node_rows(folder: Path) -> list[list[str]]:
             if name == 'republish':
                 stack.enter_context(_process('-m', NODES, 'listen'))
             time.sleep(3.0)
-            stack.enter_context(_process('-m', NODES, 'play', str(script), '1'))
+            stack.enter_context(_process('-m', NODES, 'play', str(script)))
             time.sleep(8.0)
             before = _cpu_seconds(ours), _cpu_seconds(other)
             time.sleep(CPU_SECONDS)
             spent = [100.0 * (_cpu_seconds(pid) - start) / CPU_SECONDS
                      for pid, start in zip((ours, other), before)]
         rows.append(row_of(title, *spent, '% CPU', '1.15'))
-    held = 1e3 * np.array(_held(folder))
-    rows.append([f'callbacks of the node, {len(held)}: 99.9th percentile; longest',
-                 f'{np.percentile(held, 99.9):.3g} ms', f'{held.max():.3g} ms', '', '20 ms'])
     return rows
-
-
-def _held(folder: Path) -> list[float]:
-    """Return how long each callback held the executor, s, listeners and refits included."""
-    script, times = folder / 'long.pickle', folder / 'held.json'
-    script.write_bytes(pickle.dumps(_script(HOLD_SECONDS)))
-    with _process('-m', NODES, 'timed', str(times)), _process('-m', NODES, 'listen'):
-        time.sleep(3.0)
-        subprocess.run([sys.executable, '-m', NODES, 'play', str(script), str(HOLD_RATE)],
-                       check=True)
-    return list(json.loads(times.read_text()))
 
 
 def _script(seconds: float) -> Any:
@@ -176,44 +164,25 @@ def _cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
 
-def filter_row() -> list[str]:
-    """Compare time per IMU sample with python-ins' filter, which is given a coarse attitude."""
-    data = simulate('car', imu_rate=200.0, duration=FILTER_SECONDS)
+def epoch_rows() -> list[list[str]]:
+    """Measure the time of every GNSS epoch with its IMU samples, and how memory grows."""
+    data = simulate('car', duration=EPOCH_SECONDS)
+    aligner = Aligner(config_for(data))
+    times, resident = [], []
     start = time.process_time()
-    for _ in epochs_of(Aligner(config_for(data)), data):
-        pass
-    ours = time.process_time() - start
-    start = time.process_time()
-    _run_pyins(data)
-    other = time.process_time() - start
-    samples = len(data.imu_stamps_ns)
-    return row_of("estimator; python-ins' feedback filter, per IMU sample",
-                  1e6 * ours / samples, 1e6 * other / samples, 'us', '')
-
-
-def _run_pyins(data: Simulation) -> None:
-    """Run the filter from a coarse attitude, in its axes: north-east-down, x forward, z down."""
-    import pandas as pd
-    from pyins import filters, measurements, strapdown
-
-    flip = np.array([1.0, -1.0, -1.0])
-    first = data.gnss_stamps_ns[0]
-    seconds = (data.imu_stamps_ns - first) * 1e-9
-    gnss = (data.gnss_stamps_ns - first) * 1e-9
-    imu = pd.DataFrame(np.hstack([data.gyro * flip, data.accel * flip]), index=seconds,
-                       columns=['gyro_x', 'gyro_y', 'gyro_z', 'accel_x', 'accel_y', 'accel_z'])
-    velocity = pd.DataFrame(data.velocity[:, [1, 0, 2]] * [1.0, 1.0, -1.0], index=gnss,
-                            columns=['VN', 'VE', 'VD'])
-    place = pd.DataFrame(data.lla_deg, index=gnss, columns=['lat', 'lon', 'alt'])
-    C_nb = data.attitude_at(np.array([first]))[0]
-    pva = pd.concat([place.iloc[0], velocity.iloc[0], pd.Series(
-        [0.0, 0.0, float(np.degrees(np.arctan2(C_nb[0, 0], C_nb[1, 0])))],
-        index=['roll', 'pitch', 'heading'])])
-    pva.name = float(gnss[0])
-    increments = strapdown.compute_increments_from_imu(imu, 'rate')
-    filters.run_feedback_filter(
-        pva, 5.0, 0.5, 5.0, 10.0, increments[increments.index > gnss[0]],
-        measurements=[measurements.Position(place, 2.5), measurements.NedVelocity(velocity, 0.1)])
+    for kind, payload in data.messages():
+        give(aligner, kind, payload)
+        if kind == 'velocity':
+            aligner.update()
+            now = time.process_time()
+            times.append(1e3 * (now - start))
+            start = now
+            resident.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    grown = resident[-1] - resident[len(resident) // 10]
+    return [[f'GNSS epoch of the estimator, {len(times)}: median; longest',
+             f'{np.median(times):.3g} ms', f'{max(times):.3g} ms', '', '20 ms'],
+            [f'largest memory in {EPOCH_SECONDS / 60:g} min; its growth after a tenth of them',
+             f'{resident[-1]:.0f} MB', f'{grown:.1f} MB', '', '']]
 
 
 def start_row() -> list[str]:

@@ -15,15 +15,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 import io
 import json
 import math
 import multiprocessing
 import os
 from pathlib import Path
-import sys
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 from ins_align.aligner import Attitude, Epoch, State
 from ins_align.config import Config
@@ -36,12 +37,11 @@ import numpy as np
 # Of simulated data nothing comes late, but an unknown delay wants IMU samples beyond the stamp.
 LATENESS = 0.5
 GRADES = ('navigation', 'tactical', 'mems')
-_PROGRESS_STEP = 0.02
 COLOURS = 64        # of a figure
 
 
 def parallel(function: Callable[[Any], Any], tasks: Sequence[Any],
-             jobs: int | None = None, name: str = '', *, apart: bool = False) -> list[Any]:
+             jobs: int | None = None, name: str = '') -> list[Any]:
     """
     Map a function of a module over tasks in processes of one thread each.
 
@@ -55,37 +55,22 @@ def parallel(function: Callable[[Any], Any], tasks: Sequence[Any],
         By default one a processor; 1 stays in this process.
     name : str, optional
         Shown with the progress on a terminal.
-    apart : bool
-        A process of its own even for one job.
 
     """
+    from tqdm import tqdm
+
     jobs = min(jobs or processors(), max(len(tasks), 1))
-    if jobs == 1 and not apart:
-        return list(_counted(map(function, tasks), len(tasks), name))
-    before = {variable: os.environ.get(variable) for variable in VARIABLES}
-    os.environ.update(dict.fromkeys(VARIABLES, '1'))
-    try:
-        # A fresh interpreter reads the number of threads when it imports numpy.
-        with multiprocessing.get_context('spawn').Pool(jobs) as pool:
-            chunk = max(1, min(10, len(tasks) // (4 * jobs)))
-            return list(_counted(pool.imap(function, tasks, chunk), len(tasks), name))
-    finally:
-        for variable, value in before.items():
-            if value is None:
-                del os.environ[variable]
-            else:
-                os.environ[variable] = value
 
+    def shown(results: Iterable[Any]) -> list[Any]:
+        return list(tqdm(results, name, len(tasks), disable=None))  # None: not on a terminal
 
-def _counted(results: Iterable[Any], total: int, name: str) -> Iterator[Any]:
-    """Pass results on; on a terminal, say how many there are."""
-    shown = sys.stderr.isatty()
-    step = max(1, int(total * _PROGRESS_STEP))
-    for count, result in enumerate(results, 1):
-        if shown and (count % step == 0 or count == total):
-            end = '\n' if count == total else ''
-            print(f'\r{name}: {count}/{total}', end=end, file=sys.stderr, flush=True)
-        yield result
+    if jobs == 1:
+        return shown(map(function, tasks))
+    # A fresh interpreter reads the number of threads when it imports numpy.
+    with patch.dict(os.environ, dict.fromkeys(VARIABLES, '1')), ProcessPoolExecutor(
+            jobs, multiprocessing.get_context('spawn')) as pool:
+        return shown(pool.map(function, tasks,
+                              chunksize=max(1, min(10, len(tasks) // (4 * jobs)))))
 
 
 def config_for(simulation: Simulation, **changes: Any) -> Config:
@@ -235,14 +220,10 @@ def _plain(value: Any) -> Any:
     """Return what JSON can hold; numbers that are not finite become None."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
+    if isinstance(value, float):
         return float(f'{value:.6g}') if math.isfinite(value) else None
     return value

@@ -17,8 +17,8 @@ The estimation problem solved in one go, all noise covariances written out: the 
 It shares neither integration nor recursion with the package: attitude, velocity and position are
 integrated by plain sums at the IMU's instants, the Earth is python-ins', and the covariance of
 the random-walk errors of all epochs is one dense matrix. On the true motion its inverse
-information is the Cramer-Rao bound; on the measured data it gives the estimate that the recursion
-must match. Cost grows with the cube of the number of epochs: 500 take about a second.
+information is the Cramer-Rao bound; the tests solve the measured data with the same pieces. Cost
+grows with the cube of the number of epochs: 500 take about a second.
 
 Velocity rows come before position rows.
 """
@@ -70,37 +70,6 @@ class Bound:
         return self.covariance[np.searchsorted(self.time, seconds + 1e-6) - 1]
 
 
-@dataclass(frozen=True)
-class DenseSolution:
-    """
-    The estimate from all epochs at once.
-
-    Attributes
-    ----------
-    C : ndarray, shape (3, 3)
-        ``C_nb(t0)``.
-    unknowns : ndarray, shape (37,)
-        Sensor errors, start, lever arm, delay in their places, the first three zero. The start is
-        that of the IMU with respect to inertial space.
-    covariance : ndarray, shape (37, 37)
-        Zero where something is not estimated.
-    chi2 : float
-        Sum of squares of the whitened residuals and the prior's.
-    C_n0b : ndarray, shape (3, 3)
-        Attitude at the last epoch.
-    current_covariance : ndarray, shape (3, 3)
-        Of its error in n0.
-
-    """
-
-    C: Array
-    unknowns: Array
-    covariance: Array
-    chi2: float
-    C_n0b: Array
-    current_covariance: Array
-
-
 def bound(simulation: Simulation, *, noise: ImuNoise | None = None, use_velocity: bool = True,
           use_position: bool = False, lever_arm_std: float = 0.0,
           delay_std: float = 0.0) -> Bound:
@@ -126,92 +95,19 @@ def bound(simulation: Simulation, *, noise: ImuNoise | None = None, use_velocity
     noise = simulation.imu_noise if noise is None else noise
     epochs = _true_epochs_ns(simulation)
     path = _true_path(simulation, epochs)
-    H = _design(path, simulation.lever_arm)
-    walk = _bias_walk(path, noise, simulation.lever_arm)
-    V = _noise_covariance(path, noise, walk, _measurement_covariance(simulation, path))
-    rows = _rows(len(epochs), use_velocity, use_position)
-    columns, prior = _prior(simulation, noise, use_position, lever_arm_std, delay_std)
-    whitened = _whitened(V[np.ix_(rows, rows)], H[rows][:, columns])
+    H = design_of(path, simulation.lever_arm)
+    walk = bias_walk(path, noise, simulation.lever_arm)
+    V = noise_covariance(path, noise, walk, measurement_covariance(simulation, path))
+    rows = used_rows(len(epochs), use_velocity, use_position)
+    columns, prior = prior_of(simulation, noise, use_position, lever_arm_std, delay_std)
+    whitened = whiten(V[np.ix_(rows, rows)], H[rows][:, columns])
     each = whitened.reshape(len(epochs), -1, len(columns))
     information = np.cumsum(each.transpose(0, 2, 1) @ each, axis=0) + prior
-    return Bound(path.time, np.array([_inverse(matrix)[:3, :3] for matrix in information]))
-
-
-def dense_solution(simulation: Simulation, *, noise: ImuNoise | None = None,
-                   use_velocity: bool = True, use_position: bool = False,
-                   lever_arm_std: float = 0.0, delay_std: float = 0.0,
-                   lever_arm: Array | None = None, iterations: int = 6) -> DenseSolution:
-    """
-    Gauss-Newton on all measured data of a simulation, from the truth on.
-
-    Parameters
-    ----------
-    simulation : Simulation
-        Its measurements are used, its truth to start from.
-    noise : ImuNoise, optional
-        By default that of the simulation.
-    use_velocity, use_position : bool
-        Which measurements are used.
-    lever_arm_std, delay_std : float
-        Metres per axis and seconds; above 0 they are estimated, from `lever_arm` and 0 on.
-    lever_arm : array_like, shape (3,), optional
-        By default that of the simulation.
-    iterations : int
-        Steps of Gauss-Newton.
-
-    Returns
-    -------
-    DenseSolution
-
-    """
-    noise = simulation.imu_noise if noise is None else noise
-    stamps = simulation.gnss_stamps_ns
-    rows = _rows(len(stamps), use_velocity, use_position)
-    columns, prior = _prior(simulation, noise, use_position, lever_arm_std, delay_std)
-    mean = np.zeros(SIZE)
-    mean[LEVER_ARM] = simulation.lever_arm if lever_arm is None else lever_arm
-    x = mean.copy()
-    x[GYRO_BIAS], x[ACCEL_BIAS] = simulation.gyro_bias, simulation.accel_bias
-    C = simulation.attitude_at(int(stamps[0]))
-    for _ in range(iterations):
-        # A late measurement is one of an earlier instant.
-        path = _measured_path(simulation, C, x)
-        walk = _bias_walk(path, noise, x[LEVER_ARM])
-        V = _noise_covariance(path, noise, walk, _measurement_covariance(simulation, path))
-        H = _design(path, x[LEVER_ARM])[rows][:, columns]
-        s = _measured_sides(simulation, path)
-        lever_v, lever_p = _lever_terms(path, x[LEVER_ARM])
-        time = path.time[:, None]
-        y = np.stack([s[:, 0] - path.U - lever_v - x[START_VELOCITY],
-                      s[:, 1] - path.P - lever_p - x[START_POSITION]
-                      - time * x[START_VELOCITY]], axis=1).ravel()[rows]
-        both = _whitened(V[np.ix_(rows, rows)], np.column_stack([y, H]))
-        whitened_y, whitened_H = both[:, 0], both[:, 1:]
-        P = _inverse(whitened_H.T @ whitened_H + prior)
-        to_mean = (mean - x)[columns]
-        information = prior.copy()
-        information[:3, :3] = 0.0
-        dx = np.zeros(SIZE)
-        dx[columns] = P @ (whitened_H.T @ whitened_y + information @ to_mean)
-        left = whitened_y - whitened_H @ dx[columns]
-        off = to_mean - dx[columns]
-        chi2 = float(left @ left + off @ information @ off)
-        rotation, E = _attitude_error_now(path, noise, walk, V[np.ix_(rows, rows)], rows, y, H,
-                                          dx[columns])
-        current = _rotation(dx[:3] - path.Theta[-1] @ dx[GYRO] + rotation) @ path.C[-1]
-        C = _rotation(dx[:3]) @ C
-        x = x + dx
-        x[:3] = 0.0
-    J = np.zeros((3, SIZE))
-    J[:, ATTITUDE], J[:, GYRO] = np.eye(3), -path.Theta[-1]
-    J = J[:, columns] - E[:, :len(columns)]
-    covariance = np.zeros((SIZE, SIZE))
-    covariance[np.ix_(columns, columns)] = P
-    return DenseSolution(C, x, covariance, chi2, current, J @ P @ J.T + E[:, len(columns):])
+    return Bound(path.time, np.array([inverse_of(matrix)[:3, :3] for matrix in information]))
 
 
 @dataclass(frozen=True)
-class _Path:
+class Path:
     """
     Integrals over the motion at K epochs, in n0 axes.
 
@@ -238,31 +134,31 @@ class _Path:
     C_n0n: Array
 
 
-def _cumulative(time: Array, values: Array) -> Array:
+def cumulative(time: Array, values: Array) -> Array:
     """Integral by the trapezoidal rule along the first axis."""
     h = np.diff(time).reshape((-1,) + (1,) * (values.ndim - 1))
     return np.concatenate([np.zeros_like(values[:1]),
                            np.cumsum(h / 2 * (values[1:] + values[:-1]), axis=0)])
 
 
-def _path(time: Array, C: Array, omega: Array, f: Array, at: Array, C_n0n: Array, g_n: Array,
-          v_n: Array) -> _Path:
+def path_along(time: Array, C: Array, omega: Array, f: Array, at: Array, C_n0n: Array,
+               g_n: Array, v_n: Array) -> Path:
     """Integrate along a grid of instants; `at` picks the epochs from it."""
     force = np.einsum('nij,nj->ni', C, f)
-    U = _cumulative(time, force)
-    P = _cumulative(time, U)
-    S = _cumulative(time, C)
-    Theta, Sigma = (np.concatenate([S, _cumulative(time, _by_row(C, measured))], axis=-1)
+    U = cumulative(time, force)
+    P = cumulative(time, U)
+    S = cumulative(time, C)
+    Theta, Sigma = (np.concatenate([S, cumulative(time, _by_row(C, measured))], axis=-1)
                     for measured in (omega, f))
-    Gamma = _cumulative(time, skew(force) @ Theta)
+    Gamma = cumulative(time, skew(force) @ Theta)
     z = np.hstack([np.ones((len(time), 1)), U, time[:, None] * U - P])
-    M = _cumulative(time, z[:, :, None] * z[:, None, :])
+    M = cumulative(time, z[:, :, None] * z[:, None, :])
     gravity = np.einsum('nij,nj->ni', C_n0n, g_n)
-    return _Path(time[at], C[at], U[at], P[at], Theta[at], Gamma[at],
-                 _cumulative(time, Gamma)[at], Sigma[at], _cumulative(time, Sigma)[at], M[at],
-                 omega[at],
-                 _rate_of_change(time, omega)[at], force[at] + gravity,
-                 np.einsum('nij,nj->ni', C_n0n, v_n), C_n0n)
+    return Path(time[at], C[at], U[at], P[at], Theta[at], Gamma[at],
+                cumulative(time, Gamma)[at], Sigma[at], cumulative(time, Sigma)[at], M[at],
+                omega[at],
+                _rate_of_change(time, omega)[at], force[at] + gravity,
+                np.einsum('nij,nj->ni', C_n0n, v_n), C_n0n)
 
 
 def _by_row(matrices: Array, vectors: Array) -> Array:
@@ -272,7 +168,7 @@ def _by_row(matrices: Array, vectors: Array) -> Array:
 
 def _rate_of_change(time: Array, omega: Array) -> Array:
     """Derive the angular rate: second differences of its integral, which calm noise."""
-    angle = _cumulative(time, omega)
+    angle = cumulative(time, omega)
     middle = np.clip(time, time[0] + SWING_STEP, time[-1] - SWING_STEP)
     before, here, after = (
         np.stack([np.interp(middle + step, time, column) for column in angle.T], axis=1)
@@ -280,14 +176,14 @@ def _rate_of_change(time: Array, omega: Array) -> Array:
     return (after - 2 * here + before) / SWING_STEP ** 2
 
 
-def _grid(imu_ns: np.ndarray, epochs_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def grid_of(imu_ns: np.ndarray, epochs_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Instants of the samples from the first epoch to the last with those of the epochs."""
     inside = (imu_ns > epochs_ns[0]) & (imu_ns < epochs_ns[-1])
     grid = np.union1d(imu_ns[inside], epochs_ns)
     return grid, np.searchsorted(grid, epochs_ns)
 
 
-def _interpolated(stamps_ns: np.ndarray, values: Array, wanted_ns: np.ndarray) -> Array:
+def interpolated(stamps_ns: np.ndarray, values: Array, wanted_ns: np.ndarray) -> Array:
     from scipy.interpolate import CubicSpline
 
     origin = stamps_ns[0]
@@ -299,95 +195,53 @@ def _true_epochs_ns(simulation: Simulation) -> np.ndarray:
     return simulation.gnss_stamps_ns - round(simulation.meta['gnss_delay'] * 1e9)
 
 
-def _true_path(simulation: Simulation, epochs_ns: np.ndarray) -> _Path:
-    grid, at = _grid(simulation.imu_stamps_ns, epochs_ns)
+def _true_path(simulation: Simulation, epochs_ns: np.ndarray) -> Path:
+    grid, at = grid_of(simulation.imu_stamps_ns, epochs_ns)
     time = (grid - grid[0]) * 1e-9
     stamps = simulation.truth_stamps_ns
     # Longitudes go round at the antimeridian, the Earth-fixed matrices do not.
     lla = simulation.truth_lla.copy()
     lla[:, 1] = np.unwrap(lla[:, 1], period=360.0)
-    lla = _interpolated(stamps, lla, grid)
-    C_n0n = _matrices_n0n(lla, lla[0], time)
+    lla = interpolated(stamps, lla, grid)
+    C_n0n = matrices_n0n(lla, lla[0], time)
     C = C_n0n @ simulation.attitude_at(grid)
-    return _path(time, C, _interpolated(stamps, simulation.truth_gyro, grid),
-                 _interpolated(stamps, simulation.truth_accel, grid), at, C_n0n[at],
-                 _gravity_n(lla[at]),
-                 _interpolated(stamps, simulation.truth_velocity, epochs_ns))
+    return path_along(time, C, interpolated(stamps, simulation.truth_gyro, grid),
+                      interpolated(stamps, simulation.truth_accel, grid), at, C_n0n[at],
+                      gravity_n(lla[at]),
+                      interpolated(stamps, simulation.truth_velocity, epochs_ns))
 
 
-def _measured_path(simulation: Simulation, C: Array, x: Array) -> _Path:
-    from scipy.spatial.transform import Rotation
-
-    epochs_ns = simulation.gnss_stamps_ns - round(x[DELAY][0] * 1e9)
-    grid, at = _grid(simulation.imu_stamps_ns, epochs_ns)
-    time = (grid - grid[0]) * 1e-9
-    omega = _interpolated(simulation.imu_stamps_ns, simulation.gyro, grid)
-    omega = omega - omega @ x[GYRO_MATRIX].reshape(3, 3).T - x[GYRO_BIAS]
-    f = _interpolated(simulation.imu_stamps_ns, simulation.accel, grid)
-    f = f - f @ x[ACCEL_MATRIX].reshape(3, 3).T - x[ACCEL_BIAS]
-    # Angle of each step with the coning term of a rate that is linear in time.
-    h = np.diff(time)[:, None]
-    steps = Rotation.from_rotvec(h / 2 * (omega[1:] + omega[:-1])
-                                 + h * h / 12 * np.cross(omega[:-1], omega[1:])).as_matrix()
-    attitude = np.empty((len(time), 3, 3))
-    attitude[0] = C
-    for k, step in enumerate(steps):
-        attitude[k + 1] = attitude[k] @ step
-    lla = simulation.lla_deg
-    velocity = simulation.velocity
-    return _path(time, attitude, omega, f, at, _matrices_n0n(lla, lla[0], time[at]),
-                 _gravity_n(lla), velocity)
-
-
-def _measured_sides(simulation: Simulation, path: _Path) -> Array:
-    """Antenna velocity and position in n0 without what gravitation did, shape (K, 2, 3)."""
-    from pyins.earth import gravitation_ecef, RATE
-    from pyins.transform import lla_to_ecef
-
-    lla = simulation.lla_deg
-    r_e = lla_to_ecef(lla)
-    C_en = _matrices_en(lla)
-    to_n0 = C_en[0].T @ _matrices_earth(path.time)
-    v_e = (np.einsum('nij,nj->ni', C_en, simulation.velocity)
-           + np.cross([0.0, 0.0, RATE], r_e))
-    gravitation = np.einsum('nij,nj->ni', to_n0, gravitation_ecef(lla))
-    fallen = _cumulative(path.time, gravitation)
-    return np.stack([np.einsum('nij,nj->ni', to_n0, v_e) - fallen,
-                     np.einsum('nij,nj->ni', to_n0, r_e)
-                     - _cumulative(path.time, fallen)], axis=1)
-
-
-def _matrices_en(lla: Array) -> Array:
+def matrices_en(lla: Array) -> Array:
     from pyins.transform import mat_en_from_ll
 
     return mat_en_from_ll(lla[:, 0], lla[:, 1]) @ ENU_FROM_NED
 
 
-def _matrices_earth(time: Array) -> Array:
+def matrices_earth(time: Array) -> Array:
     from pyins.earth import RATE
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_rotvec(RATE * time[:, None] * [0.0, 0.0, 1.0]).as_matrix()
 
 
-def _matrices_n0n(lla: Array, start: Array, time: Array) -> Array:
-    return _matrices_en(start[None])[0].T @ _matrices_earth(time) @ _matrices_en(lla)
+def matrices_n0n(lla: Array, start: Array, time: Array) -> Array:
+    return matrices_en(start[None])[0].T @ matrices_earth(time) @ matrices_en(lla)
 
 
-def _gravity_n(lla: Array) -> Array:
+def gravity_n(lla: Array) -> Array:
     from pyins.earth import gravity
 
     return np.stack([0 * lla[:, 0], 0 * lla[:, 0], -gravity(lla[:, 0], lla[:, 2])], axis=-1)
 
 
-def _lever_terms(path: _Path, lever_b: Array) -> tuple[Array, Array]:
+def lever_terms(path: Path, lever_b: Array) -> tuple[Array, Array]:
     """Velocity and position of the antenna with respect to the IMU, in n0."""
     return (np.einsum('nij,nj->ni', path.C, np.cross(path.omega, lever_b)), path.C @ lever_b)
 
 
-def _design(path: _Path, lever_b: Array) -> Array:
+def design_of(path: Path, lever_b: Array) -> Array:
     """Derive the measurements by the unknowns, shape (6 K, 37)."""
-    lever_v, lever_p = _lever_terms(path, lever_b)
+    lever_v, lever_p = lever_terms(path, lever_b)
     time = path.time[:, None, None]
     H = np.zeros((len(path.time), 2, 3, SIZE))
     velocity, position = H[:, 0], H[:, 1]
@@ -411,14 +265,14 @@ def _design(path: _Path, lever_b: Array) -> Array:
     return H.reshape(-1, SIZE)
 
 
-def _measurement_covariance(simulation: Simulation, path: _Path) -> Array:
+def measurement_covariance(simulation: Simulation, path: Path) -> Array:
     """Covariances of velocity and position in n0, shape (K, 2, 3, 3)."""
     stated = np.stack([simulation.velocity_covariance, simulation.position_covariance])
     turn = path.C_n0n[:, None]
     return turn @ stated @ turn.swapaxes(-1, -2)
 
 
-def _turned_by_noise(path: _Path) -> tuple[Array, Array]:
+def _turned_by_noise(path: Path) -> tuple[Array, Array]:
     """
     How an angle error at s turns a row: ``-[x x]`` with ``x = B z(s)``.
 
@@ -439,25 +293,14 @@ def _turned_by_noise(path: _Path) -> tuple[Array, Array]:
     return B.reshape(-1, 3, 7), np.repeat(path.M, 2, axis=0)
 
 
-def _bias_walk(path: _Path, noise: ImuNoise, lever_b: Array) -> tuple[Array, Array]:
-    """
-    Follow steps of the gyros' biases at the epochs, 1 sigma each, from then on.
-
-    Returns
-    -------
-    to_rows : ndarray, shape (6 K, 3 J)
-        To the measurements; J = 0 where they do not walk.
-    to_attitude : ndarray, shape (3, 3 J)
-        To the attitude at the last epoch.
-
-    """
-    lever_v, lever_p = _lever_terms(path, lever_b)
+def bias_walk(path: Path, noise: ImuNoise, lever_b: Array) -> Array:
+    """Derive the measurements by the 3 J steps of the gyros' biases in sigmas, (6 K, 3 J)."""
+    lever_v, lever_p = lever_terms(path, lever_b)
     C_lever = path.C @ skew(lever_b)
     Theta, Gamma, int_Gamma = (a[..., :3] for a in (path.Theta, path.Gamma, path.int_Gamma))
     n = len(path.time)
     steps = n if noise.rate_random_walk > 0 else 0
     to_rows = np.zeros((n, 2, 3, steps, 3))
-    to_attitude = np.zeros((3, steps, 3))
     for j in range(1, steps):
         std = noise.rate_random_walk * math.sqrt(path.time[j] - path.time[j - 1])
         t = path.time[j:, None] - path.time[j]
@@ -468,12 +311,10 @@ def _bias_walk(path: _Path, noise: ImuNoise, lever_b: Array) -> tuple[Array, Arr
         to_rows[j:, 1, :, j] = std * (
             int_Gamma[j:] - int_Gamma[j] - t[..., None] * Gamma[j]
             - skew(path.P[j:] - path.P[j] - t * path.U[j]) @ Theta[j] + skew(lever_p[j:]) @ turned)
-        to_attitude[:, j] = -std * turned[-1]
-    return to_rows.reshape(6 * n, 3 * steps), to_attitude.reshape(3, 3 * steps)
+    return to_rows.reshape(6 * n, 3 * steps)
 
 
-def _noise_covariance(path: _Path, noise: ImuNoise, walk: tuple[Array, Array],
-                      measurement: Array) -> Array:
+def noise_covariance(path: Path, noise: ImuNoise, walk: Array, measurement: Array) -> Array:
     """Covariance of all rows: random walks of the IMU and GNSS noise, shape (6 K, 6 K)."""
     B, M = _turned_by_noise(path)
     n = len(B)
@@ -499,42 +340,16 @@ def _noise_covariance(path: _Path, noise: ImuNoise, walk: tuple[Array, Array],
     V = np.where(upper > 0, V, V.T)
     blocks = V.reshape(n, 3, n, 3)
     blocks[range(n), :, range(n), :] += measurement.reshape(-1, 3, 3)
-    return V + walk[0] @ walk[0].T
+    return V + walk @ walk.T
 
 
-def _attitude_error_now(path: _Path, noise: ImuNoise, walk: tuple[Array, Array], V: Array,
-                        rows: Index, y: Array, H: Array, dx: Array) -> tuple[Array, Array]:
-    """
-    Predict the random-walk error of the attitude at the last epoch.
-
-    Returns
-    -------
-    rotation : ndarray, shape (3,)
-    E : ndarray, shape (3, n + 3)
-        What the prediction makes of the columns of H; the covariance of what it leaves.
-
-    """
-    variance = noise.angle_random_walk ** 2
-    B, M = _turned_by_noise(path)
-    mean = (B @ M[..., :1])[..., 0]
-    cross = variance * skew(mean).transpose(1, 0, 2).reshape(3, -1)[:, rows]
-    to_rows, to_attitude = walk
-    cross = cross + to_attitude @ to_rows[rows].T
-    solved = np.linalg.solve(V, np.column_stack([y, H, cross.T]))
-    spread = (variance * path.time[-1] * np.eye(3) + to_attitude @ to_attitude.T
-              - cross @ solved[:, -3:])
-    n = H.shape[1]
-    E = np.hstack([cross @ solved[:, 1:1 + n], spread])
-    return cross @ solved[:, 0] - E[:, :n] @ dx, E
-
-
-def _rows(epochs: int, use_velocity: bool, use_position: bool) -> Index:
+def used_rows(epochs: int, use_velocity: bool, use_position: bool) -> Index:
     """Numbers of the rows that are used, in the order of time."""
     return np.flatnonzero(np.tile(np.repeat([use_velocity, use_position], 3), epochs))
 
 
-def _prior(simulation: Simulation, noise: ImuNoise, use_position: bool, lever_arm_std: float,
-           delay_std: float) -> tuple[Index, Array]:
+def prior_of(simulation: Simulation, noise: ImuNoise, use_position: bool, lever_arm_std: float,
+             delay_std: float) -> tuple[Index, Array]:
     """Numbers of the unknowns that are estimated, and the prior's information about them."""
     std = np.zeros(SIZE)
     std[ATTITUDE] = _ATTITUDE_STD
@@ -548,8 +363,8 @@ def _prior(simulation: Simulation, noise: ImuNoise, use_position: bool, lever_ar
     columns = np.flatnonzero(std)
     # The biases of the accelerometers are what they are said to be under the force at t0, turned
     # into one of gravity's size.
-    force = _interpolated(simulation.imu_stamps_ns, simulation.accel,
-                          simulation.gnss_stamps_ns[:1])
+    force = interpolated(simulation.imu_stamps_ns, simulation.accel,
+                         simulation.gnss_stamps_ns[:1])
     force *= STANDARD_GRAVITY / np.linalg.norm(force)
     told = np.eye(SIZE)
     told[ACCEL_BIAS, ACCEL_MATRIX] = _by_row(np.eye(3)[None], force)[0]
@@ -557,7 +372,7 @@ def _prior(simulation: Simulation, noise: ImuNoise, use_position: bool, lever_ar
     return columns, told.T @ np.diag(std[columns] ** -2.0) @ told
 
 
-def _whitened(V: Array, columns: Array) -> Array:
+def whiten(V: Array, columns: Array) -> Array:
     """
     Solve with the Cholesky factor of V.
 
@@ -569,7 +384,7 @@ def _whitened(V: Array, columns: Array) -> Array:
     return solve_triangular(cholesky(V, lower=True), columns, lower=True)
 
 
-def _inverse(matrix: Array) -> Array:
+def inverse_of(matrix: Array) -> Array:
     """
     Inverse of a symmetric positive definite matrix whose rows differ widely in scale.
 
@@ -579,9 +394,3 @@ def _inverse(matrix: Array) -> Array:
         return np.full(matrix.shape, math.nan)
     scale = 1 / np.sqrt(np.diag(matrix))
     return np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
-
-
-def _rotation(vector: Array) -> Array:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_rotvec(vector).as_matrix()

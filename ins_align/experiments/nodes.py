@@ -15,13 +15,11 @@
 Processes that experiments with the node run beside it: ``python -m ins_align.experiments.nodes``.
 
 ``bare`` subscribes to what the node subscribes to and does nothing, ``republish`` publishes each
-IMU message unchanged, ``listen`` takes what is published, ``play FILE RATE`` plays the drivers,
-``timed FILE`` is the node itself, which writes how long its callbacks held the executor.
+IMU message unchanged, ``listen`` takes what is published, ``play FILE`` plays the drivers.
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 import pickle
 import sys
@@ -89,7 +87,7 @@ def _spin(name: str) -> None:
     rclpy.spin(node)
 
 
-def _play(path: str, rate: float) -> None:
+def _play(path: str) -> None:
     script: Script = pickle.loads(Path(path).read_bytes())
     node = rclpy.create_node('play')
     publishers = {topic: node.create_publisher(kind, topic, 1000)
@@ -97,49 +95,18 @@ def _play(path: str, rate: float) -> None:
     time.sleep(2.0)  # they have to find each other
     start, first = time.monotonic(), script[0][0]
     for time_ns, topic, message in script:
-        wait = start + (time_ns - first) * 1e-9 / rate - time.monotonic()
+        wait = start + (time_ns - first) * 1e-9 - time.monotonic()
         if wait > 0.0:
             time.sleep(wait)
         publishers[topic].publish(message)
 
 
-def _timed(path: str) -> int:
-    from ins_align.ros import main, node
-
-    held: list[float] = []
-
-    def timed(function: Any) -> Any:
-        def call(self: Any, *arguments: Any) -> Any:
-            start = time.perf_counter()
-            try:
-                return function(self, *arguments)
-            finally:
-                held.append(time.perf_counter() - start)
-        return call
-
-    for name in ('_on_imu', '_on_reset'):
-        setattr(node.AlignmentNode, name,
-                _like(timed(getattr(node.AlignmentNode, name)), name))
-    status = main.main(['--ros-args', '-p', 'lever_arm:=[1.0, 1.0, 1.0]'])
-    Path(path).write_text(json.dumps(held))
-    return status
-
-
-def _like(call: Any, name: str) -> Any:
-    # rclpy counts a callback's arguments to know what it wants.
-    if name == '_on_imu':
-        return lambda self, data, info: call(self, data, info)
-    return lambda self, request, response: call(self, request, response)
-
-
 def main(name: str, *arguments: str) -> int:
     """Run one of the processes until it is interrupted."""
-    if name == 'timed':
-        return _timed(*arguments)
     rclpy.init()
     try:
         if name == 'play':
-            _play(arguments[0], float(arguments[1]))
+            _play(*arguments)
         else:
             _spin(name)
     except ExternalShutdownException:

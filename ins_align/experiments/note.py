@@ -49,6 +49,7 @@ VARIANTS: dict[str, tuple[tuple[float, ...], dict[str, Any]]] = {
     'compensated, free start': (LEVER, {'method': 'vif'}),
     'bank': (LEVER, {'method': 'bank'}),
 }
+SHOWN = 'not compensated', 'compensated', 'zero lever arm'
 ADDED = ('compensated', 'compensated, free start', 'bank')
 COLOURS = {'not compensated': '#D55E00', 'compensated': '#0072B2', 'zero lever arm': '#009E73',
            'compensated, free start': '#E69F00', 'bank': '#CC79A7'}
@@ -78,11 +79,7 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
                   'method `vif` without free start, as in Fig. 1 of the note')
     report.figure(added_figure(errors, bounds, time), '_added', 'Root mean square errors: the '
                   'note, its free start, bank, and the Cramer-Rao bound')
-    remarks = remarks_of(REMARK_DURATION)
-    report.figure(remark_figure(*remarks), '_remarks', 'Remark 2.1: what the short form of (9) '
-                  'leaves out. Remark 2.2: the lever-arm term against the integral of the '
-                  'specific force')
-    seconds, remainder, limit, term, integral = remarks
+    seconds, remainder, limit, term, integral = remarks_of(REMARK_DURATION)
     numbers['remark_2_1'] = {'largest_m_s': remainder.max(), 'limit_at_end_m_s': limit[-1],
                              'largest_share_of_limit': np.max(remainder[1:] / limit[1:])}
     report.text(
@@ -136,29 +133,24 @@ def rms_table(report: Report, errors: dict[str, dict[str, Array]], bounds: dict[
 
 
 def peak_table(report: Report, errors: dict[str, Array], time: Array) -> dict[str, list[float]]:
-    """Print the largest mean errors early on."""
+    """Print the largest mean errors early on, and how far they are from those of no lever arm."""
     early = (time >= PEAK_FROM) & (time <= PEAK_TO)
-    rows, numbers = [], {}
-    for name in ('not compensated', 'compensated', 'zero lever arm'):
-        mean = np.mean(errors[name], axis=0)
-        values = [*np.max(np.abs(mean[early]), axis=0), *np.abs(mean[-1])]
-        rows.append([name, *(f'{value:.3f}' for value in values)])
-        numbers[name] = values
+    none = errors['zero lever arm']
+    numbers = {}
+    for name in SHOWN:
+        mean, apart = np.mean(errors[name], axis=0), np.mean(errors[name] - none, axis=0)
+        numbers[name] = [*np.max(np.abs(mean[early]), axis=0), *np.abs(mean[-1]),
+                         *np.max(np.abs(apart[early]), axis=0)]
+    chance = np.max(np.std(none, axis=0, ddof=1)[early], axis=0) / np.sqrt(len(none))
     report.table(
-        f'Mean error, deg: largest from {PEAK_FROM:g} to {PEAK_TO:g} s, and at {DURATION:g} s',
-        ['variant', *ANGLES, *(f'{angle}, end' for angle in ANGLES)], rows)
-    apart = {name: np.max(np.abs(np.mean(errors[name] - errors['zero lever arm'], axis=0)[early]),
-                          axis=0) for name in ('not compensated', 'compensated')}
-    chance = np.max((np.std(errors['zero lever arm'], axis=0, ddof=1)
-                     / np.sqrt(len(errors['zero lever arm'])))[early], axis=0)
+        f'Mean error, deg: largest from {PEAK_FROM:g} to {PEAK_TO:g} s, at {DURATION:g} s, and '
+        'largest difference early from that of zero lever arm with the same noise',
+        ['variant', *ANGLES, *(f'{angle}, end' for angle in ANGLES),
+         *(f'{angle}, apart' for angle in ANGLES)],
+        [[name, *(f'{value:.2g}' for value in values)] for name, values in numbers.items()])
     report.text(
         "The note's Fig. 1 shows early peaks without compensation, gone with it, and compensated "
-        f'like zero lever arm. Here, from {PEAK_FROM:g} to {PEAK_TO:g} s, the mean errors differ '
-        'from those of zero lever arm, with the same noise, by at most '
-        + '; '.join(f'{name}: ' + ', '.join(f'{angle} {value:.2g}' for angle, value in
-                                            zip(ANGLES, values)) + ' deg'
-                    for name, values in apart.items())
-        + '. What the noise alone leaves in the means (1 sigma, largest in that time): '
+        'like zero lever arm. What the noise alone leaves in these means (1 sigma): '
         + ', '.join(f'{angle} {value:.2g}' for angle, value in zip(ANGLES, chance)) + ' deg.')
     return numbers
 
@@ -167,14 +159,13 @@ def note_figure(errors: dict[str, Array], time: Array) -> Any:
     """Draw mean errors over time."""
     picture = new_figure(8.0, 8.0)
     axes = picture.subplots(3, 1, sharex=True)
+    means = {name: np.mean(errors[name], axis=0) for name in SHOWN}
     for column, (ax, angle) in enumerate(zip(axes, ANGLES)):
-        for name in ('not compensated', 'compensated', 'zero lever arm'):
-            mean = np.mean(errors[name][..., column], axis=0)
-            ax.plot(time, mean, color=COLOURS[name], label=name,
+        for name, mean in means.items():
+            ax.plot(time, mean[:, column], color=COLOURS[name], label=name,
                     linestyle='--' if name == 'zero lever arm' else '-')
-        shown = time >= SHOWN_FROM
-        limit = 1.1 * max(np.nanmax(np.abs(np.mean(errors[name][:, shown, column], axis=0)))
-                          for name in ('not compensated', 'compensated', 'zero lever arm'))
+        limit = 1.1 * max(np.nanmax(np.abs(mean[time >= SHOWN_FROM, column]))
+                          for mean in means.values())
         ax.set_ylim(-limit, limit)
         ax.set_xlim(0.0, DURATION)
         ax.set_ylabel(f'{angle} (deg)')
@@ -242,28 +233,6 @@ def remarks_of(duration: float) -> tuple[Array, Array, Array, Array, Array]:
 
     return (time, size(remainder), 2 * EARTH_RATE ** 2 * time * np.linalg.norm(lever_b),
             size(turned - turned[0]), size(integral))
-
-
-def remark_figure(time: Array, remainder: Array, limit: Array, term: Array,
-                  integral: Array) -> Any:
-    """Draw Remarks 2.1 and 2.2."""
-    picture = new_figure(11.0, 4.2)
-    left, right = picture.subplots(1, 2)
-    every = slice(10, None, 10)
-    left.plot(time[every], remainder[every], color='#0072B2', label='remainder of the short form')
-    left.plot(time[every], limit[every], 'k--', label='$2\\,W^2\\,t\\,|l|$')
-    left.set_title('Remark 2.1')
-    right.loglog(time[every], integral[every], color='#E69F00',
-                 label='$|\\int C_{b0b}\\,f_b\\,dt|$')
-    right.loglog(time[every], term[every], color='#0072B2', linewidth=0.8,
-                 label='lever-arm term')
-    right.set_title('Remark 2.2')
-    for ax in (left, right):
-        ax.set_xlabel('time since t0 (s)')
-        ax.set_ylabel('m/s')
-        ax.grid(alpha=0.3)
-        ax.legend()
-    return picture
 
 
 def exact_lever_remainder(time: Array, C_b0b: Array, omega_eb_b: Array, omega_ie_b0: Array,

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
 from ins_align.experiments import disturbances as of
-from ins_align.experiments import recorded
+from ins_align.experiments import recordings
 from ins_align.experiments.common import config_for, error_of, parallel, Report
 from ins_align.experiments.spoilt import SECOND, Stream, stream_of
 from ins_align.geometry.rotation import Array
@@ -255,25 +255,15 @@ def truth(simulation: Simulation, stream: Stream, stamps: list[int]) -> list[Arr
 
 def run_recorded(path: Path, start_s: float, z_sign: float, told: JsonDict) -> JsonDict:
     """Align a recording from some time to its end."""
-    recording = recorded.load(path)
-    imu, signs = recording.imu, np.array([1.0, 1.0, z_sign])
-
-    def sent() -> Iterator[Message]:
-        place = start = int(np.searchsorted(
-            imu.stamps_ns, recording.start_ns + round(start_s * SECOND)))
-        for end, message in zip(recording.imu_before.tolist(), recording.messages):
-            if end <= start:
-                continue
-            now = int(imu.stamps_ns[end - 1])
-            if end > place:
-                yield now, 'imu', (imu.stamps_ns[place:end], imu.gyro[place:end] * signs,
-                                   imu.accel[place:end])
-            place = end
-            yield now, 'velocity' if isinstance(message, Velocity) else 'fix', message
-
-    aligner = Aligner(Config(lever_arm=recorded.KNOWN_LEVER_ARMS[RECORDING], **told))
+    recording = recordings.load(path)
+    signs = np.array([1.0, 1.0, z_sign])
+    first = int(np.searchsorted(recording.imu.stamps_ns,
+                                recording.start_ns + round(start_s * SECOND)))
+    sent = ((now, kind, (payload[0], payload[1] * signs, payload[2]) if kind == 'imu' else payload)
+            for now, kind, payload in recording.sent(first, int(recording.imu_before[-1])))
+    aligner = Aligner(Config(lever_arm=recordings.KNOWN_LEVER_ARMS[RECORDING], **told))
     return {'start_s': start_s, **follow(
-        aligner, sent(), lambda stamps: [recording.reference.attitude_at(s) for s in stamps],
+        aligner, sent, lambda stamps: [recording.reference.attitude_at(s) for s in stamps],
         std_deg=recording.reference_std_deg)}
 
 

@@ -11,91 +11,233 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Checks of what a simulation is asked for."""
+"""What a simulation can be asked for: one table, which the command line and the checks share."""
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from collections.abc import Sequence
+import dataclasses
+from dataclasses import dataclass
 import math
+from numbers import Real
+import reprlib
 from typing import Any
 
 from ins_align.config import ImuNoise, parameters, PRESETS
-from ins_align.simulation.scenarios import SCENARIOS
-import numpy as np
 
-VELOCITY_FRAMES = ('enu', 'ned')
 IMU_AXES = {'': (1.0, 1.0, 1.0), 'x': (-1.0, 1.0, 1.0), 'y': (1.0, -1.0, 1.0),
             'z': (1.0, 1.0, -1.0)}
 
 LATENESS_MARGIN = 0.5  # s, of gnss_lateness over the latency
 _MAX_SAMPLES = 20_000_000
 
+# As far as the parameters of the aligner go that make up for them.
+_MOST = {parameter.name: parameter.maximum for parameter in parameters()
+         if parameter.maximum is not None}
+# Errors that an IMU has by default because of its grade; the others have noise and biases alone.
+# The estimator takes misalignment and the errors of the accelerometers for 3 tenths of the gyros'
+# scale factor errors.
+_CHIP = PRESETS['chip']
+_OF_GRADE = {'chip': {
+    'gyro_scale_std': _CHIP.gyro_scale_std, 'rate_random_walk': _CHIP.rate_random_walk,
+    **dict.fromkeys(('gyro_misalignment_std', 'accel_scale_std', 'accel_misalignment_std'),
+                    0.3 * _CHIP.gyro_scale_std)}}
+
 
 class SimulationError(ValueError):
     """A simulation cannot be made as asked; the text says why."""
 
 
-def checked_arguments(arguments: dict[str, Any]) -> ImuNoise:
-    """Raise SimulationError for an argument without sense; return the IMU's noise."""
-    def number(value: Any) -> bool:
-        return isinstance(value, (int, float, np.number)) and not isinstance(value, bool) \
-            and math.isfinite(value)
+def _argument(default: Any, text: str, unit: str = '', minimum: float = -math.inf,
+              maximum: float = math.inf, *, group: str = '', names: tuple[str, ...] = (),
+              choices: tuple[Any, ...] = ()) -> Any:
+    """Describe a number, as many numbers as `names`, or one of `choices`; None means optional."""
+    return dataclasses.field(default=default, metadata={
+        'text': text, 'unit': unit, 'minimum': minimum, 'maximum': maximum, 'group': group,
+        'names': names, 'choices': choices})
 
-    def check(names: str, expected: str, fits: Callable[[Any], bool]) -> None:
-        for name in names.split():
-            if not fits(arguments[name]):
-                raise SimulationError(f'{name} must be {expected}, got {arguments[name]!r}')
 
-    check('scenario', f'one of {", ".join(SCENARIOS)}', lambda value: value in tuple(SCENARIOS))
-    check('imu_grade', f'one of {", ".join(PRESETS)} or an ImuNoise with figures above 0',
-          lambda value: all(number(figure) and figure > 0 for figure in value[:4])
-          if isinstance(value, ImuNoise) else value in tuple(PRESETS))
-    check('seed', 'an integer, 0 or above',
-          lambda value: number(value) and value == int(value) and value >= 0)
-    check('imu_rate gnss_rate', 'a number of Hz above 0 and up to 10000',
-          lambda value: number(value) and 0 < value <= 10000)
-    check('duration', 'a number of seconds above 0',
-          lambda value: value is None or number(value) and value > 0)
-    check('velocity_std position_std position_drift_std outlier_velocity outlier_position '
-          'gyro_misalignment_std accel_scale_std accel_misalignment_std '
-          'rate_random_walk gnss_phase stand_still',
-          'a number, 0 or above', lambda value: number(value) and value >= 0)
-    # As far as the parameters go that make up for them.
-    most = {parameter.name: parameter.maximum for parameter in parameters()
-            if parameter.maximum is not None}
-    latency = most['gnss_lateness'] - LATENESS_MARGIN
-    check('gnss_latency', f'a number of seconds from 0 to {latency:g}',
-          lambda value: number(value) and 0 <= value <= latency)
-    check('gnss_delay', f'a number of seconds from 0 to {most["gnss_delay"]:g}',
-          lambda value: number(value) and 0 <= value <= most['gnss_delay'])
-    check('gyro_scale_std', f'a number from 0 to {most["gyro_scale_std"]:g}',
-          lambda value: number(value) and 0 <= value <= most['gyro_scale_std'])
-    check('velocity_std_vertical position_std_vertical gyro_bias_std accel_bias_std',
-          'a number, 0 or above', lambda value: value is None or number(value) and value >= 0)
-    check('position_drift_time', 'a number of seconds above 0',
-          lambda value: number(value) and value > 0)
-    check('imu_jitter', 'a number from 0 to below 0.5',
-          lambda value: number(value) and 0 <= value < 0.5)
-    check('outlier_rate', 'a number from 0 to 1', lambda value: number(value) and 0 <= value <= 1)
-    check('latitude_deg', 'a number of degrees between -89 and 89',
-          lambda value: number(value) and -89 <= value <= 89)
-    check('altitude', 'a number of metres from -1000 to 100000',
-          lambda value: number(value) and -1e3 <= value <= 1e5)
-    check('longitude_deg heading_deg crab_deg', 'a finite number', number)
-    check('mount_rpy_deg', 'three finite numbers',
-          lambda value: np.shape(value) == (3,) and all(map(number, value)))
-    check('lever_arm', 'three numbers of metres from -{0:g} to {0:g}'.format(most['lever_arm']),
-          lambda value: np.shape(value) == (3,) and all(map(number, value))
-          and max(map(abs, value)) <= most['lever_arm'])
-    check('outages', 'pairs of a start and a later end in seconds',
-          lambda value: all(np.shape(pair) == (2,) and pair[0] < pair[1] for pair in value))
-    check('velocity_frame', 'enu or ned', lambda value: value in VELOCITY_FRAMES)
-    check('flip_axis flip_gyro', 'x, y, z or empty', lambda value: value in tuple(IMU_AXES))
-    check('accel_sign', '1 or -1', lambda value: value in (1, -1))
-    duration = arguments['duration']
-    if duration is None:
-        duration = SCENARIOS[arguments['scenario']].duration + arguments['stand_still']
-    rate = max(arguments['imu_rate'], arguments['gnss_rate'])
-    if duration * rate > _MAX_SAMPLES:
-        raise SimulationError(f'{duration:g} s at {rate:g} Hz are too many '
-                              f'samples, the limit is {_MAX_SAMPLES}')
-    grade = arguments['imu_grade']
-    return grade if isinstance(grade, ImuNoise) else PRESETS[grade]
+def _imu(default: Any, text: str, unit: str = '', minimum: float = 0.0,
+         maximum: float = math.inf, **options: Any) -> Any:
+    return _argument(default, text, unit, minimum, maximum, group='IMU', **options)
+
+
+def _gnss(default: Any, text: str, unit: str = '', minimum: float = 0.0,
+          maximum: float = math.inf, **options: Any) -> Any:
+    return _argument(default, text, unit, minimum, maximum, group='GNSS', **options)
+
+
+def _motion(default: Any, text: str, unit: str = 'deg', minimum: float = -math.inf,
+            maximum: float = math.inf) -> Any:
+    return _argument(default, text, unit, minimum, maximum, group='motion')
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """
+    Everything that `simulate` can be asked for, checked.
+
+    Each field's metadata holds ``text``, ``unit``, ``minimum`` and ``maximum`` (inclusive),
+    ``choices``, ``names`` of its numbers where it has several, and its ``group`` of options.
+
+    Raises
+    ------
+    SimulationError
+        If an argument makes no sense.
+
+    """
+
+    scenario: str
+    imu_grade: str | ImuNoise = 'mems'
+    seed: int = 0
+    duration: float | None = None
+    ideal: bool = False
+    outages: Sequence[tuple[float, float]] = ()
+
+    imu_rate: float = _imu(100.0, 'samples per second', 'Hz', 1e-3, 1e4)
+    imu_jitter: float = _imu(0.0, 'samples are off their time by up to this part of the interval '
+                             'between them; stamps tell the displaced instants', '1', 0.0, 0.49)
+    lever_arm: Sequence[float] = _imu(
+        (1.0, 1.0, 1.0), 'IMU to antenna in the IMU frame', 'm', -_MOST['lever_arm'],
+        _MOST['lever_arm'], names=('X', 'Y', 'Z'))
+    mount_rpy_deg: Sequence[float] = _imu(
+        (0.0, 0.0, 0.0), 'attitude of the IMU in the vehicle', 'deg', -math.inf,
+        names=('ROLL', 'PITCH', 'YAW'))
+    gyro_bias_std: float | None = _imu(
+        None, "gyroscope bias, 1 sigma per axis; default: the grade's", 'rad/s')
+    accel_bias_std: float | None = _imu(
+        None, "accelerometer bias, 1 sigma per axis; default: the grade's", 'm/s^2')
+    accel_bias: Sequence[float] | None = _imu(
+        None, 'accelerometer bias itself, instead of a drawn one', 'm/s^2', -math.inf,
+        names=('X', 'Y', 'Z'))
+    gyro_scale_std: float | None = _imu(
+        None, 'scale factor error of each gyroscope, 1 sigma, 0.01 is one percent; default: 0, '
+        'of a chip what its grade states', '1', 0.0, _MOST['gyro_scale_std'])
+    gyro_misalignment_std: float | None = _imu(
+        None, 'what a gyroscope feels of the rate about each other axis, 1 sigma; default: 0, '
+        'of a chip what its grade states', '1')
+    accel_scale_std: float | None = _imu(
+        None, 'the same of the accelerometers: scale factor error', '1')
+    accel_misalignment_std: float | None = _imu(
+        None, 'the same of the accelerometers: misalignment', '1')
+    rate_random_walk: float | None = _imu(
+        None, 'how the biases of the gyroscopes change; default: 0, of a chip what its grade '
+        'states', 'rad/s/sqrt(s)')
+    dead_band: Sequence[float] = _imu(
+        (0.0, 0.0), 'gyroscopes and accelerometers read 0 below this', 'rad/s and m/s^2',
+        names=('GYRO', 'ACCEL'))
+    quantum: Sequence[float] = _imu(
+        (0.0, 0.0), 'gyroscopes and accelerometers read multiples of this', 'rad/s and m/s^2',
+        names=('GYRO', 'ACCEL'))
+    flip_axis: str = _imu('', 'this axis of the IMU has the wrong sign', choices=tuple(IMU_AXES))
+    flip_gyro: str = _imu('', 'this angular rate alone has the wrong sign',
+                          choices=tuple(IMU_AXES))
+    accel_sign: int = _imu(1, '-1: the accelerometers have the sign of gravity', choices=(1, -1))
+
+    latitude_deg: float = _motion(48.0, 'where it starts', 'deg', -89.0, 89.0)
+    longitude_deg: float = _motion(11.0, 'where it starts')
+    altitude: float = _motion(300.0, 'where it starts', 'm', -1e3, 1e5)
+    heading_deg: float = _motion(
+        0.0, 'turns the trajectory: course of the start, counter-clockwise from east')
+    crab_deg: float = _motion(0.0, 'the nose points so far left of the course')
+    stand_still: float = _motion(0.0, 'at rest before setting off', 's', 0.0)
+
+    gnss_rate: float = _gnss(5.0, 'epochs per second', 'Hz', 1e-3, 1e4)
+    gnss_phase: float = _gnss(0.0137, 'stamp of the first epoch; by default no IMU sample is at '
+                              'a GNSS stamp', 's')
+    gnss_latency: float = _gnss(0.0, 'messages arrive so long after their stamp', 's', 0.0,
+                                _MOST['gnss_lateness'] - LATENESS_MARGIN)
+    gnss_delay: float = _gnss(0.0, 'measurements are older than their stamp by this', 's', 0.0,
+                              _MOST['gnss_delay'])
+    velocity_std: float = _gnss(0.1, 'white noise of the velocity, 1 sigma, horizontal', 'm/s')
+    velocity_std_vertical: float | None = _gnss(
+        None, 'and vertical; default: the same', 'm/s')
+    position_std: float = _gnss(2.5, 'white noise of the position, 1 sigma, horizontal', 'm')
+    position_std_vertical: float | None = _gnss(None, 'and vertical; default: twice that', 'm')
+    velocity_drift_std: float = _gnss(
+        0.0, 'errors of the velocity that last (first-order Gauss-Markov), 1 sigma per axis; not '
+        'in the stated covariance', 'm/s')
+    position_drift_std: float = _gnss(
+        0.0, 'errors of the position that last, 1 sigma per axis; not in the stated covariance',
+        'm')
+    gnss_correlation: float = _gnss(60.0, 'time constant of the errors that last', 's', 1e-3)
+    outlier_rate: float = _gnss(0.0, 'part of the epochs that are spoilt', '1', 0.0, 1.0)
+    outlier_velocity: float = _gnss(
+        5.0, 'by how much they are, in a random direction', 'm/s')
+    outlier_position: float = _gnss(50.0, 'by how much they are, in a random direction', 'm')
+    velocity_frame: str = _gnss('enu', 'ned: the receiver sends north-east-down',
+                                choices=('enu', 'ned'))
+
+    def __post_init__(self) -> None:
+        from ins_align.simulation.scenarios import SCENARIOS
+
+        _require('scenario', self.scenario, f'one of {", ".join(SCENARIOS)}',
+                 self.scenario in tuple(SCENARIOS))
+        grade = self.imu_grade
+        _require('imu_grade', grade, f'one of {", ".join(PRESETS)} or an ImuNoise with figures '
+                 'above 0', all(_is_number(figure) and figure > 0 for figure in grade[:4])
+                 if isinstance(grade, ImuNoise) else grade in tuple(PRESETS))
+        _require('seed', self.seed, 'an integer, 0 or above',
+                 _is_number(self.seed) and self.seed == int(self.seed) and self.seed >= 0)
+        _require('outages', self.outages, 'pairs of a start and a later end in seconds',
+                 all(hasattr(pair, '__len__') and len(pair) == 2 and pair[0] < pair[1]
+                     for pair in self.outages))
+        for field in dataclasses.fields(self):
+            if field.metadata:
+                _check(field, getattr(self, field.name))
+        if self.duration is None:
+            object.__setattr__(self, 'duration',
+                               SCENARIOS[self.scenario].duration + self.stand_still)
+        _require('duration', self.duration, 'a number of seconds above 0',
+                 _is_number(self.duration) and self.duration > 0)
+        rate = max(self.imu_rate, self.gnss_rate)
+        if self.duration * rate > _MAX_SAMPLES:
+            raise SimulationError(f'{self.duration:g} s at {rate:g} Hz are too many '
+                                  f'samples, the limit is {_MAX_SAMPLES}')
+        of_grade = {} if isinstance(grade, ImuNoise) else _OF_GRADE.get(grade, {})
+        for name in _OF_GRADE['chip']:
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, of_grade.get(name, 0.0))
+
+    @property
+    def imu_noise(self) -> ImuNoise:
+        """Return what the errors of the IMU are drawn from, in SI units."""
+        noise = PRESETS[self.imu_grade] if isinstance(self.imu_grade, str) else self.imu_grade
+        own = {'gyro_bias_std': self.gyro_bias_std, 'accel_bias_std': self.accel_bias_std,
+               'gyro_scale_std': self.gyro_scale_std, 'rate_random_walk': self.rate_random_walk}
+        return noise._replace(**{name: value for name, value in own.items() if value is not None})
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _are_numbers(values: Any, count: int) -> bool:
+    return hasattr(values, '__len__') and len(values) == count and all(map(_is_number, values))
+
+
+def _require(name: str, value: Any, expected: str, fits: bool) -> None:
+    if not fits:
+        raise SimulationError(f'{name} must be {expected}, got {reprlib.repr(value)}')
+
+
+def _check(field: dataclasses.Field[Any], value: Any) -> None:
+    """Raise SimulationError for a value that does not fit its line of the table."""
+    line = field.metadata
+    if value is None and field.default is None:
+        return
+    if line['choices']:
+        _require(field.name, value, 'one of ' + ', '.join(
+            str(choice) or '""' for choice in line['choices']), value in line['choices'])
+        return
+    count = len(line['names'])
+    expected = f'{count} numbers' if count else 'a finite number'
+    if line['unit'] not in ('', '1'):
+        expected += f' in {line["unit"]}'
+    if line['maximum'] < math.inf:
+        expected += f' from {line["minimum"]:g} to {line["maximum"]:g}'
+    elif line['minimum'] > -math.inf:
+        expected += f', {line["minimum"]:g} or above'
+    fits = _are_numbers(value, count) if count else _is_number(value)
+    _require(field.name, value, expected, fits and all(
+        line['minimum'] <= number <= line['maximum'] for number in (value if count else [value])))

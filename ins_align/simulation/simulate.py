@@ -20,7 +20,7 @@ latency, outages and outliers, and the whole becomes a recording.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 import json
 import math
@@ -33,8 +33,7 @@ from ins_align.config import Config, ImuNoise, PRESETS
 from ins_align.geometry.rotation import Array, matrix_from_rpy, quaternion_from_matrix
 from ins_align.gnss.messages import ENU_FROM_NED, Fix, Velocity
 from ins_align.simulation import scenarios
-from ins_align.simulation.arguments import (
-    checked_arguments, IMU_AXES, LATENESS_MARGIN, SimulationError)
+from ins_align.simulation.arguments import Arguments, IMU_AXES, LATENESS_MARGIN, SimulationError
 from ins_align.simulation.trajectory import displaced, START_NS, Trajectory, trajectory_of, wrapped
 import numpy as np
 
@@ -184,27 +183,7 @@ def give(aligner: Any, kind: str, payload: Any) -> None:
         aligner.add_velocity(payload)
 
 
-def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0,
-             duration: float | None = None, ideal: bool = False,
-             imu_rate: float = 100.0, imu_jitter: float = 0.0,
-             gyro_bias_std: float | None = None, accel_bias_std: float | None = None,
-             rate_random_walk: float = 0.0,
-             gyro_scale_std: float = 0.0, gyro_misalignment_std: float = 0.0,
-             accel_scale_std: float = 0.0, accel_misalignment_std: float = 0.0,
-             lever_arm: Sequence[float] = (1.0, 1.0, 1.0),
-             mount_rpy_deg: Sequence[float] = (0.0, 0.0, 0.0),
-             gnss_rate: float = 5.0, gnss_phase: float = 0.0137,
-             gnss_latency: float = 0.0, gnss_delay: float = 0.0,
-             velocity_std: float = 0.1, velocity_std_vertical: float | None = None,
-             position_std: float = 2.5, position_std_vertical: float | None = None,
-             position_drift_std: float = 0.0, position_drift_time: float = 60.0,
-             outages: Sequence[tuple[float, float]] = (),
-             outlier_rate: float = 0.0, outlier_velocity: float = 5.0,
-             outlier_position: float = 50.0,
-             latitude_deg: float = 48.0, longitude_deg: float = 11.0, altitude: float = 300.0,
-             heading_deg: float = 0.0, crab_deg: float = 0.0, stand_still: float = 0.0,
-             velocity_frame: str = 'enu', flip_axis: str = '', flip_gyro: str = '',
-             accel_sign: int = 1) -> Simulation:
+def simulate(scenario: str, **options: Any) -> Simulation:
     """
     Simulate the sensors of a moving vehicle.
 
@@ -212,65 +191,9 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
     ----------
     scenario : str
         One of `SCENARIOS`.
-    imu_grade : str or ImuNoise
-        Preset of `ins_align.config` or the four figures themselves.
-    seed : int
-        Of everything random; the same seed gives the same recording. Each sensor has its own
-        stream: another GNSS rate leaves the IMU as it was.
-    duration : float, optional
-        Seconds; by default what suits the scenario, after `stand_still`.
-    ideal : bool
-        Leave out noise, biases, scale factors, drift. Stated covariances stay.
-    imu_rate, gnss_rate : float
-        Hz.
-    imu_jitter : float
-        Largest displacement of a sampling instant in parts of the interval, below 0.5. Stamps
-        tell the displaced instants.
-    gyro_bias_std, accel_bias_std : float, optional
-        rad/s and m/s^2 per axis in place of the grade's.
-    rate_random_walk : float
-        Of the gyros' biases, rad/s/sqrt(s).
-    gyro_scale_std, gyro_misalignment_std : float
-        Scale factor error of each gyro (0.01 is one percent), and what it feels of the rate about
-        each of the other axes.
-    accel_scale_std, accel_misalignment_std : float
-        So it is with the accelerometers and the force along the axes.
-    lever_arm : three floats
-        IMU to antenna in the IMU frame, m.
-    mount_rpy_deg : three floats
-        Attitude of the IMU in the vehicle: roll, pitch, yaw.
-    gnss_phase : float
-        Stamp of the first epoch, s; by default no IMU sample is at a GNSS stamp.
-    gnss_latency : float
-        Arrival after the stamp, s, up to 59.5.
-    gnss_delay : float
-        The measurement is older than its stamp by this, s, up to 10.
-    velocity_std, position_std : float
-        Horizontal noise, m/s and m.
-    velocity_std_vertical, position_std_vertical : float, optional
-        By default the same for velocity, twice that for position.
-    position_drift_std, position_drift_time : float
-        First-order Gauss-Markov error on top of the white noise, m and s; not in the covariance.
-    outages : sequence of (start, end)
-        Seconds without GNSS.
-    outlier_rate, outlier_velocity, outlier_position : float
-        Part of the epochs that are spoilt, and by how many m/s and m in a random direction.
-    latitude_deg, longitude_deg, altitude : float
-        Where the motion starts.
-    heading_deg : float
-        Turns the trajectory: course of the start, counter-clockwise from east.
-    crab_deg : float
-        The vehicle's nose points so far left of its course.
-    stand_still : float
-        Seconds at rest before the vehicle sets off.
-    velocity_frame : str
-        'ned': the receiver sends north-east-down.
-    flip_axis : str
-        'x', 'y' or 'z': this axis of the IMU has the wrong sign.
-    flip_gyro : str
-        So has this angular rate alone.
-    accel_sign : int
-        -1: the accelerometer has the sign of gravity.
+    options
+        The fields of `Arguments`, whose defaults hold for the rest; units are SI, but where the
+        name says degrees.
 
     Returns
     -------
@@ -282,92 +205,107 @@ def simulate(scenario: str, *, imu_grade: str | ImuNoise = 'mems', seed: int = 0
         If an argument makes no sense.
 
     """
-    meta = dict(locals())
-    noise = checked_arguments(meta)._replace(gyro_scale_std=gyro_scale_std,
-                                             rate_random_walk=rate_random_walk)
-    if gyro_bias_std is not None:
-        noise = noise._replace(gyro_bias_std=gyro_bias_std)
-    if accel_bias_std is not None:
-        noise = noise._replace(accel_bias_std=accel_bias_std)
-    if duration is None:
-        duration = scenarios.SCENARIOS[scenario].duration + stand_still
-        meta['duration'] = duration
-    trajectory = trajectory_of(
-        scenario, float(duration), float(imu_rate), float(imu_jitter), float(latitude_deg),
-        float(longitude_deg), float(altitude), float(heading_deg), float(crab_deg),
-        float(stand_still))
+    asked = Arguments(scenario, **options)
+    trajectory = trajectory_of(scenario, *(float(getattr(asked, name)) for name in (
+        'duration', 'imu_rate', 'imu_jitter', 'latitude_deg', 'longitude_deg', 'altitude',
+        'heading_deg', 'crab_deg', 'stand_still')))
     streams = [np.random.default_rng(child)
-               for child in np.random.SeedSequence(int(seed)).spawn(5)]
-    scale = 0.0 if ideal else 1.0
-    C_vb = matrix_from_rpy(np.radians(mount_rpy_deg))
-    lever_b = np.array(lever_arm, dtype=float)
+               for child in np.random.SeedSequence(int(asked.seed)).spawn(6)]
+    C_vb = matrix_from_rpy(np.radians(asked.mount_rpy_deg))
+    lever_b = np.array(asked.lever_arm, dtype=float)
+    return Simulation(
+        truth_stamps_ns=trajectory.stamps_ns, truth_C_nb=trajectory.C_nv @ C_vb,
+        truth_velocity=trajectory.velocity, truth_lla=trajectory.lla, lever_arm=lever_b,
+        meta=vars(asked), _trajectory=trajectory, _C_vb=C_vb,
+        **_imu(asked, trajectory, C_vb, streams),
+        **_gnss(asked, trajectory, C_vb, lever_b, streams))
 
+
+def _imu(asked: Arguments, trajectory: Trajectory, C_vb: Array,
+         streams: list[np.random.Generator]) -> dict[str, Any]:
+    """Return what the IMU reads, and its errors."""
+    noise, scale = asked.imu_noise, 0.0 if asked.ideal else 1.0
     truth_gyro, truth_accel = trajectory.gyro @ C_vb, trajectory.accel @ C_vb
     gyro_bias = scale * noise.gyro_bias_std * streams[0].standard_normal(3)
     accel_bias = scale * noise.accel_bias_std * streams[0].standard_normal(3)
+    if asked.accel_bias is not None:
+        accel_bias = scale * np.array(asked.accel_bias, dtype=float)
+        noise = noise._replace(accel_bias_std=max(
+            noise.accel_bias_std, float(np.sqrt(np.mean(np.square(asked.accel_bias))))))
     gyro_matrix, accel_matrix = (
         np.eye(3) + scale * scale_std * np.diag(streams[0].standard_normal(3))
         + scale * misalignment_std * (1 - np.eye(3)) * streams[0].standard_normal((3, 3))
-        for scale_std, misalignment_std in ((gyro_scale_std, gyro_misalignment_std),
-                                            (accel_scale_std, accel_misalignment_std)))
-    walk = _random_walk(trajectory.stamps_ns * 1e-9, scale * rate_random_walk, streams[0])
-    gyro_std = scale * noise.angle_random_walk * math.sqrt(imu_rate)
-    accel_std = scale * noise.velocity_random_walk * math.sqrt(imu_rate)
-    sign = np.array(IMU_AXES[flip_axis])
+        for scale_std, misalignment_std in (
+            (asked.gyro_scale_std, asked.gyro_misalignment_std),
+            (asked.accel_scale_std, asked.accel_misalignment_std)))
+    walk = _random_walk(trajectory.stamps_ns * 1e-9, scale * noise.rate_random_walk, streams[0])
+    gyro_std = scale * noise.angle_random_walk * math.sqrt(asked.imu_rate)
+    accel_std = scale * noise.velocity_random_walk * math.sqrt(asked.imu_rate)
+    sign = np.array(IMU_AXES[asked.flip_axis])
     shape = truth_gyro.shape
-    gyro = sign * IMU_AXES[flip_gyro] * (truth_gyro @ gyro_matrix.T + gyro_bias + walk
-                                         + gyro_std * streams[1].standard_normal(shape))
-    accel = accel_sign * sign * (truth_accel @ accel_matrix.T + accel_bias
-                                 + accel_std * streams[2].standard_normal(shape))
+    gyro = sign * IMU_AXES[asked.flip_gyro] * (
+        truth_gyro @ gyro_matrix.T + gyro_bias + walk
+        + gyro_std * streams[1].standard_normal(shape))
+    accel = asked.accel_sign * sign * (truth_accel @ accel_matrix.T + accel_bias
+                                       + accel_std * streams[2].standard_normal(shape))
+    for reading, dead_band, quantum in zip((gyro, accel), asked.dead_band, asked.quantum):
+        if not asked.ideal:
+            reading[np.abs(reading) < dead_band] = 0.0
+            if quantum > 0:
+                np.rint(reading / quantum, out=reading)
+                reading *= quantum
+    return {'imu_stamps_ns': trajectory.stamps_ns, 'gyro': gyro, 'accel': accel,
+            'truth_gyro': truth_gyro, 'truth_accel': truth_accel, 'gyro_bias': gyro_bias,
+            'accel_bias': accel_bias, 'imu_noise': noise, 'gyro_std': gyro_std,
+            'accel_std': accel_std}
 
-    stamps, time = _gnss_epochs(duration, gnss_rate, gnss_phase, gnss_delay, outages)
+
+def _gnss(asked: Arguments, trajectory: Trajectory, C_vb: Array, lever_b: Array,
+          streams: list[np.random.Generator]) -> dict[str, Any]:
+    """Return what the receiver sends."""
+    scale = 0.0 if asked.ideal else 1.0
+    stamps, time = _gnss_epochs(asked)
     lla, velocity = trajectory.antenna(time, C_vb, lever_b)
-    velocity_sigma = _per_axis(velocity_std, velocity_std_vertical, 1.0)
-    position_sigma = _per_axis(position_std, position_std_vertical, 2.0)
-    outlier = streams[4].random(len(time)) < outlier_rate
+    velocity_sigma = _per_axis(asked.velocity_std, asked.velocity_std_vertical, 1.0)
+    position_sigma = _per_axis(asked.position_std, asked.position_std_vertical, 2.0)
+    outlier = streams[4].random(len(time)) < asked.outlier_rate
     direction = streams[4].standard_normal((len(time), 3))
     direction *= (outlier / np.linalg.norm(direction, axis=1))[:, None]
     velocity = (velocity + scale * velocity_sigma * streams[3].standard_normal(velocity.shape)
-                + outlier_velocity * direction)
+                + asked.outlier_velocity * direction)
     offset = (scale * position_sigma * streams[3].standard_normal(lla.shape)
-              + outlier_position * direction)
-    if position_drift_std > 0 and not ideal:
-        offset += _gauss_markov(stamps * 1e-9, position_drift_std, position_drift_time,
-                                streams[3])
+              + asked.outlier_position * direction)
+    if not asked.ideal:
+        # The last draws of a stream each, so that they change nothing else.
+        for error, std, stream in ((offset, asked.position_drift_std, streams[3]),
+                                   (velocity, asked.velocity_drift_std, streams[5])):
+            error += _gauss_markov(stamps * 1e-9, std, asked.gnss_correlation, stream)
     lla = wrapped(displaced(lla, offset))
     velocity_covariance = np.diag(velocity_sigma ** 2)
-    if velocity_frame == 'ned':
+    if asked.velocity_frame == 'ned':
         velocity = velocity @ ENU_FROM_NED
         velocity_covariance = ENU_FROM_NED @ velocity_covariance @ ENU_FROM_NED
-
     gnss_stamps_ns = START_NS + stamps
-    return Simulation(
-        imu_stamps_ns=trajectory.stamps_ns, gyro=gyro, accel=accel,
-        gnss_stamps_ns=gnss_stamps_ns,
-        gnss_arrival_ns=gnss_stamps_ns + round(gnss_latency * 1e9),
-        lla_deg=lla, velocity=velocity, velocity_covariance=velocity_covariance,
-        position_covariance=np.diag(position_sigma ** 2), outlier=outlier,
-        truth_stamps_ns=trajectory.stamps_ns, truth_C_nb=trajectory.C_nv @ C_vb,
-        truth_velocity=trajectory.velocity, truth_lla=trajectory.lla,
-        truth_gyro=truth_gyro, truth_accel=truth_accel, gyro_bias=gyro_bias,
-        accel_bias=accel_bias, lever_arm=lever_b, imu_noise=noise, gyro_std=gyro_std,
-        accel_std=accel_std, meta=meta, _trajectory=trajectory, _C_vb=C_vb)
+    return {'gnss_stamps_ns': gnss_stamps_ns,
+            'gnss_arrival_ns': gnss_stamps_ns + round(asked.gnss_latency * 1e9),
+            'lla_deg': lla, 'velocity': velocity, 'velocity_covariance': velocity_covariance,
+            'position_covariance': np.diag(position_sigma ** 2), 'outlier': outlier}
 
 
 def _per_axis(horizontal: float, vertical: float | None, ratio: float) -> Array:
     return np.array([horizontal, horizontal, ratio * horizontal if vertical is None else vertical])
 
 
-def _gnss_epochs(duration: float, rate: float, phase: float, delay: float,
-                 outages: Sequence[tuple[float, float]]) -> tuple[np.ndarray, Array]:
+def _gnss_epochs(asked: Arguments) -> tuple[np.ndarray, Array]:
     """Stamps in ns and true instants of measurement in s since the start."""
-    count = max(int((duration - phase) * rate + 1e-6) + 1, 0)
-    stamps = np.rint((phase + np.arange(count) / rate) * 1e9).astype(np.int64)
+    count = max(int((asked.duration - asked.gnss_phase) * asked.gnss_rate + 1e-6) + 1, 0)
+    stamps = np.rint((asked.gnss_phase + np.arange(count) / asked.gnss_rate) * 1e9).astype(
+        np.int64)
     seconds = stamps * 1e-9
-    received = seconds >= delay
-    for start, end in outages:
+    received = seconds >= asked.gnss_delay
+    for start, end in asked.outages:
         received &= (seconds < start) | (seconds >= end)
-    return stamps[received], seconds[received] - delay
+    return stamps[received], seconds[received] - asked.gnss_delay
 
 
 def _gauss_markov(time: Array, std: float, correlation_time: float,
