@@ -99,6 +99,10 @@ class Config:
         'auto', 'align with GNSS velocities; auto: when they arrive', choices=AUTO_OR_BOOL)
     use_position: str | bool = _parameter(
         'auto', 'align with GNSS positions; auto: when no velocity arrives', choices=AUTO_OR_BOOL)
+    fix_type: str = _parameter(
+        'NavSatFix', 'message type of the position topic; GPSFix of gps_msgs and NavPVT of '
+        'ublox_msgs bring the velocity too, and no velocity topic is read',
+        choices=('NavSatFix', 'GPSFix', 'NavPVT'))
     velocity_type: str = _parameter(
         'TwistWithCovarianceStamped', 'message type of the velocity topic',
         choices=('TwistWithCovarianceStamped', 'TwistStamped', 'Odometry', 'Vector3Stamped'))

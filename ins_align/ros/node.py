@@ -20,29 +20,30 @@ Everything that decides anything is in the intake and the alignment that the ali
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 import dataclasses
+from functools import partial
 from operator import itemgetter
 import time
 from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import (
-    QuaternionStamped, TwistStamped, TwistWithCovarianceStamped, Vector3Stamped)
+from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
 from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
 from ins_align.checks import InputChecks
 from ins_align.config import (
     Config, config_from_mapping, ConfigError, no_effect, NODE_NAME, parameters)
-from ins_align.gnss.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
+from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
 from ins_align.results import Severity
 from ins_align.ros.diagnostics import (
     diagnostic_status, inputs_in_words, LEVELS, parameter_descriptor, ReasonLog, topic_faults,
     vector_msg)
+from ins_align.ros.gnss_inputs import (
+    FIX_TOPIC, gnss_from_msg, gnss_topics, REJECTED_AS, VELOCITY_TOPIC, VELOCITY_TYPES)
 from ins_align.ros.imu_bytes import ImuSample, read_imu, with_orientation
 from ins_align.ros.on_demand import OnDemand, queued
 from ins_align.ros.worker import Worker
-from nav_msgs.msg import Odometry
 import numpy as np
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -55,17 +56,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.time import Time
-from sensor_msgs.msg import Imu, NavSatFix
+from sensor_msgs.msg import Imu
 from std_msgs.msg import UInt8
 from std_srvs.srv import Trigger
 
-VELOCITY_TYPES = {
-    'TwistWithCovarianceStamped': TwistWithCovarianceStamped,
-    'TwistStamped': TwistStamped,
-    'Odometry': Odometry,
-    'Vector3Stamped': Vector3Stamped,
-}
-IMU_TOPIC, FIX_TOPIC, VELOCITY_TOPIC = 'imu/data_raw', 'fix', 'fix_velocity'
+IMU_TOPIC = 'imu/data_raw'
 STATE_NUMBERS = {state: number for number, state in enumerate(State)}
 IMU_DEPTH = 2000  # ten seconds at 200 Hz: the machine may be busy, no sample may be lost
 GNSS_DEPTH = 200
@@ -153,15 +148,14 @@ class AlignmentNode(Node):
             self._publish_on(Vector3Stamped, topic, QoSProfile(depth=100))
             for topic in ('~/roll_pitch_yaw_deg', '~/sigma_deg'))
         self._state_publisher = self._publish_on(UInt8, '~/state', QoSProfile(depth=10))
-        velocity_type = VELOCITY_TYPES[self._config.velocity_type]
-        self._inputs = {IMU_TOPIC: Imu, FIX_TOPIC: NavSatFix, VELOCITY_TOPIC: velocity_type}
+        gnss = gnss_topics(self._config)
+        self._inputs = {IMU_TOPIC: Imu, **gnss}
         self._imu_on_demand = OnDemand()
         self._imu_subscription = self._subscribe_to(
             Imu, IMU_TOPIC, self._on_imu, IMU_DEPTH, self._imu_on_demand)
-        self._fix_subscription = self._subscribe_to(
-            NavSatFix, FIX_TOPIC, _nothing, GNSS_DEPTH, OnDemand())
-        self._velocity_subscription = self._subscribe_to(
-            velocity_type, VELOCITY_TOPIC, _nothing, GNSS_DEPTH, OnDemand())
+        self._gnss_subscriptions = [
+            (self._subscribe_to(msg_type, topic, _nothing, GNSS_DEPTH, OnDemand()),
+             partial(self._gnss, topic)) for topic, msg_type in gnss.items()]
         self.get_logger().info(inputs_in_words(self, self._inputs, self._config))
         self.create_service(Trigger, '~/reset', self._on_reset)
         # A signal between two waits of the executor wakes it from neither: it has to look.
@@ -214,11 +208,11 @@ class AlignmentNode(Node):
     def _work(self, items: list[tuple[int, Any]]) -> None:
         """Take in what has come, align and publish what has changed."""
         for subscription, convert in (
-                *([] if self._imu_on_demand.is_open else [(self._imu_subscription, read_imu)]),
-                (self._fix_subscription, fix_from_msg),
-                (self._velocity_subscription, self._velocity)):
-            items += [(received_ns, convert(message)) for message, received_ns
-                      in queued(subscription, subscription.qos_profile.depth)]
+                *([] if self._imu_on_demand.is_open else [(self._imu_subscription, _sample)]),
+                *self._gnss_subscriptions):
+            items += [(received_ns, item) for message, received_ns
+                      in queued(subscription, subscription.qos_profile.depth)
+                      for item in convert(message)]
         # Each topic is a queue by itself: nothing shall be late, or early, for having waited.
         items.sort(key=itemgetter(0))
         for received_ns, item in items:
@@ -288,12 +282,12 @@ class AlignmentNode(Node):
         self._aligner.reset(why)
         self._checks = InputChecks(self._config)
 
-    def _velocity(self, msg: Any) -> Velocity | None:
+    def _gnss(self, topic: str, msg: Any) -> Sequence[Fix | Velocity]:
         try:
-            return velocity_from_msg(msg, self._config)
+            return gnss_from_msg(topic, msg, self._config)
         except MessageError as error:
-            self._aligner.reject('velocity_body_frame', str(error))
-            return None
+            self._aligner.reject(REJECTED_AS[topic], str(error))
+            return []
 
     def _heeds(self, frame_id: str, received_ns: int) -> bool:
         """Whether a sample is of the IMU that is aligned, which one that is new becomes."""
@@ -477,6 +471,10 @@ class AlignmentNode(Node):
     def _change_parameters(self, changes: list[Parameter]) -> None:
         self._config = self._changed_config(changes)
         self._worker.put((self._now_ns(), self._config))
+
+
+def _sample(message: bytes) -> Sequence[ImuSample]:
+    return [read_imu(message)]
 
 
 def _nothing(*_: Any) -> None:
