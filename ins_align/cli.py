@@ -298,6 +298,8 @@ def _add_simulate(commands: Any) -> None:
     group.add_argument('--outage', type=float, nargs=2, action='append', default=[],
                        metavar=('FROM', 'TO'), dest='outages',
                        help='no GNSS between these seconds; repeatable')
+    command.add_argument('--tf', action='store_true',
+                         help='write how IMU and antenna are mounted to /tf_static')
 
 
 # Options that hand a number, or three, to the argument of the same name of
@@ -570,9 +572,10 @@ def run_simulate(arguments: argparse.Namespace) -> int:
     from ins_align.simulation.simulate import simulate, write_bag
 
     options = {name: value for name, value in vars(arguments).items()
-               if name not in ('command', 'run', 'parser', 'out', 'storage', 'scenario')}
+               if name not in ('command', 'run', 'parser', 'out', 'storage', 'scenario', 'tf')}
     try:
-        write_bag(simulate(arguments.scenario, **options), arguments.out, arguments.storage)
+        write_bag(simulate(arguments.scenario, **options), arguments.out, arguments.storage,
+                  arguments.tf)
     except SimulationError as error:
         raise UsageError(error) from None
     except OSError as error:

@@ -28,16 +28,19 @@ from ins_align.gnss.drivers import (
     DRIVER_TYPES, imu_from_driver, in_words, INERTIAL_UNITS, LIVE_TYPES, NoTimeError,
     receiver_from_msg, RECEIVERS)
 from ins_align.gnss.messages import Fix, MessageError, Velocity, velocity_from_msg
+from ins_align.mounting import find_mounting, FixedFrames, Mounting
 from ins_align.recordings import BagError, Topic
 from ins_align.recordings.bag import Bag, Block
 from ins_align.recordings.decode import (
     decode_gnss, decode_imu_topic, decode_orientations, deserialize, GNSS_TYPES, IMU_TYPE,
     ImuSamples, Orientations, Refused)
+from ins_align.results import Severity
 import numpy as np
 
 FIX_TYPES, VELOCITY_TYPES = ([name for name, fields in GNSS_TYPES.items() if fields.kind == kind]
                              for kind in ('fix', 'velocity'))
 VECTOR_TYPE = 'geometry_msgs/msg/Vector3Stamped'  # of a velocity or of anything else
+TF_TYPE = 'tf2_msgs/msg/TFMessage'
 UNSTAMPED_TYPES = ['geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistWithCovariance',
                    'geometry_msgs/msg/Vector3']
 REFERENCE_NAMESPACE = '/reference/'
@@ -54,6 +57,7 @@ class Topics(NamedTuple):
     velocity: Topic | None
     velocity_type: str | None  # as the parameter of that name has it
     reference: Topic | None
+    C_imu_base: np.ndarray | None = None  # takes vectors of the configured base to the IMU
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,8 @@ def read(request: Request) -> Iterator[Part]:
         config = request.config
         if topics.velocity_type is not None:
             config = dataclasses.replace(config, velocity_type=topics.velocity_type)
+        mounting = _mounting(bag, topics, config)
+        config, topics = mounting.config, topics._replace(C_imu_base=mounting.C_imu_base)
         start_ns = (bag.start_ns or 0) + round((request.start or 0.0) * 1e9)
         stop_ns = (None if request.duration is None
                    else start_ns + round(request.duration * 1e9))
@@ -137,6 +143,36 @@ def read(request: Request) -> Iterator[Part]:
             raise BagError(f'{request.path} has no IMU or GNSS messages {_part(request, bag)}')
         nothing = Block(np.zeros(0, np.int64), np.zeros(0, np.int64), [()] * len(wanted))
         yield _decoded(nothing, wanted, topics, config, 1.0, tuple(bag.warnings))
+
+
+def _mounting(bag: Bag, topics: Topics, config: Config) -> Mounting:
+    """Look up in /tf_static where antenna and base are."""
+    frames = FixedFrames()
+    static = [topic for topic in bag.topics
+              if topic.msgtype == TF_TYPE and topic.name.endswith('/tf_static')]
+    for block in bag.blocks(static):
+        for topic, messages in zip(static, block.messages):
+            for data in messages:
+                with suppress(MessageError):
+                    for transform in deserialize(data, topic).transforms:
+                        frames.add(transform)
+    found = find_mounting(frames.lookup, _frame_id(bag, topics.imu), _frame_id(bag, topics.fix),
+                          config)
+    if found.missing and (config.lever_arm_from_tf is True or config.base_frame):
+        raise BagError(f'{bag.path} has no transform {" and none ".join(found.missing)}: '
+                       'lever_arm_from_tf and base_frame need /tf_static with them')
+    for severity, text in found.words:
+        if severity is Severity.WARNING:
+            bag.warn(text)
+    return found
+
+
+def _frame_id(bag: Bag, topic: Topic) -> str:
+    """Return the frame_id of the first message of a topic, empty where it has none."""
+    data = bag.first_message(topic)
+    with suppress(MessageError, AttributeError):
+        return str(deserialize(data or b'', topic).header.frame_id)
+    return ''
 
 
 def _part(request: Request, bag: Bag) -> str:

@@ -33,6 +33,7 @@ from ins_align.geometry.rotation import (
 from ins_align.gnss.buffer import fault_of_fix
 from ins_align.gnss.messages import Fix
 from ins_align.intake import Intake, Step
+from ins_align.mounting import base_attitude
 from ins_align.recordings.decode import Attitudes, Refused
 from ins_align.recordings.reader import Part, read, Request, Topics
 from ins_align.results import Attitude, Epoch, State, Status
@@ -167,7 +168,17 @@ class ReplayResult:
             'lever_arm_m': _finite(status.lever_arm),
             'gnss_delay_s': _finite([status.gnss_delay])[0],
             'counts': dict(status.counts),
+            **self._base_json(),
         }
+
+    def _base_json(self) -> dict[str, Any]:
+        """Return the attitudes of the base, where one is configured."""
+        if not self.config.base_frame:
+            return {}
+        attitudes = {f'base_{name}_attitude': _attitude_json(
+            base_attitude(attitude, self.topics.C_imu_base)) for name, attitude in (
+                ('initial', self.status.initial), ('final', self.status.current))}
+        return {'base_frame': self.config.base_frame, **attitudes}
 
     def to_csv(self) -> str:
         """Return the table that ``--csv`` writes, a row per GNSS epoch."""

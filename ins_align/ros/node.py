@@ -35,10 +35,12 @@ from ins_align.config import (
     Config, config_from_mapping, ConfigError, no_effect, NODE_NAME, parameters)
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
+from ins_align.mounting import Mounting
 from ins_align.results import Severity
 from ins_align.ros.diagnostics import (
     diagnostic_status, inputs_in_words, LEVELS, parameter_descriptor, ReasonLog, topic_faults,
     vector_msg)
+from ins_align.ros.frames import frame_id_of, MountingSearch, open_buffer
 from ins_align.ros.gnss_inputs import (
     FIX_TOPIC, gnss_from_msg, gnss_topics, REJECTED_AS, VELOCITY_TOPIC, VELOCITY_TYPES)
 from ins_align.ros.imu_bytes import ImuSample, read_imu, with_orientation
@@ -120,6 +122,7 @@ class AlignmentNode(Node):
         self.failure: BaseException | None = None
         self._worker = Worker(self._work, self._on_failure)
         self._config = self._declare_parameters()
+        self._search = MountingSearch(self._config, open_buffer(self, self._config))
         # The executor's thread:
         self._follower = Follower()
         self._adopted: _Outlook | None = None
@@ -208,13 +211,17 @@ class AlignmentNode(Node):
     def _work(self, items: list[tuple[int, Any]]) -> None:
         """Take in what has come, align and publish what has changed."""
         for subscription, convert in (
-                *([] if self._imu_on_demand.is_open else [(self._imu_subscription, _sample)]),
+                *([] if self._imu_on_demand.is_open else
+                  [(self._imu_subscription, lambda message: [read_imu(message)])]),
                 *self._gnss_subscriptions):
             items += [(received_ns, item) for message, received_ns
                       in queued(subscription, subscription.qos_profile.depth)
                       for item in convert(message)]
         # Each topic is a queue by itself: nothing shall be late, or early, for having waited.
         items.sort(key=itemgetter(0))
+        items, mounting = self._search.take(items, time.monotonic())
+        if mounting is not None:
+            self._adopt(mounting)
         for received_ns, item in items:
             self._feed(received_ns, item)
         self._check([item for _, item in items])
@@ -231,6 +238,15 @@ class AlignmentNode(Node):
         # By a clock that goes on when simulated time stands still.
         if events or time.monotonic() >= self._next_status:
             self._publish_status()
+
+    def _adopt(self, mounting: Mounting) -> None:
+        """Take over what TF says."""
+        for severity, text in mounting.words:
+            self._log(severity, text)
+        if mounting.config.lever_arm != self._config.lever_arm:
+            self._config = dataclasses.replace(self._config, lever_arm=mounting.config.lever_arm)
+            self._aligner, self._checks = Aligner(self._config), InputChecks(self._config)
+            self._imu_frame = None
 
     def _log(self, severity: Severity, text: str) -> None:
         # rclpy wants one line of code for each severity.
@@ -283,6 +299,8 @@ class AlignmentNode(Node):
         self._checks = InputChecks(self._config)
 
     def _gnss(self, topic: str, msg: Any) -> Sequence[Fix | Velocity]:
+        if topic == FIX_TOPIC:
+            self._search.antenna_frame = frame_id_of(msg)
         try:
             return gnss_from_msg(topic, msg, self._config)
         except MessageError as error:
@@ -307,6 +325,7 @@ class AlignmentNode(Node):
         """Start over: what was learnt is about axes that are no longer the IMU's."""
         if self._imu_frame is not None:
             self._aligner.reject('imu_frame_changed')
+            self._search.restart()
             self._start_over(
                 f'frame_id of the IMU changed from {self._imu_frame!r} to {frame_id!r}')
             if len(self._other_frames) < MAX_OTHER_FRAMES:
@@ -371,6 +390,8 @@ class AlignmentNode(Node):
         if silent > IMU_SILENT:
             # The aligner goes by stamps: it learns of a gap when the next sample comes.
             more.append(f'no IMU sample for {silent:.0f} s')
+        if self._search.waits_for:
+            more.append(f'waits for {self._search.waits_for}')
         reason = f'{status.state.value}: {status.reason}'
         if more:
             level = max(level, DiagnosticStatus.WARN)
@@ -378,7 +399,8 @@ class AlignmentNode(Node):
         msg = DiagnosticArray()
         msg.header.stamp = self.get_clock().now().to_msg()
         msg.status = [diagnostic_status(
-            self.get_fully_qualified_name(), self._imu_frame or '', level, status)]
+            self.get_fully_qualified_name(), self._imu_frame or '', level, status,
+            self._search.mounting)]
         for publisher in self._status_publishers:
             publisher.publish(msg)
         self._state_publisher.publish(UInt8(data=STATE_NUMBERS[status.state]))
@@ -471,10 +493,6 @@ class AlignmentNode(Node):
     def _change_parameters(self, changes: list[Parameter]) -> None:
         self._config = self._changed_config(changes)
         self._worker.put((self._now_ns(), self._config))
-
-
-def _sample(message: bytes) -> Sequence[ImuSample]:
-    return [read_imu(message)]
 
 
 def _nothing(*_: Any) -> None:
