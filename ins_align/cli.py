@@ -314,6 +314,8 @@ def _add_simulate(commands: Any) -> None:
             metavar=line['names'] or unit.upper() or ('NAME' if line['choices'] else 'X'),
             help=line['text'] + (unit and f', {unit}')
             + (f' (default: {default})' if default else ''))
+    command.add_argument('--tf', action='store_true',
+                         help='write how IMU and antenna are mounted to /tf_static')
 
 
 def _add_experiment(commands: Any) -> None:
@@ -557,9 +559,10 @@ def run_simulate(arguments: argparse.Namespace) -> int:
     from ins_align.simulation.simulate import simulate, write_bag
 
     options = {name: value for name, value in vars(arguments).items()
-               if name not in ('command', 'run', 'parser', 'out', 'storage', 'scenario')}
+               if name not in ('command', 'run', 'parser', 'out', 'storage', 'scenario', 'tf')}
     try:
-        write_bag(simulate(arguments.scenario, **options), arguments.out, arguments.storage)
+        write_bag(simulate(arguments.scenario, **options), arguments.out, arguments.storage,
+                  arguments.tf)
     except SimulationError as error:
         raise UsageError(error) from None
     except OSError as error:

@@ -99,10 +99,20 @@ class Config:
     lever_arm_std: float = _parameter(
         1.0, 'how well the lever arm is known, 1 sigma per axis; above 0 it is estimated too',
         'm', minimum=0.0, maximum=100.0)
+    lever_arm_from_tf: str | bool = _parameter(
+        'auto', 'take the lever arm from the transform between the frame_ids of IMU and position '
+        'messages (/tf_static); auto: where there is one and lever_arm is not set; true: wait for '
+        'it', choices=AUTO_OR_BOOL)
+    base_frame: str = _parameter(
+        '', 'frame whose attitude the status and JSON give as well, as TF has it; empty: none')
     use_velocity: str | bool = _parameter(
         'auto', 'align with GNSS velocities; auto: when they arrive', choices=AUTO_OR_BOOL)
     use_position: str | bool = _parameter(
         'auto', 'align with GNSS positions; auto: when no velocity arrives', choices=AUTO_OR_BOOL)
+    fix_type: str = _parameter(
+        'NavSatFix', 'message type of the position topic; GPSFix of gps_msgs and NavPVT of '
+        'ublox_msgs bring the velocity too, and no velocity topic is read',
+        choices=('NavSatFix', 'GPSFix', 'NavPVT'))
     velocity_type: str = _parameter(
         'TwistWithCovarianceStamped', 'message type of the velocity topic',
         choices=('TwistWithCovarianceStamped', 'TwistStamped', 'Odometry', 'Vector3Stamped'))
@@ -373,6 +383,8 @@ def _checked(field: dataclasses.Field[Any], value: Any) -> Any:
     if choices:
         return _checked_choice(field.name, value, choices)
     if isinstance(field.default, str):
+        if value == field.default == '':
+            return value
         if not isinstance(value, str) or not re.fullmatch(r'[^\s/][^\s]{0,255}', value):
             raise ConfigError(f'{field.name} must be a name without spaces and without a leading '
                               f'slash, got {reprlib.repr(value)}')

@@ -261,7 +261,7 @@ class Result:
     def to_json(self) -> dict[str, Any]:
         """Return the object that ``--json`` writes; numbers that are not finite are None."""
         status = self.status
-        final = _attitude_json(status.current)
+        final = attitude_json(status.current)
         if final is not None and status.current is not None:
             final = {'stamp': status.current.stamp_ns, **final}
         return {
@@ -270,7 +270,7 @@ class Result:
             'reason': status.reason,
             't0': status.t0_ns,
             'time_to_align_s': status.time_to_align_s,
-            'initial_attitude': _attitude_json(status.initial),
+            'initial_attitude': attitude_json(status.initial),
             'final_attitude': final,
             'gyro_bias_rad_s': _finite(status.gyro_bias),
             'accel_bias_m_s2': _finite(status.accel_bias),
@@ -295,7 +295,8 @@ class Result:
         return out.getvalue()
 
 
-def _attitude_json(attitude: Attitude | None) -> dict[str, Any] | None:
+def attitude_json(attitude: Attitude | None) -> dict[str, Any] | None:
+    """Return an attitude as ``--json`` writes it."""
     if attitude is None:
         return None
     roll, pitch, yaw = _finite([attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg])

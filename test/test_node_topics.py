@@ -15,17 +15,22 @@
 
 from dataclasses import replace
 import re
+import sys
+from types import SimpleNamespace
 
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TwistStamped, Vector3Stamped
+from ins_align.config import Config, ConfigError
 from ins_align.geometry.rotation import matrix_from_quaternion, roll_pitch_yaw
 from ins_align.ros.diagnostics import ReasonLog
+from ins_align.ros.gnss_inputs import gnss_from_msg, gnss_topics
 from ins_align.simulation.simulate import simulate
 from node_harness import (
     Listener, playing, RELIABLE, running_node, script_of, simulated_messages, stamp_ns, values_of)
 import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
-from std_msgs.msg import UInt8
+from std_msgs.msg import Header, UInt8
 
 PARAMETERS = ['imu_grade:=tactical', 'lever_arm:=[1, 1, 1]', 'velocity_std:=0.1',
               'velocity_std_vertical:=0.1', 'gnss_lateness:=5.0', *RELIABLE]
@@ -160,3 +165,25 @@ def test_a_reason_is_logged_when_its_kind_changes_and_when_it_stays():
     # What comes and goes is not logged each time.
     for now in range(65, 100):
         assert bool(log.due([f'ALIGNING: {"ab"[now % 2]}'], now, True)) == (now % 10 in (5, 6))
+
+
+def test_receiver_messages_need_their_package_and_bring_the_velocity(monkeypatch):
+    config = Config(fix_type='GPSFix')
+    monkeypatch.setitem(sys.modules, 'gps_msgs.msg', None)
+    monkeypatch.setitem(sys.modules, 'gps_msgs', None)
+    with pytest.raises(ConfigError, match='gps_msgs is not installed: sudo apt install ros-'):
+        gnss_topics(config)
+
+    class GPSFix(SimpleNamespace):
+        pass
+
+    monkeypatch.setitem(sys.modules, 'gps_msgs.msg', SimpleNamespace(GPSFix=GPSFix))
+    assert gnss_topics(config) == {'fix': GPSFix}
+    message = GPSFix(
+        header=Header(stamp=Time(sec=12)), status=SimpleNamespace(status=0), latitude=48.0,
+        longitude=11.0, altitude=300.0, position_covariance=np.zeros(9),
+        position_covariance_type=0, speed=5.0, track=90.0, climb=1.0, err_speed=0.2, err_climb=0.4)
+    fix, velocity = gnss_from_msg('fix', message, config)
+    assert fix[:4] == (12_000_000_000, 48.0, 11.0, 300.0) and fix.covariance is None
+    assert velocity.velocity == pytest.approx([5.0, 0.0, 1.0])
+    assert velocity.covariance == pytest.approx(np.diag([0.01, 0.01, 0.04]))

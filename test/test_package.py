@@ -125,7 +125,8 @@ def test_page_lists_every_parameter_with_its_default():
     for parameter in parameters():
         value = list(parameter.default) if isinstance(parameter.default, tuple) \
             else parameter.default
-        defaults[parameter.name] = str(value).lower() if isinstance(value, bool) else str(value)
+        defaults[parameter.name] = (
+            str(value).lower() if isinstance(value, bool) else str(value) or "''")
     assert rows == defaults
 
 

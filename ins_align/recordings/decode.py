@@ -22,10 +22,12 @@ from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
 from ins_align.config import Config
+from ins_align.gnss.drivers import (
+    DRIVER_TYPES, imu_from_driver, in_words, receiver_from_msg, RECEIVERS)
 from ins_align.gnss.messages import Fix, fixes, MessageError, velocities, Velocity
 from ins_align.recordings import Topic
 import numpy as np
-from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 IMU_TYPE = 'sensor_msgs/msg/Imu'
 # sensor_msgs/Imu ends with 37 float64, as ROS 1 and CDR have them: of each field the place of its
@@ -119,6 +121,21 @@ def decode_imu(messages: Sequence[bytes], encoding: str) -> ImuSamples:
     return ImuSamples(*_decode(messages, encoding, 'angular_velocity', 'linear_acceleration'))
 
 
+def decode_imu_topic(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
+    """Decode an IMU topic, sensor_msgs/Imu or a driver's own, like `decode_imu`."""
+    if topic.msgtype == IMU_TYPE:
+        return decode_imu(messages, topic.encoding)
+    decoded = np.zeros(len(messages), bool)
+    rows = []
+    for place, data in enumerate(messages):
+        with suppress(MessageError):
+            rows.append(imu_from_driver(deserialize(data, topic), topic.msgtype))
+            decoded[place] = True
+    stamps, gyro, accel = zip(*rows) if rows else ((), (), ())
+    return ImuSamples(np.array(stamps, np.int64), np.reshape(gyro, (-1, 3)),
+                      np.reshape(accel, (-1, 3)), decoded)
+
+
 def decode_orientations(messages: Sequence[bytes], encoding: str) -> Orientations:
     """Decode the orientations of serialised sensor_msgs/Imu like `decode_imu`."""
     return Orientations(
@@ -177,15 +194,34 @@ def _layout(length: int, order: str, mark: int, names: tuple[str, ...]) -> np.dt
                      'itemsize': length})
 
 
-@lru_cache(maxsize=None)
-def _typestore(encoding: str) -> Any:
-    return get_typestore(Stores.ROS1_NOETIC if encoding == 'ros1' else Stores.ROS2_JAZZY)
+@lru_cache(maxsize=16)
+def _typestore(encoding: str, msgtype: str, definition: str) -> Any:
+    """Return a store of types that has one, by the definition where it is a driver's."""
+    store = get_typestore(Stores.ROS1_NOETIC if encoding == 'ros1' else Stores.ROS2_JAZZY)
+    if msgtype in DRIVER_TYPES and definition:
+        store.register({name: content for name, content
+                        in get_types_from_msg(definition, msgtype).items()
+                        if name not in store.types})
+    return store
 
 
 def deserialize(data: bytes, topic: Topic) -> Any:
-    """Deserialise one message with rosbags; a MessageError says that the bytes are none."""
-    store = _typestore(topic.encoding)
+    """
+    Deserialise one message with rosbags.
+
+    Raises
+    ------
+    MessageError
+        If the bytes are none, or nothing defines the type.
+
+    """
+    if topic.msgtype in DRIVER_TYPES and not topic.definition:
+        raise MessageError(
+            f'the recording has no definition of {in_words(topic.msgtype)}: record as mcap, where '
+            'the package of that message is installed, or "ros2 bag convert" it there to mcap')
     try:
+        store = _typestore(topic.encoding, topic.msgtype,
+                           topic.definition if topic.msgtype in DRIVER_TYPES else '')
         if topic.encoding == 'ros1':
             return store.deserialize_ros1(data, topic.msgtype)
         return store.deserialize_cdr(data, topic.msgtype)
@@ -194,9 +230,15 @@ def deserialize(data: bytes, topic: Topic) -> Any:
                            f'{topic.msgtype}') from None
 
 
-def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config,
+def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config, kind: str = '',
                 ) -> list[Fix | Velocity | Refused]:
-    """Decode messages of one of GNSS_TYPES, or say of each why not."""
+    """
+    Decode messages of one of GNSS_TYPES or RECEIVERS, or say of each why not.
+
+    Of the latter, which have both, `kind` says which is wanted, fix or velocity.
+    """
+    if topic.msgtype in RECEIVERS:
+        return [_of_receiver(data, topic, config, kind) for data in messages]
     kind, values, covariance, more = GNSS_TYPES[topic.msgtype]
     read = attrgetter('header.stamp.sec', 'header.stamp.nanosec',
                       *f'{values} {more} {covariance}'.split())
@@ -223,3 +265,12 @@ def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config,
         for place, message in zip(places, found):
             decoded[place] = message
     return decoded
+
+
+def _of_receiver(data: bytes, topic: Topic, config: Config, kind: str) -> Fix | Velocity | Refused:
+    """Return what is wanted of a message of one of RECEIVERS."""
+    try:
+        both = receiver_from_msg(deserialize(data, topic), topic.msgtype, config)
+    except MessageError as error:
+        return Refused(f'{kind}_undecodable', str(error))
+    return both[kind == 'velocity']

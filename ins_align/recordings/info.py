@@ -111,7 +111,7 @@ class _Survey:
         self._bag = bag
         self._start_ns = bag.start_ns or 0
         self._candidates = candidates
-        self._data: dict[str, Recorded] = {data.topic.name: data for data in candidates}
+        self._data = {(data.kind, data.topic.name): data for data in candidates}
         self._notes: list[str] = []
         self._settings: list[str] = []
         self._obstacles: list[str] = []
@@ -160,7 +160,7 @@ class _Survey:
         count = data.stamps_ns.size
         if not count:
             faults = [*faults, 'it has no messages' if not data.undecodable
-                      else 'its messages cannot be decoded']
+                      else data.undecodable_why or 'its messages cannot be decoded']
         return TopicInfo(
             data.topic.name, data.topic.msgtype.replace('/msg/', '/'), data.kind,
             data.timing(self._start_ns), data.undecodable, tuple(faults),
@@ -179,7 +179,7 @@ class _Survey:
 
     def _exchanged(self, fix: TopicInfo) -> str:
         """Say that latitude and longitude are exchanged, and exchange them for the rest."""
-        data = self._data[fix.name]
+        data = self._data[fix.kind, fix.name]
         fault = next(filter(None, (
             exchange_fault(self._series(data), self._series(velocity))
             for velocity in self._of('velocity') if velocity.usable.any())), '')
@@ -231,7 +231,7 @@ class _Survey:
         return Series(times, vectors[first])
 
     def _velocity_series(self, velocity: TopicInfo) -> Series:
-        series = self._series(self._data[velocity.name])
+        series = self._series(self._data[velocity.kind, velocity.name])
         if velocity.frame is not None and velocity.frame.frame == 'ned':
             return Series(series.times, series.vectors[:, [1, 0, 2]] * (1.0, 1.0, -1.0))
         return series
@@ -239,29 +239,29 @@ class _Survey:
     def _positions(self, fix: TopicInfo | None) -> Series:
         if fix is None:
             return Series(np.zeros(0), np.zeros((0, 3)))
-        series = self._series(self._data[fix.name])
+        series = self._series(self._data[fix.kind, fix.name])
         return without_wild_positions(track(series.times, *series.vectors.T))
 
     def _place(self, fix: TopicInfo | None) -> tuple[float, float]:
         """Return latitude, degrees, and altitude; somewhere on Earth if they are not known."""
         if fix is None:
             return 45.0, 0.0
-        data = self._data[fix.name]
+        data = self._data[fix.kind, fix.name]
         latitude, _, altitude = np.median(data.values[data.usable], axis=0).tolist()
         return latitude, altitude if math.isfinite(altitude) else 0.0
 
     def _lateness(self, chosen: dict[str, TopicInfo | None]) -> float | None:
         """Return how late GNSS messages come after newer IMU samples, 99 percent of them."""
         imu = chosen['imu']
-        if imu is None or not self._data[imu.name].usable.any():
+        if imu is None or not self._data[imu.kind, imu.name].usable.any():
             return None
-        imu_data = self._data[imu.name]
+        imu_data = self._data[imu.kind, imu.name]
         newest = np.maximum.accumulate(imu_data.stamps_ns[imu_data.usable])
         late = []
         for topic in (chosen['fix'], chosen['velocity']):
             if topic is None:
                 continue
-            data = self._data[topic.name]
+            data = self._data[topic.kind, topic.name]
             before = np.searchsorted(imu_data.recorded_ns[imu_data.usable],
                                      data.recorded_ns[data.usable]) - 1
             late.append((newest[before] - data.stamps_ns[data.usable])[before >= 0] * 1e-9)
@@ -279,7 +279,7 @@ class _Survey:
             return
         facts, timing = imu.imu, imu.timing
         self._notes.extend(facts.too_small)
-        data = self._data[imu.name]
+        data = self._data[imu.kind, imu.name]
         if data.unmeasured and not imu.faults:
             self._notes.append(f'{imu.name}: {_says_unmeasured(data)}; its numbers are used all '
                                'the same (covariances that are not known are 0)')
@@ -308,7 +308,7 @@ class _Survey:
         if frame is None or frame.frame == 'unknown':
             self._notes.append('nothing tells the frame of the velocity (too little motion): '
                                'it is taken as east-north-up')
-        elif frame.frame == 'ned' or _is_refused(self._data[velocity.name]):
+        elif frame.frame == 'ned' or _is_refused(self._data[velocity.kind, velocity.name]):
             self._settings.append(f'velocity_frame={frame.frame}')
         if frame is not None and frame.upside_down:
             self._notes.append('the vertical velocity has the wrong sign')

@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 import dataclasses
 from dataclasses import dataclass
 from operator import attrgetter, itemgetter
@@ -23,17 +24,23 @@ import os
 from typing import NamedTuple
 
 from ins_align.config import Config
+from ins_align.gnss.drivers import (
+    DRIVER_TYPES, imu_from_driver, in_words, INERTIAL_UNITS, LIVE_TYPES, NoTimeError,
+    receiver_from_msg, RECEIVERS)
 from ins_align.gnss.messages import Fix, MessageError, Velocity, velocity_from_msg
+from ins_align.mounting import find_mounting, FixedFrames, Mounting
 from ins_align.recordings import BagError, Topic
 from ins_align.recordings.bag import Bag, Block
 from ins_align.recordings.decode import (
-    decode_gnss, decode_imu, decode_orientations, deserialize, GNSS_TYPES, IMU_TYPE, ImuSamples,
-    Orientations, Refused)
+    decode_gnss, decode_imu_topic, decode_orientations, deserialize, GNSS_TYPES, IMU_TYPE,
+    ImuSamples, Orientations, Refused)
+from ins_align.results import Severity
 import numpy as np
 
 FIX_TYPES, VELOCITY_TYPES = ([name for name, fields in GNSS_TYPES.items() if fields.kind == kind]
                              for kind in ('fix', 'velocity'))
 VECTOR_TYPE = 'geometry_msgs/msg/Vector3Stamped'  # of a velocity or of anything else
+TF_TYPE = 'tf2_msgs/msg/TFMessage'
 UNSTAMPED_TYPES = ['geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistWithCovariance',
                    'geometry_msgs/msg/Vector3']
 REFERENCE_NAMESPACE = '/reference/'
@@ -50,6 +57,7 @@ class Topics(NamedTuple):
     velocity: Topic | None
     velocity_type: str | None  # as the parameter of that name has it
     reference: Topic | None
+    C_imu_base: np.ndarray | None = None  # takes vectors of the configured base to the IMU
 
 
 @dataclass(frozen=True)
@@ -114,6 +122,8 @@ def read(request: Request) -> Iterator[Part]:
         config = request.config
         if topics.velocity_type is not None:
             config = dataclasses.replace(config, velocity_type=topics.velocity_type)
+        mounting = _mounting(bag, topics, config)
+        config, topics = mounting.config, topics._replace(C_imu_base=mounting.C_imu_base)
         start_ns = (bag.start_ns or 0) + round((request.start or 0.0) * 1e9)
         stop_ns = (None if request.duration is None
                    else start_ns + round(request.duration * 1e9))
@@ -122,7 +132,7 @@ def read(request: Request) -> Iterator[Part]:
             end_ns = min(end_ns, stop_ns)
         done = 0.0
         empty = request.start is not None or request.duration is not None
-        wanted = [topic for topic in topics if isinstance(topic, Topic)]
+        wanted = list(dict.fromkeys(topic for topic in topics if isinstance(topic, Topic)))
         for block in bag.blocks(wanted, None if request.start is None else start_ns, stop_ns):
             if end_ns > start_ns:
                 last_ns = int(block.times_ns[-1])
@@ -133,6 +143,36 @@ def read(request: Request) -> Iterator[Part]:
             raise BagError(f'{request.path} has no IMU or GNSS messages {_part(request, bag)}')
         nothing = Block(np.zeros(0, np.int64), np.zeros(0, np.int64), [()] * len(wanted))
         yield _decoded(nothing, wanted, topics, config, 1.0, tuple(bag.warnings))
+
+
+def _mounting(bag: Bag, topics: Topics, config: Config) -> Mounting:
+    """Look up in /tf_static where antenna and base are."""
+    frames = FixedFrames()
+    static = [topic for topic in bag.topics
+              if topic.msgtype == TF_TYPE and topic.name.endswith('/tf_static')]
+    for block in bag.blocks(static):
+        for topic, messages in zip(static, block.messages):
+            for data in messages:
+                with suppress(MessageError):
+                    for transform in deserialize(data, topic).transforms:
+                        frames.add(transform)
+    found = find_mounting(frames.lookup, _frame_id(bag, topics.imu), _frame_id(bag, topics.fix),
+                          config)
+    if found.missing and (config.lever_arm_from_tf is True or config.base_frame):
+        raise BagError(f'{bag.path} has no transform {" and none ".join(found.missing)}: '
+                       'lever_arm_from_tf and base_frame need /tf_static with them')
+    for severity, text in found.words:
+        if severity is Severity.WARNING:
+            bag.warn(text)
+    return found
+
+
+def _frame_id(bag: Bag, topic: Topic) -> str:
+    """Return the frame_id of the first message of a topic, empty where it has none."""
+    data = bag.first_message(topic)
+    with suppress(MessageError, AttributeError):
+        return str(deserialize(data or b'', topic).header.frame_id)
+    return ''
 
 
 def _part(request: Request, bag: Bag) -> str:
@@ -153,14 +193,15 @@ def _decoded(block: Block, wanted: list[Topic], topics: Topics, config: Config, 
     for number, (topic, messages) in enumerate(zip(wanted, block.messages)):
         places = np.flatnonzero(block.topics == number)
         if topic is topics.imu:
-            samples = decode_imu(messages, topic.encoding)
+            samples = decode_imu_topic(messages, topic)
             before = np.zeros(block.topics.size, np.int64)
             before[places] = samples.decoded
             before = np.cumsum(before)
         elif topic is topics.reference:
             orientations = messages
-        else:
-            gnss += zip(places.tolist(), decode_gnss(messages, topic, config))
+        for kind, source in (('fix', topics.fix), ('velocity', topics.velocity)):
+            if topic is source:
+                gnss += zip(places.tolist(), decode_gnss(messages, topic, config, kind))
     gnss.sort(key=itemgetter(0))
     return Part(topics, config, samples,
                 tuple((int(before[place]), message) for place, message in gnss),
@@ -183,12 +224,16 @@ def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | N
         the option that chooses one.
 
     """
-    imu_topic = _required(bag, 'IMU', [IMU_TYPE], imu)
-    fix_topic = _required(bag, 'position', FIX_TYPES, fix)
+    imu_topic = _required(bag, 'IMU', [IMU_TYPE], [*INERTIAL_UNITS], imu)
+    fix_topic = _required(bag, 'position', *(
+        (FIX_TYPES, [*RECEIVERS]) if config.fix_type == 'NavSatFix' else
+        ([LIVE_TYPES[config.fix_type]], [*FIX_TYPES, *RECEIVERS])), fix)
     velocity_topic = None
     if velocity is not None:
-        velocity_topic = _named(bag, 'velocity', VELOCITY_TYPES, velocity)
+        velocity_topic = _named(bag, 'velocity', [*VELOCITY_TYPES, *RECEIVERS], velocity)
         _measures(bag, velocity_topic, config)  # for the warning: it is read as the user wishes
+    elif config.use_velocity is not False and fix_topic.msgtype in RECEIVERS:
+        velocity_topic = fix_topic
     elif config.use_velocity is not False:
         preferred = [name for name in VELOCITY_TYPES if _short(name) == config.velocity_type]
         others = [name for name in VELOCITY_TYPES if name not in preferred]
@@ -198,17 +243,22 @@ def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | N
             _warn_of_others(bag, velocity_topic, others)
         else:
             velocity_topic = (_only(bag, 'velocity', twists, config)
-                              or _only(bag, 'velocity', [VECTOR_TYPE], config))
+                              or _only(bag, 'velocity', [VECTOR_TYPE], config)
+                              or _only(bag, 'velocity', [*RECEIVERS], config))
         if velocity_topic is None:
             _warn_of_unstamped(bag)
     reference = next((topic for topic in bag.topics if topic.name == REFERENCE_TOPIC
                       and topic.msgtype == IMU_TYPE), None)
     return Topics(imu_topic, fix_topic, velocity_topic,
-                  None if velocity_topic is None else _short(velocity_topic.msgtype), reference)
+                  _short(velocity_topic.msgtype) if velocity_topic is not None
+                  and velocity_topic.msgtype in VELOCITY_TYPES else None, reference)
 
 
-def _required(bag: Bag, what: str, types: list[str], name: str | None) -> Topic:
-    topic = _only(bag, what, types) if name is None else _named(bag, what, types, name)
+def _required(bag: Bag, what: str, types: list[str], others: list[str], name: str | None,
+              ) -> Topic:
+    """Return the one topic of some types, or of others where there is none of these."""
+    topic = (_only(bag, what, types) or _only(bag, what, others) if name is None
+             else _named(bag, what, [*types, *others], name))
     if topic is None:
         raise BagError(f'{bag.path} has no {what} topic ({_in_words(types)}); {_listing(bag)}')
     return topic
@@ -222,7 +272,7 @@ def _candidates(bag: Bag, types: list[str]) -> list[Topic]:
 def _only(bag: Bag, what: str, types: list[str], config: Config = Config()) -> Topic | None:
     """Return the one topic of some types; where there are more the one that measures."""
     candidates = _candidates(bag, types)
-    if what == 'velocity' or len(candidates) > 1:
+    if what == 'velocity' or len(candidates) > 1 or types[0] in DRIVER_TYPES:
         candidates = [topic for topic in candidates if _measures(bag, topic, config)]
     if len(candidates) > 1:
         names = ', '.join(sorted(topic.name for topic in candidates))
@@ -286,7 +336,12 @@ def _measures(bag: Bag, topic: Topic, config: Config = Config(), say: bool = Tru
         return False
     try:
         message = deserialize(data, topic)
-        if topic.msgtype in VELOCITY_TYPES:
+        if topic.msgtype in RECEIVERS:
+            with suppress(NoTimeError):
+                receiver_from_msg(message, topic.msgtype, config)
+        elif topic.msgtype in INERTIAL_UNITS:
+            imu_from_driver(message, topic.msgtype)
+        elif topic.msgtype in VELOCITY_TYPES:
             velocity_from_msg(message, dataclasses.replace(
                 config, velocity_type=_short(topic.msgtype)))
     except MessageError as error:
@@ -310,4 +365,4 @@ def _short(msgtype: str) -> str:
 
 
 def _in_words(types: list[str]) -> str:
-    return ' or '.join(name.replace('/msg/', '/') for name in types)
+    return ' or '.join(map(in_words, types))

@@ -26,10 +26,11 @@ from ins_align.geometry.rotation import (
     Array, exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw)
 from ins_align.gnss.buffer import fault_of_fix
 from ins_align.gnss.messages import Fix
+from ins_align.mounting import base_attitude
 from ins_align.offline import Recorded
 from ins_align.recordings.decode import Attitudes
 from ins_align.recordings.reader import read, Request, Topics
-from ins_align.results import Attitude, Result
+from ins_align.results import Attitude, attitude_json, Result
 import numpy as np
 
 MAX_REFERENCE_GAP_NS = 1_500_000_000  # the reference is not interpolated over more
@@ -113,7 +114,16 @@ class ReplayResult(Result):
 
     def to_json(self) -> dict[str, Any]:
         """Return the object that ``--json`` writes; numbers that are not finite are None."""
-        return {'bag': self.bag, **super().to_json()}
+        return {'bag': self.bag, **super().to_json(), **self._base_json()}
+
+    def _base_json(self) -> dict[str, Any]:
+        """Return the attitudes of the base, where one is configured."""
+        if not self.config.base_frame:
+            return {}
+        attitudes = {f'base_{name}_attitude': attitude_json(
+            base_attitude(attitude, self.topics.C_imu_base)) for name, attitude in (
+                ('initial', self.status.initial), ('final', self.status.current))}
+        return {'base_frame': self.config.base_frame, **attitudes}
 
 
 def replay(path: str | os.PathLike[str], config: Config | None = None, *,

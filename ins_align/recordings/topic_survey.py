@@ -24,12 +24,13 @@ from typing import Any, NamedTuple
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.buffer import fault_of_fix, usable_velocity, with_an_altitude
+from ins_align.gnss.drivers import INERTIAL_UNITS, RECEIVERS
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.recordings import Topic
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import (
-    decode_gnss, decode_imu, deserialize, GNSS_TYPES, IMU_TYPE, Refused)
+    decode_gnss, decode_imu_topic, deserialize, GNSS_TYPES, IMU_TYPE, Refused)
 from ins_align.recordings.reader import may_be_velocity, REFERENCE_NAMESPACE
 import numpy as np
 
@@ -87,6 +88,7 @@ class Recorded:
         self.usable = np.zeros(0, bool)  # finite and, of fixes, with a fix
         self.no_fix = 0
         self.undecodable = 0
+        self.undecodable_why = ''  # in words, where that helps
         self.refusals: Counter[str] = Counter()  # why a frame_id is refused, in words
         self.unmeasured: list[str] = []  # what an IMU says that it does not measure
         self._rows: list[tuple[Any, ...]] = []
@@ -94,17 +96,19 @@ class Recorded:
     def add(self, times_ns: np.ndarray, messages: Sequence[bytes]) -> None:
         """Decode messages."""
         if self.kind == 'imu':
-            if not self._rows:
+            if not self._rows and self.topic.msgtype == IMU_TYPE:
                 self._look_at(messages[0])
-            samples = decode_imu(messages, self.topic.encoding)
+            samples = decode_imu_topic(messages, self.topic)
             self.undecodable += int(np.count_nonzero(~samples.decoded))
             self._rows.append((times_ns[samples.decoded], samples.stamps_ns,
                                np.hstack([samples.gyro, samples.accel])))
             return
-        decoded = decode_gnss(messages, self.topic, Config())
+        decoded = decode_gnss(messages, self.topic, Config(), self.kind)
         refusals = [message.why for message in decoded
                     if isinstance(message, Refused) and message.why]
-        if refusals:  # for their frame_id, which may be wrong: the motion will tell
+        if refusals and self.topic.msgtype in RECEIVERS:
+            self.undecodable_why = refusals[0]
+        elif refusals:  # for their frame_id, which may be wrong: the motion will tell
             self.refusals.update(refusals)
             decoded = decode_gnss(messages, self.topic, Config(velocity_frame='enu'))
         for time_ns, message in zip(times_ns.tolist(), decoded):
@@ -218,22 +222,26 @@ def read_candidates(bag: Bag) -> list[Recorded]:
         If the recording cannot be read.
 
     """
-    candidates = sorted((Recorded(topic, kind) for topic in bag.topics
-                         if (kind := _kind(topic)) and REFERENCE_NAMESPACE not in topic.name),
+    candidates = sorted((Recorded(topic, kind) for topic in bag.topics for kind in _kinds(topic)
+                         if REFERENCE_NAMESPACE not in topic.name),
                         key=lambda data: (KINDS.index(data.kind), data.topic.name))
-    topics = [data.topic for data in candidates]
+    topics = list(dict.fromkeys(data.topic for data in candidates))
     for block in bag.blocks(topics):
-        for number, messages in enumerate(block.messages):
-            if messages:
-                candidates[number].add(block.times_ns[block.topics == number], messages)
+        for data in candidates:
+            number = topics.index(data.topic)
+            if messages := block.messages[number]:
+                data.add(block.times_ns[block.topics == number], messages)
     for data in candidates:
         data.finish()
     return candidates
 
 
-def _kind(topic: Topic) -> str:
-    if topic.msgtype == IMU_TYPE:
-        return 'imu'
+def _kinds(topic: Topic) -> Sequence[str]:
+    """Return what an alignment could read of a topic: some of KINDS."""
+    if topic.msgtype == IMU_TYPE or topic.msgtype in INERTIAL_UNITS:
+        return ['imu']
+    if topic.msgtype in RECEIVERS:
+        return ['fix', 'velocity']
     if topic.msgtype not in GNSS_TYPES or not may_be_velocity(topic):
-        return ''
-    return GNSS_TYPES[topic.msgtype].kind
+        return []
+    return [GNSS_TYPES[topic.msgtype].kind]

@@ -16,11 +16,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+import itertools
 import re
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Vector3Stamped
 from ins_align.config import Config, Parameter, parameters
+from ins_align.mounting import base_attitude, Mounting
 from ins_align.results import State, Status
 import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
@@ -158,12 +160,13 @@ def vector_msg(stamp_ns: int, frame_id: str, values: Sequence[float] | np.ndarra
 
 
 def diagnostic_status(name: str, hardware_id: str, level: bytes, status: Status,
-                      ) -> DiagnosticStatus:
-    """Return a status as diagnostics have it."""
+                      mounting: Mounting | None = None) -> DiagnosticStatus:
+    """Return a status as diagnostics have it, with the attitude of the base if it is known."""
     return DiagnosticStatus(
         level=level, name=f'{name.lstrip("/")}: alignment', hardware_id=hardware_id,
         message=f'{status.state.value}: {status.reason}',
-        values=[KeyValue(key=key, value=value) for key, value in status_values(status)])
+        values=[KeyValue(key=key, value=value) for key, value in itertools.chain(
+            status_values(status), base_values(status, mounting))])
 
 
 def status_values(status: Status) -> Iterator[tuple[str, str]]:
@@ -191,6 +194,17 @@ def status_values(status: Status) -> Iterator[tuple[str, str]]:
         yield f'{name}_std_{unit}', _text(sigma)
     for name, count in status.counts.items():
         yield name, str(count)
+
+
+def base_values(status: Status, mounting: Mounting | None) -> Iterator[tuple[str, str]]:
+    """List the attitude of the configured base like `status_values`."""
+    if mounting is None or not mounting.config.base_frame:
+        return
+    yield 'base_frame', mounting.config.base_frame
+    for name, attitude in (('initial', status.initial), ('current', status.current)):
+        base = base_attitude(attitude, mounting.C_imu_base)
+        yield f'base_{name}_roll_pitch_yaw_deg', _text(
+            None if base is None else (base.roll_deg, base.pitch_deg, base.yaw_deg))
 
 
 def _text(value: float | Sequence[float] | np.ndarray | None) -> str:

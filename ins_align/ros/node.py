@@ -19,29 +19,32 @@ Everything that decides anything is in the aligner, which `ins_align replay` run
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 import dataclasses
+from functools import partial
 from operator import itemgetter
 import time
 from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import (
-    QuaternionStamped, TwistStamped, TwistWithCovarianceStamped, Vector3Stamped)
+from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
 from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
 from ins_align.checks import InputChecks
 from ins_align.config import (
     Config, config_from_mapping, ConfigError, no_effect, NODE_NAME, parameters)
-from ins_align.gnss.messages import Fix, fix_from_msg, MessageError, Velocity, velocity_from_msg
+from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
+from ins_align.mounting import Mounting
 from ins_align.results import Severity
 from ins_align.ros.diagnostics import (
     diagnostic_status, inputs_in_words, LEVELS, parameter_descriptor, ReasonLog, topic_faults,
     vector_msg)
+from ins_align.ros.frames import frame_id_of, MountingSearch, open_buffer
+from ins_align.ros.gnss_inputs import (
+    FIX_TOPIC, gnss_from_msg, gnss_topics, REJECTED_AS, VELOCITY_TOPIC, VELOCITY_TYPES)
 from ins_align.ros.imu_bytes import ImuSample, read_imu, with_orientation
 from ins_align.ros.on_demand import OnDemand, queued
 from ins_align.ros.worker import Worker
-from nav_msgs.msg import Odometry
 import numpy as np
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -54,17 +57,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.time import Time
-from sensor_msgs.msg import Imu, NavSatFix
+from sensor_msgs.msg import Imu
 from std_msgs.msg import UInt8
 from std_srvs.srv import Trigger
 
-VELOCITY_TYPES = {
-    'TwistWithCovarianceStamped': TwistWithCovarianceStamped,
-    'TwistStamped': TwistStamped,
-    'Odometry': Odometry,
-    'Vector3Stamped': Vector3Stamped,
-}
-IMU_TOPIC, FIX_TOPIC, VELOCITY_TOPIC = 'imu/data_raw', 'fix', 'fix_velocity'
+IMU_TOPIC = 'imu/data_raw'
 STATE_NUMBERS = {state: number for number, state in enumerate(State)}
 IMU_DEPTH = 2000  # ten seconds at 200 Hz: the machine may be busy, no sample may be lost
 GNSS_DEPTH = 200
@@ -124,6 +121,7 @@ class AlignmentNode(Node):
         self.failure: BaseException | None = None
         self._worker = Worker(self._work, self._on_failure)
         self._config = self._declare_parameters()
+        self._search = MountingSearch(self._config, open_buffer(self, self._config))
         # The executor's thread:
         self._follower = Follower()
         self._adopted: _Outlook | None = None
@@ -152,15 +150,14 @@ class AlignmentNode(Node):
             self._publish_on(Vector3Stamped, topic, QoSProfile(depth=100))
             for topic in ('~/roll_pitch_yaw_deg', '~/sigma_deg'))
         self._state_publisher = self._publish_on(UInt8, '~/state', QoSProfile(depth=10))
-        velocity_type = VELOCITY_TYPES[self._config.velocity_type]
-        self._inputs = {IMU_TOPIC: Imu, FIX_TOPIC: NavSatFix, VELOCITY_TOPIC: velocity_type}
+        gnss = gnss_topics(self._config)
+        self._inputs = {IMU_TOPIC: Imu, **gnss}
         self._imu_on_demand = OnDemand()
         self._imu_subscription = self._subscribe_to(
             Imu, IMU_TOPIC, self._on_imu, IMU_DEPTH, self._imu_on_demand)
-        self._fix_subscription = self._subscribe_to(
-            NavSatFix, FIX_TOPIC, _nothing, GNSS_DEPTH, OnDemand())
-        self._velocity_subscription = self._subscribe_to(
-            velocity_type, VELOCITY_TOPIC, _nothing, GNSS_DEPTH, OnDemand())
+        self._gnss_subscriptions = [
+            (self._subscribe_to(msg_type, topic, _nothing, GNSS_DEPTH, OnDemand()),
+             partial(self._gnss, topic)) for topic, msg_type in gnss.items()]
         self.get_logger().info(inputs_in_words(self, self._inputs, self._config))
         self.create_service(Trigger, '~/reset', self._on_reset)
         # A signal between two waits of the executor wakes it from neither: it has to look.
@@ -213,13 +210,17 @@ class AlignmentNode(Node):
     def _work(self, items: list[tuple[int, Any]]) -> None:
         """Take in what has come, align and publish what has changed."""
         for subscription, convert in (
-                *([] if self._imu_on_demand.is_open else [(self._imu_subscription, read_imu)]),
-                (self._fix_subscription, fix_from_msg),
-                (self._velocity_subscription, self._velocity)):
-            items += [(received_ns, convert(message)) for message, received_ns
-                      in queued(subscription, subscription.qos_profile.depth)]
+                *([] if self._imu_on_demand.is_open else
+                  [(self._imu_subscription, lambda message: [read_imu(message)])]),
+                *self._gnss_subscriptions):
+            items += [(received_ns, item) for message, received_ns
+                      in queued(subscription, subscription.qos_profile.depth)
+                      for item in convert(message)]
         # Each topic is a queue by itself: nothing shall be late, or early, for having waited.
         items.sort(key=itemgetter(0))
+        items, mounting = self._search.take(items, time.monotonic())
+        if mounting is not None:
+            self._adopt(mounting)
         for received_ns, item in items:
             self._feed(received_ns, item)
         self._check([item for _, item in items])
@@ -236,6 +237,15 @@ class AlignmentNode(Node):
         # By a clock that goes on when simulated time stands still.
         if events or time.monotonic() >= self._next_status:
             self._publish_status()
+
+    def _adopt(self, mounting: Mounting) -> None:
+        """Take over what TF says."""
+        for severity, text in mounting.words:
+            self._log(severity, text)
+        if mounting.config.lever_arm != self._config.lever_arm:
+            self._config = dataclasses.replace(self._config, lever_arm=mounting.config.lever_arm)
+            self._aligner, self._checks = Aligner(self._config), InputChecks(self._config)
+            self._imu_frame = None
 
     def _log(self, severity: Severity, text: str) -> None:
         # rclpy wants one line of code for each severity.
@@ -287,12 +297,14 @@ class AlignmentNode(Node):
         self._aligner.reset(why)
         self._checks = InputChecks(self._config)
 
-    def _velocity(self, msg: Any) -> Velocity | None:
+    def _gnss(self, topic: str, msg: Any) -> Sequence[Fix | Velocity]:
+        if topic == FIX_TOPIC:
+            self._search.antenna_frame = frame_id_of(msg)
         try:
-            return velocity_from_msg(msg, self._config)
+            return gnss_from_msg(topic, msg, self._config)
         except MessageError as error:
-            self._aligner.reject('velocity_body_frame', str(error))
-            return None
+            self._aligner.reject(REJECTED_AS[topic], str(error))
+            return []
 
     def _heeds(self, frame_id: str, received_ns: int) -> bool:
         """Whether a sample is of the IMU that is aligned, which one that is new becomes."""
@@ -312,6 +324,7 @@ class AlignmentNode(Node):
         """Start over: what was learnt is about axes that are no longer the IMU's."""
         if self._imu_frame is not None:
             self._aligner.reject('imu_frame_changed')
+            self._search.restart()
             self._start_over(
                 f'frame_id of the IMU changed from {self._imu_frame!r} to {frame_id!r}')
             if len(self._other_frames) < MAX_OTHER_FRAMES:
@@ -376,6 +389,8 @@ class AlignmentNode(Node):
         if silent > IMU_SILENT:
             # The aligner goes by stamps: it learns of a gap when the next sample comes.
             more.append(f'no IMU sample for {silent:.0f} s')
+        if self._search.waits_for:
+            more.append(f'waits for {self._search.waits_for}')
         reason = f'{status.state.value}: {status.reason}'
         if more:
             level = max(level, DiagnosticStatus.WARN)
@@ -383,7 +398,8 @@ class AlignmentNode(Node):
         msg = DiagnosticArray()
         msg.header.stamp = self.get_clock().now().to_msg()
         msg.status = [diagnostic_status(
-            self.get_fully_qualified_name(), self._imu_frame or '', level, status)]
+            self.get_fully_qualified_name(), self._imu_frame or '', level, status,
+            self._search.mounting)]
         for publisher in self._status_publishers:
             publisher.publish(msg)
         self._state_publisher.publish(UInt8(data=STATE_NUMBERS[status.state]))

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+import itertools
 import json
 import math
 import os
@@ -324,7 +325,8 @@ def _random_walk(time: Array, density: float, random: np.random.Generator) -> Ar
     return np.cumsum(density * steps * random.standard_normal((len(time), 3)), axis=0)
 
 
-def write_bag(simulation: Simulation, path: str | os.PathLike, storage: str = 'mcap') -> None:
+def write_bag(simulation: Simulation, path: str | os.PathLike, storage: str = 'mcap',
+              tf: bool = False) -> None:
     """
     Write a rosbag2 of what a vehicle would have recorded, with truth on `/reference/imu`.
 
@@ -340,6 +342,9 @@ def write_bag(simulation: Simulation, path: str | os.PathLike, storage: str = 'm
         Directory to be made; written whole or not at all.
     storage : str
         One of `STORAGES`.
+    tf : bool
+        Write how IMU and antenna are mounted on the vehicle to `/tf_static`: frames base_link,
+        imu and gnss.
 
     Raises
     ------
@@ -355,12 +360,12 @@ def write_bag(simulation: Simulation, path: str | os.PathLike, storage: str = 'm
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f'.{path.name}.', dir=path.parent) as directory:
         unfinished = Path(directory) / path.name
-        _write_messages(simulation, unfinished, storage)
+        _write_messages(simulation, unfinished, storage, tf)
         (unfinished / 'ins_align.yaml').write_text(_parameter_file(simulation), 'utf-8')
         unfinished.rename(path)
 
 
-def _write_messages(simulation: Simulation, path: Path, storage: str) -> None:
+def _write_messages(simulation: Simulation, path: Path, storage: str, tf: bool) -> None:
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import get_typestore, Stores
 
@@ -370,12 +375,29 @@ def _write_messages(simulation: Simulation, path: Path, storage: str) -> None:
             {**simulation.meta, 'gyro_bias': simulation.gyro_bias,
              'accel_bias': simulation.accel_bias}, default=lambda value: value.tolist()))
         connections = {}
-        for topic, message_type, stamp, message in _ros_messages(simulation, typestore.types):
+        for topic, message_type, stamp, message in itertools.chain(
+                _static_transforms(simulation, typestore.types) if tf else (),
+                _ros_messages(simulation, typestore.types)):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, message_type,
                                                            typestore=typestore)
             writer.write(connections[topic], stamp,
                          typestore.serialize_cdr(message, message_type))
+
+
+def _static_transforms(simulation: Simulation, types: Any) -> Iterator[tuple[str, str, int, Any]]:
+    """Yield what a robot publishes of its model: topic, type, time and message."""
+    start = int(simulation.imu_stamps_ns[0])
+    vector, turn = types['geometry_msgs/msg/Vector3'], types['geometry_msgs/msg/Quaternion']
+    header = types['std_msgs/msg/Header'](
+        types['builtin_interfaces/msg/Time'](*divmod(start, 1_000_000_000)), 'base_link')
+    C_vb = simulation._C_vb
+    yield '/tf_static', 'tf2_msgs/msg/TFMessage', start, types['tf2_msgs/msg/TFMessage']([
+        types['geometry_msgs/msg/TransformStamped'](
+            header, child, types['geometry_msgs/msg/Transform'](
+                vector(*translation.tolist()), turn(*quaternion_from_matrix(C).tolist())))
+        for child, translation, C in (('imu', np.zeros(3), C_vb),
+                                      ('gnss', C_vb @ simulation.lever_arm, np.eye(3)))])
 
 
 def _ros_messages(simulation: Simulation, types: Any) -> Iterator[tuple[str, str, int, Any]]:

@@ -1,0 +1,201 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Messages of receivers and autopilots that are no sensor_msgs: a table says how to read them."""
+
+from __future__ import annotations
+
+import calendar
+from collections.abc import Callable, Mapping
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+from ins_align.config import Config
+from ins_align.gnss.messages import Fix, fixes, MessageError, stamp_from_msg, velocities, Velocity
+import numpy as np
+
+ENU_FROM: dict[str, Callable[[float, float, float], tuple[float, float, float]]] = {
+    'enu': lambda east, north, up: (east, north, up),
+    'ned': lambda north, east, down: (east, north, -down),
+    # Speed, m/s, track, degrees clockwise from north, and climb, m/s.
+    'track': lambda speed, track, climb: (speed * math.sin(math.radians(track)),
+                                          speed * math.cos(math.radians(track)), climb),
+}
+FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
+UTC_KNOWN = 3  # UBX-NAV-PVT, valid: bits of date and time
+
+
+class NoTimeError(MessageError):
+    """A message of a receiver that does not know the time yet."""
+
+
+def _utc_ns(msg: Any) -> int:
+    """Return the time of UBX-NAV-PVT."""
+    if msg.valid & UTC_KNOWN != UTC_KNOWN:
+        raise NoTimeError('the receiver does not know date and time yet')
+    seconds = calendar.timegm((msg.year, msg.month, msg.day, msg.hour, msg.min, msg.sec))
+    return seconds * 1_000_000_000 + int(msg.nano)
+
+
+def _microseconds_ns(msg: Any) -> int:
+    return int(msg.timestamp) * 1000
+
+
+class Receiver(NamedTuple):
+    """
+    How to read position and velocity in one message.
+
+    Numbers are fields with what one unit of each is. Standard deviations: horizontal per axis,
+    then vertical; one stands for both, none is the configured one.
+    """
+
+    stamp: Callable[[Any], int]  # ns
+    has_fix: Callable[[Any], bool]
+    position: Mapping[str, float]  # latitude and longitude, degrees; altitude, m
+    position_std: Mapping[str, float]  # m; or a covariance with its type as in NavSatFix
+    velocity: Mapping[str, float]  # m/s
+    frame: str  # of the velocity, one of ENU_FROM
+    velocity_std: Mapping[str, float]  # m/s
+    has_velocity: Callable[[Any], bool] = lambda msg: True
+    unknown: tuple[float, ...] = ()  # what stands for a number that is not known
+
+
+class InertialUnit(NamedTuple):
+    """How to read angular rate and specific force, rad/s and m/s^2."""
+
+    stamp: Callable[[Any], int]
+    gyro: str
+    accel: str
+    axes: np.ndarray  # signs that make them forward, left, up
+
+
+RECEIVERS = {
+    # github.com/swri-robotics/gps_umd: what is stated as an error is 95 percent.
+    'gps_msgs/msg/GPSFix': Receiver(
+        stamp_from_msg, lambda msg: msg.status.status >= 0,
+        {'latitude': 1.0, 'longitude': 1.0, 'altitude': 1.0}, {'position_covariance': 1.0},
+        {'speed': 1.0, 'track': 1.0, 'climb': 1.0}, 'track', {'err_speed': 0.5, 'err_climb': 0.5}),
+    # github.com/KumarRobotics/ublox: 2D, 3D and 3D with dead reckoning, within the masks.
+    'ublox_msgs/msg/NavPVT': Receiver(
+        _utc_ns, lambda msg: msg.fix_type in (2, 3, 4) and bool(msg.flags & 1),
+        {'lat': 1e-7, 'lon': 1e-7, 'height': 1e-3}, {'h_acc': 1e-3, 'v_acc': 1e-3},
+        {'vel_n': 1e-3, 'vel_e': 1e-3, 'vel_d': 1e-3}, 'ned', {'s_acc': 1e-3}),
+    # SBF reference guide, PVTGeodetic: accuracies are twice the distance RMS, and 2 sigma.
+    'septentrio_gnss_driver/msg/PVTGeodetic': Receiver(
+        stamp_from_msg, lambda msg: msg.error == 0 and msg.mode & 15 != 0,
+        {'latitude': math.degrees(1.0), 'longitude': math.degrees(1.0), 'height': 1.0},
+        {'h_accuracy': 0.01 / math.sqrt(8.0), 'v_accuracy': 0.01 / 2.0},
+        {'ve': 1.0, 'vn': 1.0, 'vu': 1.0}, 'enu', {}, unknown=(-2e10, 65535)),
+    # github.com/PX4/px4_msgs
+    'px4_msgs/msg/SensorGps': Receiver(
+        _microseconds_ns, lambda msg: msg.fix_type >= 2,
+        {'latitude_deg': 1.0, 'longitude_deg': 1.0, 'altitude_ellipsoid_m': 1.0},
+        {'eph': 1.0, 'epv': 1.0}, {'vel_n_m_s': 1.0, 'vel_e_m_s': 1.0, 'vel_d_m_s': 1.0}, 'ned',
+        {'s_variance_m_s': 1.0}, has_velocity=lambda msg: bool(msg.vel_ned_valid)),
+}
+INERTIAL_UNITS = {
+    'px4_msgs/msg/SensorCombined': InertialUnit(
+        _microseconds_ns, 'gyro_rad', 'accelerometer_m_s2', FLU_FROM_FRD),
+}
+# Of those which the node can read, by the parameter fix_type.
+LIVE_TYPES = {name.rsplit('/', 1)[-1]: name
+              for name in ('gps_msgs/msg/GPSFix', 'ublox_msgs/msg/NavPVT')}
+DRIVER_TYPES = {**RECEIVERS, **INERTIAL_UNITS}
+
+
+def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velocity]:
+    """
+    Convert a message of one of RECEIVERS.
+
+    Parameters
+    ----------
+    msg : object
+        With the fields of the ROS message.
+    msgtype : str
+        Key of RECEIVERS.
+    config : Config
+        Standard deviations that are not stated; its velocity_frame is not for these messages,
+        which say what axes they have.
+
+    Raises
+    ------
+    NoTimeError
+        If the receiver does not know the time yet.
+    MessageError
+        If a field is missing, or a position is in other units than those of the table.
+
+    """
+    row = RECEIVERS[msgtype]
+    try:
+        stamp_ns, has_fix = row.stamp(msg), row.has_fix(msg)
+        position = _numbers(msg, row, row.position)
+        enu = ENU_FROM[row.frame](*_numbers(msg, row, row.velocity))
+        position_std, velocity_std = (_numbers(msg, row, fields)
+                                      for fields in (row.position_std, row.velocity_std))
+        has_velocity = row.has_velocity(msg)
+    except AttributeError as error:
+        raise _no_field(msgtype, error) from None
+    for field, degrees, limit in zip(row.position, position, (90.0, 360.0)):
+        if has_fix and abs(degrees) > limit:
+            raise MessageError(
+                f'{field} of {in_words(msgtype)} comes to {degrees:.6g} deg: it must be in units '
+                f'of {row.position[field]:.6g} deg')
+    fix, = fixes([stamp_ns], [position], _covariance(position_std),
+                 [getattr(msg, 'position_covariance_type', 2)], [0 if has_fix else -1])
+    velocity, = velocities(
+        [stamp_ns], '', [enu if has_velocity else [math.nan] * 3],
+        _covariance(velocity_std) if velocity_std else None,
+        dataclasses.replace(config, velocity_frame='enu'))
+    return fix, velocity
+
+
+def imu_from_driver(msg: Any, msgtype: str) -> tuple[int, np.ndarray, np.ndarray]:
+    """
+    Convert a message of one of INERTIAL_UNITS like `messages.imu_from_msg`.
+
+    Raises
+    ------
+    MessageError
+        If a field is missing.
+
+    """
+    row = INERTIAL_UNITS[msgtype]
+    try:
+        return (row.stamp(msg), row.axes * np.asarray(getattr(msg, row.gyro), float),
+                row.axes * np.asarray(getattr(msg, row.accel), float))
+    except AttributeError as error:
+        raise _no_field(msgtype, error) from None
+
+
+def in_words(msgtype: str) -> str:
+    """Return a message type as users know it: sensor_msgs/Imu."""
+    return msgtype.replace('/msg/', '/')
+
+
+def _no_field(msgtype: str, error: AttributeError) -> MessageError:
+    return MessageError(f'{in_words(msgtype)} has no field {error.name} here: its definition is '
+                        'of another version than the ones that are known')
+
+
+def _numbers(msg: Any, row: Receiver, fields: Mapping[str, float]) -> list[Any]:
+    values = [getattr(msg, field) for field in fields]
+    return [math.nan if np.ndim(value) == 0 and value in row.unknown else np.multiply(value, unit)
+            for value, unit in zip(values, fields.values())]
+
+
+def _covariance(std: list[Any]) -> np.ndarray:
+    """Return a covariance, shape (1, 3, 3), of a horizontal and a vertical sigma, or as sent."""
+    if np.ndim(std[0]):
+        return np.reshape(std[0], (1, 3, 3))
+    return np.diag([std[0], std[0], std[-1]])[None] ** 2

@@ -1,0 +1,154 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Where the antenna and the vehicle's base are, from the robot's tree of frames (TF)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import dataclasses
+from typing import Any, NamedTuple
+
+from ins_align.config import Config, ConfigError
+from ins_align.geometry.rotation import Array, matrix_from_quaternion
+from ins_align.results import Attitude, Event, Severity
+import numpy as np
+
+ROUNDING = 1e-6  # m: numbers of a robot's model that differ less are the same
+
+
+class Transform(NamedTuple):
+    """Takes vectors of a source frame to a target frame: rotate, then add."""
+
+    rotation: Array  # (3, 3)
+    translation: Array  # (3,), m
+
+    def after(self, other: Transform) -> Transform:
+        """Return the transform that does the other one first."""
+        return Transform(self.rotation @ other.rotation,
+                         self.rotation @ other.translation + self.translation)
+
+    def inverse(self) -> Transform:
+        """Return the transform from target to source."""
+        return Transform(self.rotation.T, -self.rotation.T @ self.translation)
+
+
+# Target and source frame to the transform between them, None where there is none.
+Lookup = Callable[[str, str], 'Transform | None']
+
+
+def transform_from_msg(msg: Any) -> Transform:
+    """Convert geometry_msgs/Transform; numbers that are none end in nan."""
+    turn, way = msg.rotation, msg.translation
+    quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
+    with np.errstate(invalid='ignore'):
+        quaternion /= np.linalg.norm(quaternion)
+    return Transform(matrix_from_quaternion(quaternion), np.array([way.x, way.y, way.z]))
+
+
+class FixedFrames:
+    """The fixed part of a tree of frames, as /tf_static has it."""
+
+    def __init__(self) -> None:
+        """Start without any frame."""
+        self._parents: dict[str, tuple[str, Transform]] = {}
+
+    def add(self, msg: Any) -> None:
+        """Take a geometry_msgs/TransformStamped; of one child the last counts."""
+        self._parents[msg.child_frame_id.strip('/')] = (
+            msg.header.frame_id.strip('/'), transform_from_msg(msg.transform))
+
+    def lookup(self, target: str, source: str) -> Transform | None:
+        """Return the transform from source to target, None where they are not connected."""
+        (root, from_target), (other_root, from_source) = map(self._to_root, (target, source))
+        return from_target.inverse().after(from_source) if root == other_root else None
+
+    def _to_root(self, frame: str) -> tuple[str, Transform]:
+        frame, transform = frame.strip('/'), Transform(np.eye(3), np.zeros(3))
+        for _ in self._parents:  # as many steps as there can be: a loop has no end
+            if frame in self._parents:
+                frame, step = self._parents[frame]
+                transform = step.after(transform)
+        return frame, transform
+
+
+class Mounting(NamedTuple):
+    """What TF says, and what follows from it."""
+
+    config: Config  # with the lever arm to align with
+    C_imu_base: Array | None  # takes vectors of the base to the IMU
+    words: Sequence[Event] = ()  # what was taken from TF, what contradicts it
+    missing: Sequence[str] = ()  # transforms that are wanted and not there, in words
+
+
+def base_attitude(attitude: Attitude | None, C_imu_base: Array | None) -> Attitude | None:
+    """Return the attitude of the base; None where it or that of the IMU is not known."""
+    if attitude is None or C_imu_base is None:
+        return None
+    return dataclasses.replace(attitude, C_nb=attitude.C_nb @ C_imu_base)
+
+
+def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Config) -> Mounting:
+    """
+    Look up lever arm and mounting.
+
+    Parameters
+    ----------
+    lookup : callable
+        Returns the transform from its second argument to its first, or None.
+    imu_frame, antenna_frame : str
+        The frame_id of the IMU's and of the position messages.
+    config : Config
+        Says with ``lever_arm_from_tf`` and ``base_frame`` what is wanted.
+
+    """
+    words: list[Event] = []
+    missing: list[str] = []
+    C_imu_base = None
+    if config.lever_arm_from_tf is not False:
+        to_antenna = lookup(imu_frame, antenna_frame) if imu_frame and antenna_frame else None
+        if to_antenna is None:
+            missing.append(f'from {antenna_frame!r} (antenna) to {imu_frame!r} (IMU)')
+        else:
+            config = _with_lever_arm(config, to_antenna.translation, (imu_frame, antenna_frame),
+                                     words)
+    if config.base_frame:
+        to_base = lookup(imu_frame, config.base_frame) if imu_frame else None
+        if to_base is None:
+            missing.append(f'from {config.base_frame!r} (base) to {imu_frame!r} (IMU)')
+        else:
+            C_imu_base = to_base.rotation
+    return Mounting(config, C_imu_base, words, missing)
+
+
+def _with_lever_arm(config: Config, found: Array, frames: tuple[str, str],
+                    words: list[Event]) -> Config:
+    """Return the configuration with the lever arm of TF where it is to be used."""
+    is_set = config.lever_arm != Config.lever_arm
+    numbers = ', '.join(f'{number:.4g}' for number in found)
+    in_tf = f'[{numbers}] m (from {frames[0]} to {frames[1]})'
+    use = config.lever_arm_from_tf is True or not is_set
+    try:
+        from_tf = dataclasses.replace(config, lever_arm=tuple(found.tolist()))
+    except ConfigError:
+        words.append(Event(Severity.WARNING, f'the lever arm that TF has is none: {in_tf}'))
+        return config
+    if is_set and np.any(np.abs(found - config.lever_arm) > config.lever_arm_std + ROUNDING):
+        words.append(Event(
+            Severity.WARNING,
+            f'lever_arm is {list(config.lever_arm)} m, but TF has {in_tf}, which differs by more '
+            f'than lever_arm_std ({config.lever_arm_std:g} m): '
+            f'{"that of TF" if use else "the parameter"} is used'))
+    elif use:
+        words.append(Event(Severity.INFO, f'lever arm from TF: {in_tf}'))
+    return from_tf if use else config

@@ -1,0 +1,148 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Lever arm and mounting from TF, in recordings, live, and by hand."""
+
+from types import SimpleNamespace
+
+from ins_align.cli import main
+from ins_align.config import Config
+from ins_align.geometry.rotation import log_so3, matrix_from_quaternion, matrix_from_rpy
+from ins_align.mounting import find_mounting, FixedFrames
+from ins_align.recordings import BagError
+from ins_align.recordings.replay import replay
+from ins_align.results import Severity
+from ins_align.simulation.simulate import simulate, write_bag
+import numpy as np
+import pytest
+
+LEVER_ARM = (1.5, -0.4, 0.8)
+MOUNT_DEG = (2.0, -3.0, 90.0)
+
+
+def transform(parent, child, translation, quaternion=(0.0, 0.0, 0.0, 1.0)):
+    x, y, z = translation
+    return SimpleNamespace(
+        header=SimpleNamespace(frame_id=parent), child_frame_id=child, transform=SimpleNamespace(
+            translation=SimpleNamespace(x=x, y=y, z=z),
+            rotation=SimpleNamespace(**dict(zip('xyzw', quaternion)))))
+
+
+@pytest.fixture
+def frames():
+    """IMU on a plate that is turned by 90 deg about z; antenna on a mast."""
+    found = FixedFrames()
+    half = np.sqrt(0.5)
+    for message in (transform('base_link', 'plate', (1.0, 0.0, 0.5), (0.0, 0.0, half, half)),
+                    transform('plate', 'imu_link', (0.2, 0.0, 0.0)),
+                    transform('/base_link', '/mast', (0.0, 2.0, 1.0)),
+                    transform('mast', 'gnss', (0.0, 0.0, 1.0)),
+                    transform('a', 'b', (0.0, 0.0, 0.0)), transform('b', 'a', (0.0, 0.0, 0.0))):
+        found.add(message)
+    return found
+
+
+def test_transforms_by_hand(frames):
+    # The IMU is at (1, 0.2, 0.5) of the base, the antenna at (0, 2, 2); x of the IMU is y there.
+    rotation, translation = frames.lookup('imu_link', '/gnss')
+    assert translation == pytest.approx([1.8, 1.0, 1.5])
+    assert rotation @ [0.0, 1.0, 0.0] == pytest.approx([1.0, 0.0, 0.0])
+    back = frames.lookup('gnss', 'imu_link')
+    assert back.translation == pytest.approx([1.0, -1.8, -1.5])
+    assert frames.lookup('imu_link', 'nowhere') is None
+    assert frames.lookup('a', 'imu_link') is None  # a and b go round in circles
+
+
+@pytest.mark.parametrize('parameters, lever_arm, notes, warnings', [
+    ({}, (1.8, 1.0, 1.5), ['lever arm from TF: [1.8, 1, 1.5] m (from imu_link to gnss)'], 0),
+    ({'lever_arm_from_tf': False}, (0.0, 0.0, 0.0), [], 0),
+    ({'lever_arm': (1.9, 1.0, 1.5), 'lever_arm_std': 0.2}, (1.9, 1.0, 1.5), [], 0),
+    ({'lever_arm': (1.8, 1.0, 1.5), 'lever_arm_std': 0.0}, (1.8, 1.0, 1.5), [], 0),
+    ({'lever_arm': (1.8, -1.0, 1.5), 'lever_arm_std': 0.2}, (1.8, -1.0, 1.5), [], 1),
+    ({'lever_arm': (1.8, -1.0, 1.5), 'lever_arm_from_tf': True, 'lever_arm_std': 0.2},
+     (1.8, 1.0, 1.5), [], 1)])
+def test_which_lever_arm_is_used(frames, parameters, lever_arm, notes, warnings):
+    found = find_mounting(frames.lookup, 'imu_link', 'gnss', Config(**parameters))
+    assert found.config.lever_arm == pytest.approx(lever_arm)
+    told = {severity: [text for kind, text in found.words if kind is severity]
+            for severity in Severity}
+    assert told[Severity.INFO] == notes and found.missing == []
+    assert len(told[Severity.WARNING]) == warnings
+    for warning in told[Severity.WARNING]:
+        assert '[1.8, -1.0, 1.5] m, but TF has [1.8, 1, 1.5] m' in warning
+        assert 'more than lever_arm_std (0.2 m)' in warning
+
+
+def test_what_tf_has_may_be_missing_or_senseless(frames):
+    found = find_mounting(frames.lookup, 'imu_link', 'map', Config(base_frame='base'))
+    assert found.missing == ["from 'map' (antenna) to 'imu_link' (IMU)",
+                             "from 'base' (base) to 'imu_link' (IMU)"]
+    assert found.config.lever_arm == (0.0, 0.0, 0.0) and found.C_imu_base is None
+    frames.add(transform('base_link', 'far', (5000.0, 0.0, 0.0)))
+    frames.add(transform('base_link', 'bad', (np.nan, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
+    for frame in ('far', 'bad'):
+        found = find_mounting(frames.lookup, 'imu_link', frame, Config())
+        assert found.config == Config() and 'TF has is none' in found.words[0].text
+
+
+@pytest.fixture(scope='module')
+def drive():
+    return simulate('car', seed=2, duration=40.0, imu_grade='tactical', lever_arm=LEVER_ARM,
+                    mount_rpy_deg=MOUNT_DEG)
+
+
+@pytest.fixture(scope='module')
+def recording(drive, tmp_path_factory):
+    path = tmp_path_factory.mktemp('mounting') / 'drive'
+    write_bag(drive, path, tf=True)
+    return path
+
+
+def test_recording_with_tf_gives_the_numbers_of_the_parameter(recording, drive):
+    from_tf = replay(recording, Config(imu_grade='tactical', base_frame='base_link'))
+    given = replay(recording, Config(imu_grade='tactical', lever_arm=LEVER_ARM))
+    without = replay(recording, Config(imu_grade='tactical', lever_arm_from_tf=False))
+    assert from_tf.aligned and from_tf.warnings == given.warnings == ()
+    for epoch, other in zip(from_tf.epochs, given.epochs, strict=True):
+        assert (epoch.state, epoch.stamp_ns) == (other.state, other.stamp_ns)
+        if epoch.current is not None:
+            assert np.degrees(log_so3(
+                epoch.current.C_nb @ other.current.C_nb.T)) == pytest.approx(np.zeros(3), abs=1e-6)
+    assert without.config.lever_arm == (0.0, 0.0, 0.0)
+
+    found = from_tf.to_json()
+    assert found['base_frame'] == 'base_link' and 'base_frame' not in given.to_json()
+    final = found['base_final_attitude']
+    C_base = drive.attitude_at(from_tf.status.current.stamp_ns) \
+        @ matrix_from_rpy(np.radians(MOUNT_DEG)).T
+    error = np.degrees(log_so3(C_base @ matrix_from_quaternion(final['quaternion_xyzw']).T))
+    assert np.all(np.abs(error) < 5 * np.array(final['sigma_deg']))
+    assert abs(final['yaw_deg'] - found['final_attitude']['yaw_deg']) > 45.0
+
+
+def test_recording_with_tf_that_says_otherwise_or_nothing(recording, drive, tmp_path):
+    result = replay(recording, Config(lever_arm=(1.5, 0.4, 0.8), lever_arm_std=0.05), duration=5.0)
+    warning, = result.warnings
+    assert 'lever_arm is [1.5, 0.4, 0.8] m, but TF has [1.5, -0.4, 0.8] m' in warning
+    with pytest.raises(BagError, match="no transform from 'roof' .base. to 'imu' .IMU."):
+        replay(recording, Config(base_frame='roof'))
+    write_bag(drive, tmp_path / 'plain')
+    with pytest.raises(BagError, match="no transform from 'gnss' .antenna. to 'imu' .IMU."):
+        replay(tmp_path / 'plain', Config(lever_arm_from_tf=True))
+
+
+def test_command_line(tmp_path, capsys):
+    path = tmp_path / 'drive'
+    assert main(['simulate', str(path), '--tf', '--scenario', 'car', '--duration', '5',
+                 '--lever-arm', '1', '2', '3']) == 0
+    assert replay(path).config.lever_arm == pytest.approx((1.0, 2.0, 3.0))

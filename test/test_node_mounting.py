@@ -1,0 +1,152 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Lever arm and base from TF in the live node, with a stand-in for tf2_ros and its Buffer."""
+
+import os
+from types import SimpleNamespace
+
+from geometry_msgs.msg import TransformStamped
+from ins_align.config import Config, ConfigError
+from ins_align.gnss.messages import Fix
+from ins_align.ros.frames import MountingSearch
+from ins_align.ros.imu_bytes import ImuSample
+from ins_align.simulation.simulate import simulate, write_bag
+from node_harness import bag_script, Listener, play, RELIABLE, replayed, running_node
+import numpy as np
+import pytest
+
+SAMPLE = (1, ImuSample(10, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), 'imu'))
+FIX = (2, Fix(10, 48.0, 11.0, 300.0, None, 0))
+# tf2_ros as the node uses it: the transforms of the simulation, there after some questions only.
+STAND_IN = """
+from geometry_msgs.msg import TransformStamped
+from std_msgs.msg import Empty
+
+
+class Buffer:
+    def __init__(self):
+        self.asked = 0
+
+    def can_transform(self, target, source, time):
+        self.asked += 1
+        return target == 'imu' and source in ('gnss', 'base_link') and self.asked > 3
+
+    def lookup_transform(self, target, source, time):
+        found = TransformStamped()
+        if source == 'gnss':
+            found.transform.translation.x, found.transform.translation.y = 1.5, -0.4
+            found.transform.translation.z = 0.8
+        else:  # the IMU is turned to the left by 90 deg
+            found.transform.rotation.z = -0.5 ** 0.5
+            found.transform.rotation.w = 0.5 ** 0.5
+        return found
+
+
+class TransformListener:
+    def __init__(self, buffer, node):
+        self.tf_sub = node.create_subscription(Empty, '/tf', print, 1)
+"""
+
+
+class Buffer:
+    """Transforms that appear one after the other."""
+
+    def __init__(self, **translations):
+        self.translations = translations
+
+    def can_transform(self, target, source, time):
+        return source in self.translations
+
+    def lookup_transform(self, target, source, time):
+        found = TransformStamped()
+        vector = found.transform.translation
+        vector.x, vector.y, vector.z = self.translations[source]
+        return found
+
+
+def search(buffer, **parameters):
+    found = MountingSearch(Config(**parameters), buffer)
+    found.antenna_frame = 'gnss'
+    return found
+
+
+def test_without_tf_nothing_waits():
+    assert search(None).take([SAMPLE], 0.0)[0] == [SAMPLE]
+    assert search(Buffer(), lever_arm_from_tf=False).take([SAMPLE], 0.0)[0] == [SAMPLE]
+    with pytest.raises(ConfigError, match='tf2_ros is not installed: sudo apt install'):
+        search(None, lever_arm_from_tf=True)
+
+
+def test_messages_from_before_the_transform_are_aligned_with_it():
+    buffer = Buffer()
+    auto = search(buffer)
+    assert auto.take([SAMPLE], 0.0) == ([SAMPLE], None)
+    buffer.translations['gnss'] = 1.0, 2.0, 3.0
+    items, mounting = auto.take([FIX], 0.5)
+    assert items == [SAMPLE, FIX] and mounting.config.lever_arm == (1.0, 2.0, 3.0)
+    assert auto.take([SAMPLE], 1.0) == ([SAMPLE], None)
+    auto.restart()  # another IMU, which the model does not have
+    del buffer.translations['gnss']
+    assert auto.take([SAMPLE], 10.0) == ([SAMPLE], None)
+    items, mounting = auto.take([FIX], 13.0)
+    assert items == [SAMPLE, FIX] and mounting.config.lever_arm == (0.0, 0.0, 0.0)
+
+
+def test_what_is_wanted_is_waited_for_and_named():
+    buffer = Buffer(gnss=(1.0, 2.0, 3.0))
+    wanted = search(buffer, lever_arm_from_tf=True, base_frame='base_link')
+    request = (3, SimpleNamespace())
+    assert wanted.take([SAMPLE, request, FIX], 0.0) == ([request], None)
+    assert wanted.waits_for == "the transform from 'base_link' (base) to 'imu' (IMU)"
+    assert wanted.take([], 100.0) == ([], None)
+    buffer.translations['base_link'] = 0.0, 0.0, 0.0
+    items, mounting = wanted.take([], 101.0)
+    assert items == [SAMPLE, FIX] and wanted.waits_for == ''
+    assert np.array_equal(mounting.C_imu_base, np.eye(3))
+
+
+@pytest.mark.parametrize('base_frame', ['', 'base_link'])
+def test_node_with_tf_gives_the_numbers_of_the_parameter(tmp_path, monkeypatch, base_frame):
+    package = tmp_path / 'path' / 'tf2_ros'
+    package.mkdir(parents=True)
+    (package / '__init__.py').write_text(STAND_IN)
+    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
+        [str(package.parent), os.environ.get('PYTHONPATH', '')]))
+    drive = simulate('car', seed=2, duration=40.0, imu_grade='tactical',
+                     lever_arm=(1.5, -0.4, 0.8), mount_rpy_deg=(0.0, 0.0, 90.0))
+    write_bag(drive, tmp_path / 'drive')
+    parameters = {'imu_grade': 'tactical', 'gnss_lateness': 4.0}
+    rows = replayed(tmp_path / 'drive', {**parameters, 'lever_arm': '[1.5, -0.4, 0.8]'},
+                    tmp_path / 'rows.csv')
+    declared = next(row for row in rows if row['state'] == 'ALIGNED')
+    given = [f'{name}:={value}' for name, value in parameters.items()]
+    if base_frame:
+        given.append(f'base_frame:={base_frame}')
+    with Listener() as listener, running_node([*given, *RELIABLE]) as node:
+        listener.wait_for(lambda: listener.statuses)
+        play(bag_script(tmp_path / 'drive'), tmp_path, 4.0)
+        listener.wait_for(lambda: listener.count('imu') == len(drive.imu_stamps_ns))
+        listener.wait_for(lambda: listener.attitudes)
+        listener.wait_for_next_status()
+    assert 'lever arm from TF: [1.5, -0.4, 0.8] m (from imu to gnss)' in node.output
+    q = listener.attitudes[0].quaternion
+    assert [q.x, q.y, q.z, q.w] == pytest.approx(
+        [float(declared[name]) for name in ('qx', 'qy', 'qz', 'qw')], abs=1e-9)
+    if base_frame:
+        assert listener.status['base_frame'] == 'base_link'
+        imu, base = (np.array(listener.status[f'{name}_roll_pitch_yaw_deg'].split(), float)
+                     for name in ('current', 'base_current'))
+        assert (imu[2] - base[2] - 90.0 + 180.0) % 360.0 == pytest.approx(180.0, abs=0.2)
+    else:
+        assert 'base_frame' not in listener.status
