@@ -313,7 +313,7 @@ def test_a_new_start_remembers_what_contradicted_the_one_before():
 @pytest.mark.parametrize('P, state', [(GOOD, State.ALIGNED), (LEVEL, State.LEVELLED)])
 def test_noise_that_is_another_than_stated_is_the_end_of_the_reason(P, state):
     words = '; the GNSS velocities are 3.0 times as noisy as stated'
-    verdict = judge(Declaration(Config()), 0.0, 3.0, P, fit(noise=words))
+    verdict = judge(Declaration(Config()), 0.0, 3.0, P, fit(remarks=words))
     assert verdict.state is state and verdict.reason.endswith(words)
 
 

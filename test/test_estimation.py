@@ -21,7 +21,8 @@ from dense_solution import dense_solution
 from ins_align.aligner import State
 from ins_align.config import Config
 from ins_align.estimation.bank import Bank, RESOLVED_STD
-from ins_align.estimation.filter import DELAY, Filters, FIRST, GYRO, linearised, PHI, PHI0
+from ins_align.estimation.filter import Filters
+from ins_align.estimation.linearised import DELAY, FIRST, GYRO, linearised, PHI, PHI0
 from ins_align.estimation.rivals import SIGNS
 from ins_align.experiments.dense import bound
 from ins_align.geometry.rotation import exp_so3, log_so3, skew

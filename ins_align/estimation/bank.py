@@ -24,12 +24,12 @@ from typing import NamedTuple
 
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimation.declaration import Fit
-from ins_align.estimation.filter import (
-    DELAY, Filters, FIRST, GYRO, Linearised, linearised, MAX_DELAY, MIN_DELAY, PHI, PHI0, Track,
-    triads)
+from ins_align.estimation.filter import Filters, Track
+from ins_align.estimation.linearised import (
+    DELAY, FIRST, GYRO, Linearised, linearised, MAX_DELAY, MIN_DELAY, PHI, PHI0, triads)
+from ins_align.estimation.receiver import ReceiverNoise
 from ins_align.estimation.rivals import in_words, log_sum, Parameters, rivals_of, SHARE
-from ins_align.estimation.start import (
-    all_headings, HEADINGS, LEAST_NOISE, LOUD, OPEN_POSITION, RoughAttitude, Start)
+from ins_align.estimation.start import all_headings, HEADINGS, OPEN_POSITION, RoughAttitude, Start
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.rotation import Array, exp_so3, log_so3
 from ins_align.gnss.antenna import AntennaEpoch, velocities_of
@@ -45,16 +45,6 @@ ALIKE = 2.0
 # A wrong rival has to be less likely by this (log likelihood) or to give the same attitude, to so
 # many sigmas.
 MARGIN, HARMLESS = 6.0, 1.0
-# The receiver's noise is taken to be larger than stated when innovations are LOUD times as large
-# in the mean square; it follows at this rate, a single epoch counting up to the last.
-FOLLOW, CLIP = 0.02, 5.0
-# A mean of innovations over some epochs, which forgets this share with each, shows errors that
-# last; so much more than white noise makes of it is chance.
-LASTING, CHANCE = 0.2, 0.5
-# Factor on variances that is worth a word.
-MENTIONED = 1.5
-# Epochs over which the mean square of innovations is taken, and those it is believed to be 1 for.
-MEMORY, BELIEVED = 300, 30
 # Parameters are linearised anew when the likeliest mean has gone so far from the point: lever arm
 # (m), delay (s), bias and matrix of the gyros (rad/s, 1) and of the accelerometers (m/s^2, 1).
 _REACH = np.array([0.2] * 3 + [0.01] + [3e-3] * 3 + [0.02] * 9 + [0.1] * 3 + [0.02] * 9)
@@ -128,10 +118,7 @@ class Bank:
         self._last = epoch                          # the last epoch that was processed
         self._C_nn0 = np.eye(3)
         self._nis, self._innovation = math.nan, NOTHING_NEW
-        # Log of factors on variances: of velocity and position, horizontal and vertical.
-        self._noise = np.zeros((2, 2))
-        self._misfit = self._lasting = 1.0
-        self._heard, self._mean = BELIEVED, np.zeros((2, 3))
+        self._receiver = ReceiverNoise()
         self._in_a_row = 0                          # epochs that were rejected
         # n0 and the point of linearisation hold for so many epochs, of which so many are left.
         self._point: Array | None = None
@@ -263,12 +250,11 @@ class Bank:
         for kind, present in enumerate(track.present[k]):
             if not present:
                 continue
-            noise = np.exp(0.5 * self._noise[kind, [0, 0, 1]])
-            new = filters.update(model, k, kind, track, noise)
+            new = filters.update(model, k, kind, track, self._receiver.factors(kind))
             best = self._best(filters)
             square = float(new.nis[best]) / 3
             normalised = new.residual[best] / np.sqrt(np.diagonal(new.covariance[best]))
-            self._hear(kind, square, normalised, track.stated[k][kind])
+            self._receiver.hear(kind, square, normalised, track.stated[k][kind])
             rejected = not new.taken[best]
             self._rejected[kind] += rejected
             bad |= rejected
@@ -292,27 +278,6 @@ class Bank:
     def _of_levels(self, filters: Filters) -> Array:
         """Return the same where those that are wrong are out of the question."""
         return np.where(self._wrong[filters.ids], -np.inf, self._posterior(filters))
-
-    def _hear(self, kind: int, square: float, normalised: Array, stated: bool) -> None:
-        """Follow the noise of the receiver: how large it is, and how long errors last."""
-        east, north, up = np.square(normalised).tolist()
-        noise = self._noise[kind]
-        noise += FOLLOW * (np.minimum([0.5 * (east + north), up], CLIP)
-                           - (LOUD if stated else 1.0))
-        np.maximum(noise, 0.0 if stated else math.log(LEAST_NOISE), out=noise)
-        self._heard += 1
-        share = 1 / min(self._heard, MEMORY)
-        self._misfit += share * (min(square, CLIP) - self._misfit)
-        # Of large ones the direction counts: they are outliers, or the heading is being found.
-        mean = self._mean[kind]
-        mean += LASTING * (normalised / max(1.0, math.sqrt(square / CLIP)) - mean)
-        long_run = float(mean @ mean) / 3 * (2 - LASTING) / LASTING
-        self._lasting += share * (long_run - self._lasting)
-
-    @property
-    def factor(self) -> float:
-        """Factor on variances: innovations are larger than they should be, or last."""
-        return max(1.0, self._misfit, self._lasting - CHANCE)
 
     def _select(self, filters: Filters) -> None:
         """Drop means and rivals that are unlikely, merge means that agree."""
@@ -349,7 +314,7 @@ class Bank:
             self._last = start.epochs[0]
             self.t0_ns = self._last.stamp_ns
         if rough is not None:
-            self._noise[rough.kind] = math.log(rough.noise)
+            self._receiver.start(rough.kind, rough.noise)
             self._begin_with(rough)
 
     def _begin_with(self, rough: RoughAttitude) -> None:
@@ -419,25 +384,26 @@ class Bank:
         if self._filters is None:
             return None
         C, P = self._attitudes()
-        return C[0], self.factor * P[0]
+        return C[0], self._receiver.inflation * P[0]
 
     def current(self) -> tuple[Array, Array] | None:
         """Return ``C_nb`` at the last epoch and the covariance of its error in ENU."""
         if self._filters is None:
             return None
         C, P = self._attitudes()
-        return self._C_nn0 @ C[1], self.factor * self._C_nn0 @ P[1] @ self._C_nn0.T
+        return self._C_nn0 @ C[1], self._receiver.inflation * self._C_nn0 @ P[1] @ self._C_nn0.T
 
     def fit(self) -> Fit:
         """Return how well the data fit."""
-        if self._filters is None:
+        filters = self._filters
+        if filters is None:
             return Fit(self._offered, delay=self._config.gnss_delay)
         words, contradicted = self._doubt()
         velocity, position, either = self._rejected
-        return Fit(self._offered, 3 * (self._offered - either), self._misfit,
+        return Fit(self._offered, 3 * (self._offered - either), self._receiver.misfit,
                    self._nis, self._innovation, velocity, position, either,
                    delay=self._config.gnss_delay + float(self._body()[0][DELAY]),
-                   objection=words if contradicted else '', noise=self._noise_in_words())
+                   objection=words if contradicted else '', remarks=self._remarks(filters))
 
     def move_t0(self) -> None:
         """Move t0 to the last epoch."""
@@ -450,13 +416,6 @@ class Bank:
     def unconfirmed(self) -> str:
         """Return what speaks against declaring a heading, or ''."""
         return self._doubt()[0]
-
-    def _ahead_of(self, filters: Filters) -> Array:
-        """Return how much likelier each rival that is wrong is than all levels, shape (M,)."""
-        wrong = self._wrong[filters.ids]
-        level = self._posterior(filters)
-        ahead = np.where(wrong, level - log_sum(level[~wrong]), -np.inf)
-        return np.asarray(ahead / max(self._misfit, 1.0))
 
     def _doubt(self) -> tuple[str, bool]:
         """
@@ -473,7 +432,10 @@ class Bank:
         filters = self._filters
         if filters is None or not self._wrong[filters.ids].any():
             return '', False
-        ahead = self._ahead_of(filters)
+        # How much likelier each of them is than all levels.
+        wrong, level = self._wrong[filters.ids], self._posterior(filters)
+        ahead = np.where(wrong, level - log_sum(level[~wrong]), -np.inf)
+        ahead = ahead / max(self._receiver.misfit, 1.0)
         if not np.any(ahead > -MARGIN):
             return '', False
         mean, P = self._attitudes()
@@ -484,32 +446,21 @@ class Bank:
         if harm[worst] <= HARMLESS or ahead[worst] <= -MARGIN:
             return '', False
         if ahead[worst] > MARGIN:
-            return self._words(filters, worst), True
+            return in_words(self._rivals[filters.ids[worst]], filters.x[filters.lead[worst]],
+                            self._config.gnss_delay), True
         return 'the signs of the IMU axes are not confirmed by the motion yet: turn', False
 
-    def _words(self, filters: Filters, rival: int) -> str:
-        return in_words(self._rivals[filters.ids[rival]], filters.x[filters.lead[rival]],
-                        self._config.gnss_delay)
-
-    def _noise_in_words(self) -> str:
-        """Return how the noise is another one than is stated, as the end of a sentence."""
-        more = ''.join(f'; the GNSS {name} are {math.exp(noise / 2):.1f} times as noisy as stated'
-                       for name, noise in zip(('velocities', 'positions'), self._noise.max(axis=1))
-                       if math.exp(noise) > MENTIONED)
-        if self._lasting - CHANCE > max(MENTIONED, self._misfit):
-            more += ('; errors of the GNSS last from epoch to epoch: sigmas are '
-                     f'{math.sqrt(self.factor):.1f} times larger')
-        worst = self._rivals[0]
-        if self._filters is not None:
-            worst = self._rivals[self._filters.ids[self._best(self._filters)]]
-        noise = self._config.imu_noise
-        if worst.gyro > 1:
-            more += ('; the gyros are worse than configured: set gyro_bias_std to '
-                     f'{worst.gyro * math.degrees(noise.gyro_bias_std):.2g}')
-        if worst.accel > 1:
-            more += ('; the accelerometers are worse than configured: set accel_bias_std to '
-                     f'{worst.accel * noise.accel_bias_std:.2g}')
-        return more
+    def _remarks(self, filters: Filters) -> str:
+        """Return how the sensors are others than configured, as the end of a sentence."""
+        words, noise = self._receiver.in_words(), self._config.imu_noise
+        level = self._rivals[filters.ids[self._best(filters)]]
+        if level.gyro > 1:
+            words += ('; the gyros are worse than configured: set gyro_bias_std to '
+                      f'{level.gyro * math.degrees(noise.gyro_bias_std):.2g}')
+        if level.accel > 1:
+            words += ('; the accelerometers are worse than configured: set accel_bias_std to '
+                      f'{level.accel * noise.accel_bias_std:.2g}')
+        return words
 
     def _body(self) -> tuple[Array, Array]:
         filters = self._filters

@@ -66,8 +66,8 @@ class Fit:
         Of the GNSS, seconds; the configured one where none is estimated.
     objection : str
         What the data say against the configuration, in words.
-    noise : str
-        How the noise is another one than is stated, as the end of a sentence.
+    remarks : str
+        How the sensors are others than configured, as the end of a sentence.
 
     """
 
@@ -81,7 +81,7 @@ class Fit:
     rejected: int = 0
     delay: float = 0.0
     objection: str = ''
-    noise: str = ''
+    remarks: str = ''
 
 
 class Declaration:
@@ -215,17 +215,17 @@ class Declaration:
         config = self.config
         if self.aligned:
             return Verdict(State.ALIGNED, f'heading sigma {_deg(heading)}, '
-                                          f'tilt sigma {_deg(tilt)}{fit.noise}')
+                                          f'tilt sigma {_deg(tilt)}{fit.remarks}')
         if fit.rows < MIN_ROWS:
             return Verdict(State.ALIGNING, self._too_few(fit))
         if tilt > config.tilt_std_threshold and not self.levelled:
             return Verdict(State.ALIGNING,
                            f'tilt sigma {_above(tilt, config.tilt_std_threshold)}: wait, or turn '
-                           f'or change speed{fit.noise}')
+                           f'or change speed{fit.remarks}')
         state = State.LEVELLED if self.levelled else State.ALIGNING
         if heading > config.heading_std_threshold:
             return Verdict(state, f'heading sigma {_above(heading, config.heading_std_threshold)}'
-                                  f': turn or change speed{fit.noise}')
+                                  f': turn or change speed{fit.remarks}')
         return Verdict(state, f'heading sigma {_deg(heading)} is good enough: it has to hold '
                               f'for {config.hold_time:g} s')
 

@@ -29,27 +29,14 @@ differ in their heading share one covariance (docs, "Theory").
 
 from dataclasses import dataclass
 
-from ins_align.geometry.rotation import apply, Array, by_row, cross, exp_so3, Index, log_so3, skew
-from ins_align.imu.preintegration import Intervals
-from ins_align.imu.recent import AGES, exact, smooth
+from ins_align.estimation.linearised import FIRST, GYRO, Linearised, PHI, PHI0, RHO, XI
+from ins_align.geometry.rotation import apply, Array, exp_so3, Index, log_so3
 import numpy as np
 
-# Places in the error state; the parameters follow from FIRST on: lever arm, delay, errors of the
-# gyros (bias, then matrix), errors of the accelerometers.
-PHI, XI, RHO, PHI0, FIRST = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12
-LEVER_ARM, DELAY, GYRO = slice(0, 3), 3, 4          # in the parameters
-# A delay within these (s) is followed along the recent motion; from there it goes straight on.
-MIN_DELAY, MAX_DELAY = -0.1, AGES[-1]
 # Normalised innovation squared of three rows above which a measurement is an outlier: one good
 # one in 60 000 is (chi-square with three degrees of freedom).
 GATE = 25.0
 _EYE = np.eye(3)
-
-
-def triads(m: int) -> tuple[slice, slice]:
-    """Return the places of the errors of gyros and accelerometers among m parameters."""
-    middle = (GYRO + m) // 2
-    return slice(GYRO, middle), slice(middle, m)
 
 
 @dataclass
@@ -78,164 +65,26 @@ class Track:
 
 
 @dataclass
-class Linearised:
+class Innovation:
     """
-    Motion and measurements of K epochs, linearised at the parameters of each of M rivals.
+    What was new in a measurement, to the likeliest mean of each rival.
 
     Attributes
     ----------
-    point : ndarray, shape (M, m)
-        The parameters x.
-    duration : list of float
-        Seconds.
-    R : ndarray, shape (K, M, 3, 3)
-        Rotation over the interval before each epoch, corrected for the point's sensor errors.
-    moved : ndarray, shape (K, M, 6)
-        Velocity and position gained in it.
-    J : ndarray, shape (K, M, 9, m)
-        Derivatives of rotation, velocity and position to x.
-    F : ndarray, shape (K, M, 9, n)
-        Transition of phi, xi, rho.
-    Q : ndarray, shape (K, M, 9, 9)
-        What the noise of the IMU adds to their covariance.
-    H : ndarray, shape (K, 2, M, 3, n)
-        Derivatives of velocity and position, in the body frame, to the errors.
-    expected : ndarray, shape (K, 2, M, 3)
-        What C u and C w lack, in the body frame, of the measurements.
+    nis : ndarray, shape (M,)
+        Normalised and squared, of three rows.
+    residual : ndarray, shape (M, 3)
+        In n0.
+    covariance : ndarray, shape (M, 3, 3)
+    taken : ndarray of bool, shape (M,)
+        Whether it was taken.
 
     """
 
-    point: Array
-    duration: list[float]
-    R: Array
-    moved: Array
-    J: Array
-    F: Array
-    Q: Array
-    H: Array
-    expected: Array
-
-
-def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool) -> Linearised:
-    """
-    Linearise K epochs.
-
-    Parameters
-    ----------
-    point : ndarray, shape (M, m)
-        Parameters to linearise at; their delays are alike, and within `MIN_DELAY` and
-        `MAX_DELAY`.
-    interval : Intervals
-        Before each epoch, as each of the rivals has them: leading axes (K, M).
-    Q : ndarray, shape (K, 1, 9, 9)
-        Covariance of (rotation, velocity, position), in the frame at the start.
-    use_position : bool
-        Whether positions are measurements.
-
-    """
-    M, m = point.shape
-    K = interval.duration.size
-    gyro, accel = triads(m)
-    size = m - accel.start                      # errors of a triad: its bias, or its matrix too
-    J = np.zeros((K, M, 9, m))
-    J[:, :, PHI, gyro], J[:, :, XI, gyro] = interval.J_Rg[..., :size], interval.J_vg[..., :size]
-    J[:, :, RHO, gyro], J[:, :, XI, accel] = interval.J_pg[..., :size], interval.J_va[..., :size]
-    J[:, :, RHO, accel] = interval.J_pa[..., :size]
-    change = apply(J, point)
-    R = exp_so3(change[..., PHI]) @ interval.R
-    moved = np.concatenate([interval.v, interval.p], axis=-1) + change[..., 3:]
-    T = R.swapaxes(-1, -2)
-    F = np.zeros((K, M, 9, FIRST + m))
-    F[..., PHI, PHI] = F[..., XI, XI] = F[..., RHO, RHO] = T
-    F[..., XI, PHI], F[..., RHO, PHI] = -T @ skew(moved[..., :3]), -T @ skew(moved[..., 3:])
-    F[..., RHO, XI] = interval.duration[:, None, None, None] * T
-    for rows in (PHI, XI, RHO):
-        F[..., rows, FIRST:] = T @ J[..., rows, :]
-    # What is gained late is missing in the position, with all its errors.
-    delay = point[:, DELAY, None, None]
-    F[..., RHO, PHI] -= delay * F[..., XI, PHI]
-    F[..., RHO, FIRST:] -= delay * F[..., XI, FIRST:]
-    F[..., RHO, FIRST + DELAY] = -apply(T, moved[..., :3])
-    turn = np.zeros((K, M, 9, 9))
-    turn[..., PHI, PHI] = turn[..., XI, XI] = turn[..., RHO, RHO] = T
-    turn[..., RHO, XI] = -delay * T
-    seen = _Seen(point, interval)
-    H, expected = np.zeros((K, 2, M, 3, FIRST + m)), np.zeros((K, 2, M, 3))
-    H[:, 0], expected[:, 0] = seen.velocity()
-    if use_position:
-        H[:, 1], expected[:, 1] = seen.position()
-    return Linearised(point.copy(), interval.duration.tolist(), R, moved, J, F,
-                      turn @ Q @ turn.swapaxes(-1, -2), H, expected)
-
-
-class _Seen:
-    """What a receiver sees whose measurements are late, in the body frame; K epochs, M rivals."""
-
-    def __init__(self, point: Array, interval: Intervals) -> None:
-        """Lead back from the epochs to the moments that were measured."""
-        self.shape = interval.R.shape[:2] + (3, FIRST + point.shape[1])
-        gyro, accel = (point[:, triad] for triad in triads(point.shape[1]))
-        self.lever = np.broadcast_to(point[:, LEVER_ARM], interval.omega.shape)
-        self.delay = delay = float(point[0, DELAY])
-        force, self.gained, self.gained_p = exact(interval.gained, delay)
-        rate, self.turned, _ = exact(interval.turned, delay)
-        # A lever arm swings with the vibration too.
-        vibration = interval.omega - exact(interval.turned, 0.0)[0]
-
-        def corrected(measured: Array, errors: Array, biases: float) -> Array:
-            """Return what a triad measured without its errors."""
-            true = measured - biases * errors[:, :3]
-            if errors.shape[1] > 3:
-                true = true - apply(errors[:, 3:].reshape(-1, 3, 3), measured)
-            return true
-
-        turn = corrected(self.turned, gyro, delay)
-        calm = corrected(rate, gyro, 1.0)
-        calm = calm + 0.5 * cross(turn, calm)
-        self.rate = rate + vibration
-        self.omega = calm + corrected(vibration, gyro, 0.0)
-        self.back = exp_so3(-turn)
-        self.swing = apply(self.back, cross(self.omega, self.lever))
-        self.fallen = corrected(self.gained, accel, delay)
-        self.fallen_p = corrected(self.gained_p, accel, delay ** 2 / 2)
-        # Vibration is no use in a derivative. The rate changes with time as it does not with age.
-        calm_force = corrected(smooth(interval.gained, delay)[0], accel, 1.0)
-        change = corrected(smooth(interval.turned, delay)[1], gyro, 0.0)
-        whirled = cross(calm, cross(self.omega, self.lever)) - cross(change, self.lever)
-        self.acceleration = calm_force + apply(self.back, whirled)
-
-    def velocity(self) -> tuple[Array, Array]:
-        """Return its derivatives, shape (K, M, 3, n), and what u lacks of it, (K, M, 3)."""
-        swing = skew(self.swing)
-        arm = self.back @ skew(self.lever)
-        H = self._derivatives(skew(self.fallen) - swing, self.back @ skew(self.omega),
-                              -self.acceleration, arm, arm - self.delay * swing, -swing,
-                              self.delay, self.gained)
-        H[..., XI] = _EYE
-        return H, self.fallen - self.swing
-
-    def position(self) -> tuple[Array, Array]:
-        """Return its derivatives, shape (K, M, 3, n), and what w lacks of it, (K, M, 3)."""
-        arm = apply(self.back, self.lever)
-        H = self._derivatives(-skew(self.fallen_p + arm), self.back, self.fallen - self.swing,
-                              np.zeros(arm.shape + (3,)), -self.delay * skew(arm), -skew(arm),
-                              -self.delay ** 2 / 2, -self.gained_p)
-        H[..., RHO] = _EYE
-        return H, -self.fallen_p - arm
-
-    def _derivatives(self, to_phi: Array, to_lever: Array, to_delay: Array, to_rate: Array,
-                     to_gyro_bias: Array, to_turn: Array, to_accel_bias: float,
-                     force: Array) -> Array:
-        """Put derivatives in their places; those to matrices follow from rates and forces."""
-        H = np.zeros(self.shape)
-        x = H[..., FIRST:]
-        H[..., PHI], x[..., LEVER_ARM], x[..., DELAY] = to_phi, to_lever, to_delay
-        gyro, accel = (x[..., triad] for triad in triads(x.shape[-1]))
-        gyro[..., :3], accel[..., :3] = to_gyro_bias, to_accel_bias * _EYE
-        if gyro.shape[-1] > 3:
-            gyro[..., 3:] = by_row(to_rate, self.rate) + by_row(to_turn, self.turned)
-            accel[..., 3:] = by_row(np.broadcast_to(_EYE, to_turn.shape), force)
-        return H
+    nis: Array
+    residual: Array
+    covariance: Array
+    taken: np.ndarray
 
 
 class Filters:
@@ -485,26 +334,3 @@ class Filters:
         kept[lead] = True
         self.weight[lead[near]] = 0.0
         self.keep(kept)
-
-
-@dataclass
-class Innovation:
-    """
-    What was new in a measurement, to the likeliest mean of each rival.
-
-    Attributes
-    ----------
-    nis : ndarray, shape (M,)
-        Normalised and squared, of three rows.
-    residual : ndarray, shape (M, 3)
-        In n0.
-    covariance : ndarray, shape (M, 3, 3)
-    taken : ndarray of bool, shape (M,)
-        Whether it was taken.
-
-    """
-
-    nis: Array
-    residual: Array
-    covariance: Array
-    taken: np.ndarray

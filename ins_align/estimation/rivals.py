@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import math
 
 from ins_align.config import Config, PRESETS
-from ins_align.estimation.filter import DELAY, FIRST, GYRO, LEVER_ARM, triads
+from ins_align.estimation.linearised import DELAY, FIRST, GYRO, LEVER_ARM, triads
 from ins_align.geometry.rotation import Array
 import numpy as np
 

@@ -23,8 +23,9 @@ import math
 from typing import NamedTuple
 
 from ins_align.config import Config
-from ins_align.estimation.filter import FIRST, PHI, PHI0, RHO, XI
 from ins_align.estimation.formula import AttitudeMoments
+from ins_align.estimation.linearised import FIRST, PHI, PHI0, RHO, XI
+from ins_align.estimation.receiver import LEAST_NOISE, LOUD
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.rotation import apply, Array, cross, cumulative_rotations, exp_so3, Index
 from ins_align.gnss.antenna import AntennaEpoch, velocities_of
@@ -35,11 +36,8 @@ import numpy as np
 FIRST_EPOCHS, MAX_WAITING = 4, 64
 # The vector from which a bank starts is so many times its noise.
 START_RATIO = 20.0
-# Residuals in the mean square, over what the receiver states, above which its noise is taken to be
-# larger, or one epoch for an outlier if those of the others are so many times smaller without it.
-LOUD, OUTLYING = 2.0, 10.0
-# The noise of a receiver that states none is estimated; least factor on the configured variance.
-LEAST_NOISE = 1e-2
+# One epoch is an outlier if the residuals of the others are so many times smaller without it.
+OUTLYING = 10.0
 # Headings, every two degrees, and their sigma over the step between them: the sum of such normal
 # densities is flat to 2e-6.
 HEADINGS, STEP_STD = 180, 0.6

@@ -1,0 +1,104 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What innovations say of the receiver: how large its noise is, and how long its errors last."""
+
+import math
+
+from ins_align.geometry.rotation import Array
+import numpy as np
+
+# The noise is taken to be larger than stated when innovations are LOUD times as large in the mean
+# square; that of a receiver that states none is estimated, from LEAST_NOISE of the configured
+# variance. It follows at this rate, a single epoch counting up to the last.
+LOUD, LEAST_NOISE, FOLLOW, CLIP = 2.0, 1e-2, 0.02, 5.0
+# A mean of innovations over some epochs, which forgets this share with each, shows errors that
+# last; so much more than white noise makes of it is chance.
+LASTING, CHANCE = 0.2, 0.5
+# Factor on variances that is worth a word.
+MENTIONED = 1.5
+# Epochs over which the mean square of innovations is taken, and those it is believed to be 1 for.
+MEMORY, BELIEVED = 300, 30
+
+
+class ReceiverNoise:
+    """
+    Follows the noise of a receiver.
+
+    Attributes
+    ----------
+    misfit : float
+        Mean square of normalised innovations.
+
+    """
+
+    def __init__(self) -> None:
+        """Believe what is stated."""
+        # Log of factors on variances: of velocity and position, horizontal and vertical.
+        self._noise = np.zeros((2, 2))
+        self.misfit = self._lasting = 1.0
+        self._heard, self._mean = BELIEVED, np.zeros((2, 3))
+
+    def start(self, kind: int, factor: float) -> None:
+        """Begin with a factor on the variances of velocities (kind 0) or positions (1)."""
+        self._noise[kind] = math.log(factor)
+
+    def factors(self, kind: int) -> Array:
+        """Return factors on the sigmas of velocities or positions, east, north, up."""
+        return np.exp(0.5 * self._noise[kind, [0, 0, 1]])
+
+    def hear(self, kind: int, square: float, normalised: Array, stated: bool) -> None:
+        """
+        Follow an innovation.
+
+        Parameters
+        ----------
+        kind : int
+            0: of a velocity, 1: of a position.
+        square : float
+            Normalised and squared, per row.
+        normalised : ndarray, shape (3,)
+            Over its sigmas, east, north, up.
+        stated : bool
+            Whether the receiver states its noise.
+
+        """
+        east, north, up = np.square(normalised).tolist()
+        noise = self._noise[kind]
+        noise += FOLLOW * (np.minimum([0.5 * (east + north), up], CLIP)
+                           - (LOUD if stated else 1.0))
+        np.maximum(noise, 0.0 if stated else math.log(LEAST_NOISE), out=noise)
+        self._heard += 1
+        share = 1 / min(self._heard, MEMORY)
+        self.misfit += share * (min(square, CLIP) - self.misfit)
+        # Of large ones the direction counts: they are outliers, or the heading is being found.
+        mean = self._mean[kind]
+        mean += LASTING * (normalised / max(1.0, math.sqrt(square / CLIP)) - mean)
+        long_run = float(mean @ mean) / 3 * (2 - LASTING) / LASTING
+        self._lasting += share * (long_run - self._lasting)
+
+    @property
+    def inflation(self) -> float:
+        """Factor on variances of results: innovations are larger than they should be, or last."""
+        return max(1.0, self.misfit, self._lasting - CHANCE)
+
+    def in_words(self) -> str:
+        """Return how the noise is another one than is stated, as the end of a sentence."""
+        words = ''.join(f'; the GNSS {name} are {math.exp(noise / 2):.1f} times as noisy as stated'
+                        for name, noise in zip(('velocities', 'positions'),
+                                               self._noise.max(axis=1))
+                        if math.exp(noise) > MENTIONED)
+        if self._lasting - CHANCE > max(MENTIONED, self.misfit):
+            words += ('; errors of the GNSS last from epoch to epoch: sigmas are '
+                      f'{math.sqrt(self.inflation):.1f} times larger')
+        return words
