@@ -183,10 +183,12 @@ def prepared(s, *, velocity=True, **changes):
     config = config_for(s, **changes)
     counts = Counter()
     samples, messages = ImuBuffer(0, counts), GnssBuffer(0, counts)
+    delay_ns = round(config.gnss_delay * 1e9)
     for k in range(len(s.gnss_stamps_ns)):
-        messages.add_fix(s.fix(k), None)
+        fix, measured = s.fix(k), s.velocity_measurement(k)
+        messages.add_fix(fix._replace(stamp_ns=fix.stamp_ns - delay_ns), None)
         if velocity:
-            messages.add_velocity(s.velocity_measurement(k), None)
+            messages.add_velocity(measured._replace(stamp_ns=measured.stamp_ns - delay_ns), None)
     samples.add_many(s.imu_stamps_ns, s.gyro, s.accel)
     antenna = Antenna(config, counts)
     first, *epochs = map(antenna.epoch, messages.release(samples.settled_ns(True), True))
