@@ -21,22 +21,20 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
-from functools import partial
+import dataclasses
+from dataclasses import dataclass
 import multiprocessing
-import os
 from pathlib import Path
-import signal
-import threading
 from typing import Any
 
-from ins_align.ahead import ProcessDied
 from ins_align.config import Config
+from ins_align.outputs import write_whole
+from ins_align.processes import pool
 from ins_align.recordings import BagError
 from ins_align.recordings.replay import replay
-from ins_align.report import plot, save_figure, summary, write_whole
+from ins_align.report import plot, save_figure, summary
 
 CONNECT_TIMEOUT = 10.0  # s, to the scheduler of a Dask cluster
 
@@ -47,8 +45,9 @@ class ClusterError(RuntimeError):
 
 @dataclass(frozen=True)
 class Task:
-    """One recording, how to read it and what to write."""
+    """One recording, how to read it and what to write; paths that hold on every machine."""
 
+    name: str  # of the recording, as it was given
     bag: str
     config: Config
     imu_topic: str | None = None
@@ -70,17 +69,18 @@ class Outcome:
     error: str = ''
 
 
-def process(task: Task, progress: Callable[[float], None] | None = None,
-            read_ahead: bool = False) -> Outcome:
+def process(task: Task, read_ahead: bool = False,
+            progress: Callable[[float], None] | None = None) -> Outcome:
     """Replay one recording and write its files; whatever the user can put right is an error."""
     try:
         result = replay(task.bag, task.config, imu_topic=task.imu_topic, fix_topic=task.fix_topic,
                         velocity_topic=task.velocity_topic, start=task.start,
                         duration=task.duration, progress=progress, read_ahead=read_ahead)
     except BagError as error:
-        return _failed(task, str(error))
-    except ProcessDied:
-        return _died(task)
+        return _failed(task, str(error).replace(task.bag, task.name))
+    except BrokenProcessPool as error:
+        return _lost(task, error)
+    result = dataclasses.replace(result, bag=task.name)
     try:
         if task.csv:
             text = result.to_csv().encode()
@@ -90,16 +90,17 @@ def process(task: Task, progress: Callable[[float], None] | None = None,
             write_whole(task.plot, lambda file: save_figure(figure, file, suffix))
     except OSError as error:
         return _failed(task, f'cannot write {error.filename}: {error.strerror}')
-    return Outcome(result.to_json(), summary(result), result.warnings)
+    warnings = tuple(text.replace(task.bag, task.name) for text in result.warnings)
+    return Outcome(result.to_json(), summary(result), warnings)
 
 
-def _died(task: Task) -> Outcome:
-    return _failed(task, f'{task.bag}: a process died on the way, perhaps for want of memory; '
-                         '--jobs 1 takes less')
+def _lost(task: Task, error: Exception) -> Outcome:
+    return _failed(task, f'{task.name}: a process died on the way ({type(error).__name__}), '
+                         'perhaps for want of memory; --jobs 1 takes less')
 
 
 def _failed(task: Task, error: str) -> Outcome:
-    return Outcome({'bag': task.bag, 'aligned': False, 'error': error}, error=error)
+    return Outcome({'bag': task.name, 'aligned': False, 'error': error}, error=error)
 
 
 def process_all(tasks: Sequence[Task], jobs: int, progress: Callable[[float], None],
@@ -120,25 +121,19 @@ def process_all(tasks: Sequence[Task], jobs: int, progress: Callable[[float], No
     """
     if jobs == 1 or len(tasks) == 1:
         for index, task in enumerate(tasks):
-            yield process(task, partial(_advance, progress, index), read_ahead=jobs > 1)
+            yield process(task, jobs > 1, lambda part: progress(index + part))
             progress(index + 1.0)
         return
-    with ProcessPoolExecutor(min(jobs, len(tasks)), initializer=_leave_interrupts) as executor:
-        try:
-            futures = [executor.submit(process, task, read_ahead=jobs >= 2 * len(tasks))
-                       for task in tasks]
-            for index, (task, future) in enumerate(zip(tasks, futures)):
-                try:
-                    outcome = future.result()
-                except BrokenProcessPool:
-                    outcome = _died(task)
-                yield outcome
-                progress(index + 1.0)
-        except BaseException:
-            executor.shutdown(wait=False, cancel_futures=True)
-            for child in multiprocessing.active_children():
-                child.terminate()
-            raise
+    executor = pool(min(jobs, len(tasks)))
+    try:
+        yield from _outcomes(executor, tasks, progress, BrokenProcessPool,
+                             read_ahead=jobs >= 2 * len(tasks))
+    except BaseException:
+        for child in multiprocessing.active_children():
+            child.terminate()
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)
 
 
 def process_on_cluster(tasks: Sequence[Task], address: str, progress: Callable[[float], None],
@@ -174,28 +169,28 @@ def process_on_cluster(tasks: Sequence[Task], address: str, progress: Callable[[
         asyncio.run(asyncio.wait_for(_ask_scheduler(address), CONNECT_TIMEOUT))
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except Exception as error:  # strangers answer all kinds of things
-        reason = str(error).partition('\n')[0] or type(error).__name__
-        if isinstance(error, asyncio.TimeoutError):
-            reason = f'nothing was heard for {CONNECT_TIMEOUT:g} s'
-        elif isinstance(error, MemoryError):  # for what was taken for a size
-            reason = 'something else does'
-        elif isinstance(error, ValueError):
-            reason += '; an address is like tcp://localhost:8786'
-        raise ClusterError(f'no Dask scheduler answers at {address}: {reason}') from None
-    with client:
-        # Not pure: the same recording twice among the arguments is two tasks.
-        futures = client.map(_process_there, [_absolute(task) for task in tasks], pure=False)
-        try:
-            for index, (task, future) in enumerate(zip(tasks, futures)):
-                try:
-                    outcome = _as_asked(future.result(), task)
-                except Exception as error:  # whatever the cluster has run into
-                    outcome = _failed(task, f'{task.bag}: the Dask cluster gave up on it: '
-                                            f'{type(error).__name__}')
-                yield outcome
-                progress(index + 1.0)
-        finally:
-            client.cancel(futures)
+        reason = f'{type(error).__name__}: {error}'.partition('\n')[0].rstrip(': ')
+        raise ClusterError(f'no Dask scheduler answers at {address} ({reason}); an address is '
+                           'like tcp://localhost:8786') from None
+    with client, client.get_executor() as executor:
+        yield from _outcomes(executor, tasks, progress, Exception)
+
+
+def _outcomes(executor: Executor, tasks: Sequence[Task], progress: Callable[[float], None],
+              lost: type[Exception], **options: Any) -> Iterator[Outcome]:
+    """Yield outcomes in order; `lost` says that whoever worked on a task is gone."""
+    futures = [executor.submit(process, task, **options) for task in tasks]
+    try:
+        for index, (task, future) in enumerate(zip(tasks, futures)):
+            try:
+                outcome = future.result()
+            except lost as error:
+                outcome = _lost(task, error)
+            yield outcome
+            progress(index + 1.0)
+    finally:
+        for future in futures:
+            future.cancel()
 
 
 async def _ask_scheduler(address: str) -> None:
@@ -209,41 +204,3 @@ async def _ask_scheduler(address: str) -> None:
     async with rpc(address, connection_args=arguments) as scheduler:
         if 'workers' not in await scheduler.identity():
             raise OSError('it is no scheduler')
-
-
-def _process_there(task: Task) -> Outcome:
-    """Be the function that Dask calls, which knows of no progress."""
-    return process(task)
-
-
-def _absolute(task: Task) -> Task:
-    """Name files as they are named from any folder."""
-    return replace(task, bag=os.path.abspath(task.bag),
-                   csv=task.csv and os.path.abspath(task.csv),
-                   plot=task.plot and os.path.abspath(task.plot))
-
-
-def _as_asked(outcome: Outcome, task: Task) -> Outcome:
-    """Name the recording as the user has named it."""
-    path = os.path.abspath(task.bag)
-    if outcome.error:
-        return _failed(task, outcome.error.replace(path, task.bag))
-    return replace(outcome, json={**outcome.json, 'bag': task.bag},
-                   summary=outcome.summary.replace(path, task.bag))
-
-
-def _advance(progress: Callable[[float], None], done: int, part: float) -> None:
-    progress(done + part)
-
-
-def _leave_interrupts() -> None:
-    """Let Ctrl-C go to the parent alone, which ends its children; end when it is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)

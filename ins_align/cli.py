@@ -17,28 +17,27 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import fields
-import errno
 import gc
 import io
 import json
 import os
 from pathlib import Path
 import sys
-from typing import Any, NoReturn, TextIO, TYPE_CHECKING
+from typing import Any, NoReturn, TYPE_CHECKING
 
-from ins_align.threads import keep_to_one, processors
+from ins_align.outputs import (
+    about, absolute, check_plot, check_writable, labels, STANDARD_OUTPUT, UsageError, with_label,
+    write_whole)
+from ins_align.processes import keep_to_one, processors
 
 if TYPE_CHECKING:
     from ins_align.batch import Outcome, Task
     from ins_align.config import Config
-    from ins_align.progress import Progress
 
 # Everything else is imported where it is used: --help must not wait for numpy.
 
-ALIGNED, NOT_ALIGNED, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
-STANDARD_OUTPUT = '-'
+ALIGNED, NOT_ALIGNED, UNUSABLE, INTERRUPTED, NO_READER = 0, 1, 2, 130, 141
 
 # Where the package to install has another name than the module.
 PACKAGES = {'backports': 'backports.zstd', 'PIL': 'pillow', 'pyins': 'python-ins',
@@ -98,10 +97,6 @@ example:
 """
 
 
-class UsageError(Exception):
-    """A wrong command line; the text says what is wrong in one sentence."""
-
-
 class Parser(argparse.ArgumentParser):
     """A parser that says in one sentence what is wrong."""
 
@@ -125,58 +120,38 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status.
 
     """
-    for stream in ('stdout', 'stderr'):
-        if getattr(sys, stream) is None:  # closed by who started us
-            setattr(sys, stream, open(os.devnull, 'w'))
-        if isinstance(getattr(sys, stream), io.TextIOWrapper):  # of any encoding
-            getattr(sys, stream).reconfigure(errors='backslashreplace')
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # of any encoding
+            stream.reconfigure(errors='backslashreplace')
     arguments, unknown = parser().parse_known_args(argv)
     if unknown:
         arguments.parser.error(f'unrecognized arguments: {" ".join(unknown)}')
     try:
         status = int(arguments.run(arguments))
-        with _readers_may_leave(sys.stdout):
-            sys.stdout.flush()
+        print(end='', flush=True)
         return status
-    except (UsageError, ModuleNotFoundError) as error:
-        if isinstance(error, ModuleNotFoundError):
-            error = _missing(error)
-        with _readers_may_leave(sys.stderr):
-            print(f'ins_align {arguments.command}: {error}', file=sys.stderr)
-        return UNUSABLE
     except KeyboardInterrupt:
         return INTERRUPTED
-    except BrokenPipeError:  # an experiment, which says what it does while it writes
-        _to_nobody(sys.stdout)
-        return UNUSABLE
-    except OSError as error:  # nobody else's: the output has no room
-        if error.errno != errno.ENOSPC:
-            raise
-        _to_nobody(sys.stdout)
-        print(f'ins_align {arguments.command}: cannot write: {error.strerror}', file=sys.stderr)
-        return UNUSABLE
-
-
-@contextmanager
-def _readers_may_leave(stream: TextIO) -> Iterator[None]:
-    """Let whoever reads our output leave, as ``| head`` does: the work and its status stay."""
-    try:
-        yield
-    except BrokenPipeError:
-        _to_nobody(stream)
-
-
-def _to_nobody(stream: TextIO) -> None:
-    """Keep Python from complaining whenever it writes, and when it flushes at the end."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    except ModuleNotFoundError as error:
+        sentence, status = str(_missing(error)), UNUSABLE
+    except BrokenPipeError:  # whoever reads the output has left, as "head" does
+        sentence, status = '', NO_READER
+    except (UsageError, OSError) as error:
+        sentence, status = str(error), UNUSABLE
+        if isinstance(error, OSError):
+            sentence = f'{error.filename or "output"}: {error.strerror}'
+            if error.filename is None:  # the disk is full: Python complains again when it closes
+                os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    if sentence:
+        print(f'ins_align {arguments.command}: {sentence}', file=sys.stderr)
+    return status
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
     top = Parser(prog='ins_align', description=DESCRIPTION,
                  formatter_class=argparse.RawDescriptionHelpFormatter)
-    top.add_argument('--version', action=_Version, nargs=0, dest=argparse.SUPPRESS,
-                     help='tell the version')
+    top.add_argument('--version', action='version', version=f'%(prog)s {_version()}')
     top.set_defaults(run=_help, parser=top)  # without a command
     commands = top.add_subparsers(dest='command', metavar='COMMAND', help=argparse.SUPPRESS)
     _add_info(commands)
@@ -201,18 +176,13 @@ def _add_command(commands: Any, name: str, run: Callable[[argparse.Namespace], i
     return command
 
 
-class _Version(argparse.Action):
-    """Tells the version of the package that is installed."""
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
 
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        """Leave with exit status 0."""
-        from importlib.metadata import PackageNotFoundError, version
-
-        try:
-            print(f'{parser.prog} {version("ins_align")}')
-        except PackageNotFoundError:
-            print(f'{parser.prog} is not installed: its version is in package.xml')
-        parser.exit()
+    try:
+        return version('ins_align')
+    except PackageNotFoundError:
+        return 'is not installed: its version is in package.xml'
 
 
 def _seconds(text: str) -> float:
@@ -335,7 +305,8 @@ def _add_experiment(commands: Any) -> None:
 
 def run_info(arguments: argparse.Namespace) -> int:
     """Run ``ins_align info``."""
-    _check_writable(arguments.json, arguments.bags)
+    if arguments.json:
+        check_writable(arguments.json, arguments.bags)
     from ins_align.recordings import BagError
     from ins_align.recordings.info import describe, inspect
 
@@ -347,18 +318,15 @@ def run_info(arguments: argparse.Namespace) -> int:
             info = inspect(bag)
         except BagError as error:
             if not several:
-                raise UsageError(_of(bag, str(error))) from None
-            with _readers_may_leave(sys.stderr):
-                print(f'ins_align info: {_of(bag, str(error))}', file=sys.stderr)
+                raise UsageError(about(bag, str(error))) from None
+            print(f'ins_align info: {about(bag, str(error))}', file=sys.stderr)
             objects.append({'bag': bag, 'error': str(error)})
             status = UNUSABLE
             continue
-        with _readers_may_leave(sys.stderr):
-            for warning in info.warnings:
-                print(f'ins_align info: warning: {_of(bag, warning)}', file=sys.stderr)
+        for warning in info.warnings:
+            print(f'ins_align info: warning: {about(bag, warning)}', file=sys.stderr)
         if arguments.json != STANDARD_OUTPUT:
-            with _readers_may_leave(sys.stdout):
-                print(describe(info) + '\n')
+            print(describe(info) + '\n')
         objects.append(info.to_json())
     if arguments.json:
         _write_json(arguments.json, objects if several else objects[0])
@@ -370,85 +338,83 @@ def run_replay(arguments: argparse.Namespace) -> int:
     keep_to_one()
     gc.set_threshold(100_000)  # rows and results by the thousand, none of which is garbage
     several = len(arguments.bags) > 1
-    labels = _labels(arguments.bags) if several else ['']
+    names = labels(arguments.bags) if several else ['']
     for option in ('csv', 'plot'):
         if getattr(arguments, option) == STANDARD_OUTPUT:
             raise UsageError(f'--{option} needs the name of a file')
     outputs = [path for path in (arguments.json, arguments.csv, arguments.plot) if path]
-    outputs += [_with_label(path, label) for path in (arguments.csv, arguments.plot) if path
-                for label in labels if label]
+    outputs += [with_label(path, label) for path in (arguments.csv, arguments.plot) if path
+                for label in names if label]
     for path in outputs:
-        _check_writable(path, [*arguments.bags, *filter(None, [arguments.params])])
+        check_writable(path, [*arguments.bags, *filter(None, [arguments.params])])
         if outputs.count(path) > 1:
             raise UsageError(f'{path} is given for two outputs')
     config = _config(arguments)
     if arguments.plot:
-        _check_plot(arguments.plot)
+        check_plot(arguments.plot)
     from ins_align.batch import Task
-    from ins_align.progress import progress_bar
 
-    tasks = [Task(bag, config, arguments.imu_topic, arguments.fix_topic, arguments.velocity_topic,
-                  arguments.start, arguments.duration, _with_label(arguments.csv, label),
-                  _with_label(arguments.plot, label))
-             for bag, label in zip(arguments.bags, labels)]
+    tasks = [Task(bag, os.path.abspath(bag), config, arguments.imu_topic, arguments.fix_topic,
+                  arguments.velocity_topic, arguments.start, arguments.duration,
+                  absolute(arguments.csv, label), absolute(arguments.plot, label))
+             for bag, label in zip(arguments.bags, names)]
     objects = []
     statuses = []
-    with progress_bar(len(tasks)) as progress:
-        # To the very end: a pool of processes that is dropped on the way is torn down in a race.
-        for outcome, bag in zip(_outcomes(tasks, arguments, progress), arguments.bags):
-            if outcome.error:
-                if not several:
-                    raise UsageError(_of(bag, outcome.error))
-                with _readers_may_leave(sys.stderr):
-                    progress.note(f'ins_align replay: {_of(bag, outcome.error)}')
-                statuses.append(UNUSABLE)
-            else:
-                with _readers_may_leave(sys.stderr):
-                    for warning in outcome.warnings:
-                        progress.note(f'ins_align replay: warning: {_of(bag, warning)}')
-                if arguments.json != STANDARD_OUTPUT:
-                    with _readers_may_leave(sys.stdout):
-                        progress.say(outcome.summary + '\n')
-                statuses.append(ALIGNED if outcome.json['aligned'] else NOT_ALIGNED)
-            objects.append(outcome.json)
+    bar = _progress_bar(len(tasks))
+    say = print if bar is None else bar.write
+    # To the very end: a pool of processes that is dropped on the way is torn down in a race.
+    for outcome, bag in zip(_outcomes(tasks, arguments, bar), arguments.bags):
+        objects.append(outcome.json)
+        if outcome.error:
+            if not several:
+                raise UsageError(about(bag, outcome.error))
+            say(f'ins_align replay: {about(bag, outcome.error)}', file=sys.stderr)
+            statuses.append(UNUSABLE)
+            continue
+        for warning in outcome.warnings:
+            say(f'ins_align replay: warning: {about(bag, warning)}', file=sys.stderr)
+        if arguments.json != STANDARD_OUTPUT:
+            say(outcome.summary + '\n')
+        statuses.append(ALIGNED if outcome.json['aligned'] else NOT_ALIGNED)
+    if bar is not None:
+        bar.close()
     if arguments.json:
         _write_json(arguments.json, objects if several else objects[0])
     return max(statuses)
 
 
-def _of(bag: str, text: str) -> str:
-    """Let a sentence on a recording begin with the path as it was given."""
-    from ins_align.recordings import one_line
-
-    path = Path(bag)
-    name, last = one_line(str(path)), one_line(path.name)
-    for begin in (name, last):
-        if begin and text.startswith((f'{begin} ', f'{begin}:')):
-            return name + text[len(begin):]
-    return f'{name}: {text}'
+def _progress_bar(total: int) -> Any:
+    """Return a bar over so many recordings; None without a terminal or without tqdm."""
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        return None
+    return tqdm(total=total, leave=False, bar_format='{percentage:3.0f}% |{bar}| {elapsed}, '
+                '{remaining} left') if sys.stderr and sys.stderr.isatty() else None
 
 
-def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace, progress: Progress,
+def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace, bar: Any,
               ) -> Iterator[Outcome]:
     """Process recordings where the arguments say."""
     from ins_align.batch import ClusterError, process_all, process_on_cluster
 
+    def advance(position: float) -> None:
+        if bar is not None:
+            bar.update(position - bar.n)
+
     if arguments.dask is None:
-        yield from process_all(tasks, arguments.jobs or processors(), progress.advance)
+        yield from process_all(tasks, arguments.jobs or processors(), advance)
         return
     try:
-        yield from process_on_cluster(tasks, arguments.dask, progress.advance)
+        yield from process_on_cluster(tasks, arguments.dask, advance)
     except ClusterError as error:
         raise UsageError(error) from None
 
 
 def _write_json(path: str, content: Any) -> None:
-    from ins_align.report import write_whole
-
     text = json.dumps(content, indent=2, allow_nan=False) + '\n'
     if path == STANDARD_OUTPUT:
-        with _readers_may_leave(sys.stdout):
-            sys.stdout.write(text)
+        print(text, end='')
         return
     try:
         write_whole(path, lambda file: file.write(text.encode()))
@@ -465,9 +431,8 @@ def _config(arguments: argparse.Namespace) -> Config:
         values = load_params(arguments.params) if arguments.params else {}
         for name in values.keys() - known:
             # As the node has it: a file for many nodes is not wrong, a slip must not pass unseen.
-            with _readers_may_leave(sys.stderr):
-                print(f'ins_align {arguments.command}: warning: parameter {name!r} of '
-                      f'{arguments.params} {no_effect(name)}', file=sys.stderr)
+            print(f'ins_align {arguments.command}: warning: parameter {name!r} of '
+                  f'{arguments.params} {no_effect(name)}', file=sys.stderr)
             del values[name]
         values.update(parse_override(text) for text in arguments.overrides)
         if arguments.lever_arm is not None:
@@ -475,74 +440,6 @@ def _config(arguments: argparse.Namespace) -> Config:
         return config_from_mapping(values)
     except ConfigError as error:
         raise UsageError(error) from None
-
-
-def _labels(bags: Sequence[str]) -> list[str]:
-    """Name the recordings, all differently, for the names of output files."""
-    names = [Path(bag).resolve().name.split('.')[0] or 'bag' for bag in bags]
-    labels: list[str] = []
-    for index, name in enumerate(names):
-        label = name
-        # A number may make it the name of another recording.
-        while names.count(label) > (label == name) or label in labels:
-            label += f'_{index + 1}'
-        labels.append(label)
-    return labels
-
-
-def _with_label(path: str | None, label: str) -> str | None:
-    if not path or not label or not Path(path).name:
-        return path
-    return str(Path(path).with_stem(f'{Path(path).stem}_{label}'))
-
-
-def _check_writable(path: str | None, inputs: Sequence[str]) -> None:
-    """Find out before the work whether its result can be written, and spoils no input."""
-    if path in (None, STANDARD_OUTPUT):
-        return
-    from ins_align.report import is_stream
-
-    if is_stream(path):
-        if not os.access(path, os.W_OK):
-            raise UsageError(f'cannot write {path}: no permission')
-        return
-    target = Path(os.path.realpath(path))
-    folder = target.parent
-    if spoilt := _spoilt(target, list(map(os.path.realpath, inputs))):
-        raise UsageError(f'cannot write {path}: {spoilt}, choose another name')
-    if not folder.is_dir():
-        raise UsageError(f'cannot write {path}: there is no directory {folder}')
-    if Path(path).is_dir():
-        raise UsageError(f'cannot write {path}: it is a directory')
-    if not os.access(folder, os.W_OK):
-        raise UsageError(f'cannot write {path}: no permission to write to {folder}')
-
-
-def _spoilt(target: Path, inputs: Sequence[str]) -> str:
-    """Say what would be lost if something were written there; both without links."""
-    from ins_align.recordings.bag import begins_like_a_recording, STORAGE_NAME
-
-    if str(target) in inputs:
-        return 'it is to be read'
-    if begins_like_a_recording(target):
-        return 'it is a recording and would be lost'
-    if str(target.parent) in inputs and (STORAGE_NAME.search(target.name)
-                                         or target.name == 'metadata.yaml'):
-        return 'it would become a part of the recording around it'
-    return ''
-
-
-def _check_plot(path: str) -> None:
-    from importlib.util import find_spec
-
-    from ins_align.report import PLOT_SUFFIXES
-
-    if Path(path).suffix.lower() not in PLOT_SUFFIXES:
-        raise UsageError(f'cannot draw {path}: its name must end with one of '
-                         f'{", ".join(PLOT_SUFFIXES)}')
-    if find_spec('matplotlib') is None:
-        raise UsageError('--plot needs matplotlib, which is not installed: '
-                         'pip install matplotlib')
 
 
 def _missing(error: ModuleNotFoundError) -> UsageError:

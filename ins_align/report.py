@@ -11,17 +11,13 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What a person sees of a result: tables of plain text, figures, and files written whole."""
+"""What a person sees of a result: tables of plain text and figures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-import io
+from collections.abc import Sequence
 import math
-import os
 from pathlib import Path
-import sys
 from typing import Any, IO, TYPE_CHECKING
 
 from ins_align.recordings import one_line
@@ -46,57 +42,6 @@ INNOVATION_LIMIT = 5.0  # sigmas shown at least
 METRES_PER_DEGREE = 6_371_000.0 * math.pi / 180.0  # of latitude, mean sphere: good for a picture
 BREAK_INTERVALS = 5.0  # a line ends where epochs are further apart than so many usual distances
 LOST_SIGMA_DEG = 60.0  # above this a heading is not worth drawing
-PLOT_SUFFIXES = ('.png', '.pdf', '.svg', '.jpg', '.jpeg', '.webp', '.eps', '.tif', '.tiff')
-
-
-def is_stream(path: str | os.PathLike[str]) -> bool:
-    """Whether there is no file at a path, nor can be one, but a pipe or a device."""
-    path = Path(path).absolute()
-    # /dev/stdout may be a file: where the output of the command goes, which is not to be replaced.
-    return path.parts[1:2] in (('dev',), ('proc',)) and path.exists() or (
-        path.exists() and not path.is_file() and not path.is_dir())
-
-
-def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any]) -> None:
-    """
-    Write a file whole or not at all.
-
-    Parameters
-    ----------
-    path : path
-        To be made or replaced.
-    write : callable
-        Gets the open file. If it raises, `path` is as it was before.
-
-    A link stays one, to a file that is replaced. A pipe or a device is written to as it is.
-
-    """
-    if is_stream(path):
-        content = io.BytesIO()
-        write(content)
-        with open(_opened(path), 'wb') as stream:
-            stream.write(content.getvalue())
-        return
-    path = Path(os.path.realpath(path))
-    unfinished = path.with_name(f'.{path.name}.{os.getpid()}.part')
-    try:
-        with open(unfinished, 'xb') as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
-
-
-def _opened(path: str | os.PathLike[str]) -> int:
-    """Open a pipe or a device; of our own output, go on where it is."""
-    for number, stream in ((1, sys.stdout), (2, sys.stderr)):
-        with suppress(OSError):  # that one is closed
-            if os.path.samestat(os.stat(path), os.fstat(number)):
-                stream.flush()
-                return os.dup(number)
-    return os.open(path, os.O_WRONLY | os.O_APPEND)
 
 
 def format_table(rows: Sequence[Sequence[Any]], header: Sequence[str] = (),

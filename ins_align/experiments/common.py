@@ -29,9 +29,10 @@ from unittest.mock import patch
 from ins_align.aligner import Attitude, Epoch, State
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array, log_so3
-from ins_align.report import format_table, write_whole
+from ins_align.outputs import write_whole
+from ins_align.processes import processors, VARIABLES
+from ins_align.report import format_table
 from ins_align.simulation.simulate import Simulation
-from ins_align.threads import processors, VARIABLES
 import numpy as np
 
 # Of simulated data nothing comes late, but an unknown delay wants IMU samples beyond the stamp.

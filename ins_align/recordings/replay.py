@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import os
 from typing import Any
 
-from ins_align.ahead import run_ahead
 from ins_align.config import Config
 from ins_align.geometry.rotation import (
     Array, exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw)
@@ -28,6 +27,7 @@ from ins_align.gnss.buffer import fault_of_fix
 from ins_align.gnss.messages import Fix
 from ins_align.mounting import base_attitude
 from ins_align.offline import Recorded
+from ins_align.processes import run_ahead
 from ins_align.recordings.decode import Attitudes
 from ins_align.recordings.reader import read, Request, Topics
 from ins_align.results import Attitude, attitude_json, Result
@@ -158,7 +158,7 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
     ------
     BagError
         If the recording cannot be read, lacks a topic, or has no messages in the part asked for.
-    ProcessDied
+    BrokenProcessPool
         If the other process is killed.
 
     """

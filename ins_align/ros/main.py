@@ -23,7 +23,7 @@ import signal
 import sys
 from types import FrameType
 
-from ins_align.threads import keep_to_one
+from ins_align.processes import keep_to_one
 
 _SOURCE_LINES = re.compile(r', at \S+:\d+')  # where in its sources rcl found an error
 

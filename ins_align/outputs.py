@@ -1,0 +1,136 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Files that a command writes: named, checked before the work, and written whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import errno
+import os
+from pathlib import Path
+from typing import Any, IO
+
+STANDARD_OUTPUT = '-'
+PLOT_SUFFIXES = ('.png', '.pdf', '.svg', '.jpg', '.jpeg', '.webp', '.eps', '.tif', '.tiff')
+
+
+class UsageError(Exception):
+    """A wrong command line; the text says what is wrong in one sentence."""
+
+
+def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any]) -> None:
+    """
+    Write a file whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        To be made or replaced.
+    write : callable
+        Gets the open file. If it raises, `path` is as it was before.
+
+    A link stays one, to a file that is replaced. What is there and is no file is not replaced.
+
+    """
+    path = Path(os.path.realpath(path))
+    if path.exists() and not path.is_file():
+        raise FileExistsError(errno.EEXIST, 'it is no file', str(path))
+    unfinished = path.with_name(f'.{path.name}.{os.getpid()}.part')
+    try:
+        with open(unfinished, 'xb') as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def labels(bags: Sequence[str]) -> list[str]:
+    """Name the recordings, all differently, for the names of output files."""
+    names = [Path(bag).resolve().name.split('.')[0] or 'bag' for bag in bags]
+    found: list[str] = []
+    for index, name in enumerate(names):
+        label = name
+        # A number may make it the name of another recording.
+        while names.count(label) > (label == name) or label in found:
+            label += f'_{index + 1}'
+        found.append(label)
+    return found
+
+
+def with_label(path: str | None, label: str) -> str | None:
+    """Put the name of a recording into that of a file."""
+    if not path or not label or not Path(path).name:
+        return path
+    return str(Path(path).with_stem(f'{Path(path).stem}_{label}'))
+
+
+def absolute(path: str | None, label: str) -> str | None:
+    """Return the same as it is named from any folder."""
+    return path and os.path.abspath(with_label(path, label) or '')
+
+
+def about(bag: str, text: str) -> str:
+    """Let a sentence on a recording begin with the path as it was given."""
+    from ins_align.recordings import one_line
+
+    path = Path(bag)
+    name, last = one_line(str(path)), one_line(path.name)
+    for begin in (name, last):
+        if begin and text.startswith((f'{begin} ', f'{begin}:')):
+            return name + text[len(begin):]
+    return f'{name}: {text}'
+
+
+def check_writable(path: str, inputs: Sequence[str]) -> None:
+    """Find out before the work whether its result can be written, and spoils no input."""
+    if path == STANDARD_OUTPUT:
+        return
+    target = Path(os.path.realpath(path))
+    folder = target.parent
+    if Path(path).exists() and not Path(path).is_file():
+        raise UsageError(f'cannot write {path}: it is a directory or a device, no file')
+    if spoilt := _spoilt(target, list(map(os.path.realpath, inputs))):
+        raise UsageError(f'cannot write {path}: {spoilt}, choose another name')
+    if not folder.is_dir():
+        raise UsageError(f'cannot write {path}: there is no directory {folder}')
+    if not os.access(folder, os.W_OK):
+        raise UsageError(f'cannot write {path}: no permission to write to {folder}')
+
+
+def _spoilt(target: Path, inputs: Sequence[str]) -> str:
+    """Say what would be lost if something were written there; both without links."""
+    from ins_align.recordings.bag import begins_like_a_recording, STORAGE_NAME
+
+    if str(target) in inputs:
+        return 'it is to be read'
+    if begins_like_a_recording(target):
+        return 'it is a recording and would be lost'
+    if str(target.parent) in inputs and (STORAGE_NAME.search(target.name)
+                                         or target.name == 'metadata.yaml'):
+        return 'it would become a part of the recording around it'
+    return ''
+
+
+def check_plot(path: str) -> None:
+    """Find out before the work whether a figure can be drawn in the format that is asked for."""
+    from importlib.util import find_spec
+
+    if Path(path).suffix.lower() not in PLOT_SUFFIXES:
+        raise UsageError(f'cannot draw {path}: its name must end with one of '
+                         f'{", ".join(PLOT_SUFFIXES)}')
+    if find_spec('matplotlib') is None:
+        raise UsageError('--plot needs matplotlib, which is not installed: '
+                         'pip install matplotlib')
