@@ -29,7 +29,8 @@ from ins_align.aligner import Aligner, Epoch, State
 from ins_align.config import Config
 from ins_align.experiments.bound import crossing_time
 from ins_align.experiments.common import (
-    config_for, error_of, exact_config_for, first_in, GRADES, parallel, Report)
+    BINS, combination, config_for, counted, error_of, exact_config_for, first_in, GRADES, JsonDict,
+    parallel, Report)
 from ins_align.simulation.simulate import epochs_of, SCENARIOS, simulate, Simulation
 import numpy as np
 
@@ -41,7 +42,6 @@ SILENT_DURATION = 600.0
 HORIZON = 120.0         # s; within this the bound has to cross the threshold
 THRESHOLD_DEG = 1.0
 WAIT_LIMIT = 1.5        # median over bound, the target
-BINS = (3.0, 5.0)
 HEADER = ('fault', 'runs', 'within 3 sigma', '3 to 5', 'beyond 5', 'not declared', 'worst, sigma',
           'worst, deg')
 # Seeds of the three parts do not meet.
@@ -52,8 +52,6 @@ SILENT_PART, TIME_PART = 80, 10
 # neither, but the defaults.
 TOLD: tuple[dict[str, Any] | None, ...] = ({}, {'trust_imu_axes': True}, None)
 DRAWN = 'simulate', 'config'        # `trial` draws them again from the index
-
-JsonDict = dict[str, Any]
 
 
 def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
@@ -94,11 +92,7 @@ def trial(index: int) -> JsonDict:
         `Config` that differ from what suits the simulation.
 
     """
-    # Every combination comes once before any comes twice.
-    combinations = list(itertools.product(FAULTS, SCENARIOS, GRADES))
-    turn, place = divmod(index, len(combinations))
-    order = np.random.default_rng(turn).permutation(len(combinations))
-    fault, scenario, grade = combinations[order[place]]
+    fault, scenario, grade = combination(index, [], FAULTS, SCENARIOS, GRADES)
     random = np.random.default_rng([1, index])
     lever = random.uniform(-1.5, 1.5, 3)
     arguments: JsonDict = {
@@ -239,16 +233,13 @@ def worse(result: JsonDict, moment: str, angle: str) -> float:
 
 def row(name: str, trials: list[JsonDict], moment: str, angle: str) -> list[Any]:
     """Return a row of a confusion table."""
-    sigmas = np.array([worse(t, moment, angle) for t in trials])
-    declared = sigmas >= 0
+    declared = [t for t in trials if t[moment] is not None]
+    sigmas = [worse(t, moment, angle) for t in declared]
     angles = slice(0, 2) if angle == 'tilt_sigmas' else slice(2, 3)
-    degrees = [np.max(np.abs(t[moment][which]['error_deg'][angles])) for t in trials
-               if t[moment] is not None for which in ('initial', 'current')]
-    return [name, len(trials), int(np.sum(declared & (sigmas <= BINS[0]))),
-            int(np.sum((sigmas > BINS[0]) & (sigmas <= BINS[1]))),
-            int(np.sum(sigmas > BINS[1])), int(np.sum(~declared)),
-            f'{sigmas.max():.1f}' if declared.any() else None,
-            f'{max(degrees):.2g}' if degrees else None]
+    degrees = [np.max(np.abs(t[moment][which]['error_deg'][angles])) for t in declared
+               for which in ('initial', 'current')]
+    return [name, len(trials), *counted(sigmas), len(trials) - len(declared),
+            f'{max(sigmas):.1f}' if sigmas else None, f'{max(degrees):.2g}' if degrees else None]
 
 
 # Part 2: silence
