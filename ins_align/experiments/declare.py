@@ -50,7 +50,7 @@ SILENT_SEED, TIME_SEED = 100_000, 200_000
 SILENT_PART, TIME_PART = 80, 10
 # What the aligner of the third part is told beside the very model of the simulation; None: that
 # neither, but the defaults.
-TOLD: tuple[dict[str, Any] | None, ...] = ({}, {'trust_imu_axes': True}, None)
+TOLD: tuple[dict[str, Any] | None, ...] = ({}, None)
 DRAWN = 'simulate', 'config'        # `trial` draws them again from the index
 
 
@@ -293,13 +293,10 @@ def time_to_heading(runs: int, jobs: int | None) -> list[JsonDict]:
     results = []
     for number, (scenario, grade, bound_s, unknown_s) in enumerate(reachable):
         first = len(TOLD) * number * runs
-        declared, trusted, by_default = (times[start:start + runs] for start in range(
-            first, first + len(TOLD) * runs, runs))
+        told, by_default = times[first:first + runs], times[first + runs:first + 2 * runs]
         results.append({'scenario': scenario, 'grade': grade, 'bound_s': bound_s,
-                        'bound_unknown_s': unknown_s, 'median_s': _median(declared),
-                        'ratio': _median(declared) / bound_s, 'declared_s': declared,
-                        'trusted_median_s': _median(trusted), 'trusted_s': trusted,
-                        'trusted_ratio': _median(trusted) / bound_s,
+                        'bound_unknown_s': unknown_s, 'median_s': _median(told),
+                        'ratio': _median(told) / bound_s, 'declared_s': told,
                         'default_median_s': _median(by_default), 'default_declared_s': by_default})
     return results
 
@@ -330,27 +327,21 @@ def time_table(report: Report, waits: list[JsonDict]) -> None:
         rows.append([wait['scenario'], wait['grade'], f"{wait['bound_s']:.1f}",
                      f"{wait['median_s']:.1f}", f"{wait['ratio']:.2f}",
                      sum(t is None for t in wait['declared_s']),
-                     f"{wait['trusted_median_s']:.1f}", f"{wait['trusted_ratio']:.2f}",
-                     sum(t is None for t in wait['trusted_s']),
                      None if unknown is None else f'{unknown:.1f}',
                      f"{wait['default_median_s']:.1f}",
                      None if unknown is None else f"{wait['default_median_s'] / unknown:.2f}",
                      sum(t is None for t in wait['default_declared_s'])])
-    met, trusted = (sum(wait[ratio] <= WAIT_LIMIT for wait in waits)
-                    for ratio in ('ratio', 'trusted_ratio'))
+    met = sum(wait['ratio'] <= WAIT_LIMIT for wait in waits)
     report.text(f'Time to a declared heading: the median is within {WAIT_LIMIT:g} times the '
                 f'bound in {met} of {len(waits)} cases in which the bound crosses '
-                f'{THRESHOLD_DEG:g} deg within {HORIZON:g} s (target: all); in {trusted} where '
-                'the axes of the IMU are said to be right (`trust_imu_axes`). The bound knows '
-                'that they are. Without being told, the aligner waits for motion that shows it: '
-                'a throw lies in a plane, and at rest a reversed axis cannot be told at all.')
+                f'{THRESHOLD_DEG:g} deg within {HORIZON:g} s (target: all). The bound knows that '
+                'the axes of the IMU are right; the aligner waits for motion that shows it.')
     report.table(
         f'Time to a declared heading of {THRESHOLD_DEG:g} deg: median of {runs} runs, and the '
         'time at which the Cramer-Rao bound crosses it. First with lever arm and delay known to '
-        'both and a threshold of 1 deg for the tilt too; then with `trust_imu_axes` besides; '
-        'then with all parameters at their '
+        'both and a threshold of 1 deg for the tilt too; then with all parameters at their '
         f'defaults, against the bound with lever arm and delay unknown ({default.lever_arm_std:g} '
         f'm, {default.gnss_delay_std:g} s). A declaration has to hold for {default.hold_time:g} s '
         'before it is made.', [
-            'scenario', 'IMU', 'bound, s', 'median, s', 'ratio', 'not declared', 'trusted, s',
-            'ratio', 'not declared', 'unknown, s', 'default, s', 'ratio', 'not declared'], rows)
+            'scenario', 'IMU', 'bound, s', 'median, s', 'ratio', 'not declared',
+            'unknown, s', 'default, s', 'ratio', 'not declared'], rows)
