@@ -127,7 +127,7 @@ def simulation_of(case: Case, seed: int) -> Simulation:
 
 
 def bounds_of(case: Case) -> tuple[Array, Array]:
-    """Bound of tilt (both axes) and heading in degrees, all times, with what the case leaves open."""
+    """Bound of tilt (both axes) and heading at all times, degrees, with the case's unknowns."""
     simulation = simulate(case.scenario, imu_grade=case.grade, duration=TIMES[-1] + 0.5,
                           **case.simulate)
     bound = dense.bound(simulation, use_velocity=not case.position_only,
