@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 import io
+import itertools
 import json
 import math
 import multiprocessing
@@ -39,6 +40,9 @@ import numpy as np
 LATENESS = 0.5
 GRADES = ('navigation', 'tactical', 'mems')
 COLOURS = 64        # of a figure
+BINS = (3.0, 5.0)   # sigmas that are counted
+
+JsonDict = dict[str, Any]
 
 
 def parallel(function: Callable[[Any], Any], tasks: Sequence[Any],
@@ -72,6 +76,28 @@ def parallel(function: Callable[[Any], Any], tasks: Sequence[Any],
             jobs, multiprocessing.get_context('spawn')) as pool:
         return shown(pool.map(function, tasks,
                               chunksize=max(1, min(10, len(tasks) // (4 * jobs)))))
+
+
+def combination(index: int, seed: Sequence[int], *axes: Iterable[Any]) -> Any:
+    """Return one of the combinations of `axes`; each comes once before any comes twice."""
+    combinations = list(itertools.product(*axes))
+    turn, place = divmod(index, len(combinations))
+    order = np.random.default_rng([*seed, turn]).permutation(len(combinations))
+    return combinations[order[place]]
+
+
+def setup(random: np.random.Generator) -> JsonDict:
+    """Draw heading, latitude, lever arm and mount as arguments of `simulate`."""
+    return {'heading_deg': random.uniform(-180, 180), 'latitude_deg': random.uniform(-75, 75),
+            'lever_arm': random.uniform(-1.5, 1.5, 3).tolist(),
+            'mount_rpy_deg': random.uniform(-20, 20, 3).tolist()}
+
+
+def counted(sigmas: Any) -> list[int]:
+    """Count errors within the first of `BINS`, between them, and beyond the second."""
+    sigmas = np.asarray(sigmas, dtype=float)
+    return [int(np.sum(sigmas <= BINS[0])), int(np.sum((sigmas > BINS[0]) & (sigmas <= BINS[1]))),
+            int(np.sum(sigmas > BINS[1]))]
 
 
 def config_for(simulation: Simulation, **changes: Any) -> Config:

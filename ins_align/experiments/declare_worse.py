@@ -27,8 +27,9 @@ from typing import Any
 
 from ins_align.aligner import Aligner, State
 from ins_align.config import PRESETS
-from ins_align.experiments.common import config_for, first_in, parallel, Report
-from ins_align.experiments.declare import BINS, JsonDict, judged, worse
+from ins_align.experiments.common import (
+    BINS, combination, config_for, first_in, JsonDict, parallel, Report, setup)
+from ins_align.experiments.declare import judged, worse
 from ins_align.simulation.simulate import epochs_of, SCENARIOS, simulate
 import numpy as np
 
@@ -66,17 +67,10 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
 
 def drawn(seed: int) -> JsonDict:
     """Return what a seed stands for: ``faults``, ``scenario``, the arguments of `simulate`."""
-    # Every combination comes once before any comes twice.
-    combinations = list(itertools.product(COMBINATIONS, SCENARIOS))
-    turn, place = divmod(seed, len(combinations))
-    faults, scenario = combinations[
-        np.random.default_rng([3, turn]).permutation(len(combinations))[place]]
+    faults, scenario = combination(seed, [3], COMBINATIONS, SCENARIOS)
     random = np.random.default_rng([4, seed])
     return {'seed': seed, 'faults': faults, 'scenario': scenario, 'simulate': {
-        'seed': seed, 'duration': DURATION, 'heading_deg': random.uniform(-180, 180),
-        'latitude_deg': random.uniform(-75, 75),
-        'lever_arm': random.uniform(-1.5, 1.5, 3).tolist(),
-        'mount_rpy_deg': random.uniform(-20, 20, 3).tolist(),
+        'seed': seed, 'duration': DURATION, **setup(random),
         'stand_still': STAND_STILL * random.integers(2)}}
 
 

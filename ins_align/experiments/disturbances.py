@@ -25,12 +25,10 @@ from itertools import pairwise
 import math
 
 from ins_align.config import PRESETS
-from ins_align.experiments.spoilt import SECOND, Stream
+from ins_align.experiments.spoilt import Random, SECOND, Stream
 from ins_align.geometry.rotation import Array
 from ins_align.simulation.trajectory import displaced
 import numpy as np
-
-Random = np.random.Generator
 
 
 def _time(rows: np.ndarray, stream: Stream) -> Array:

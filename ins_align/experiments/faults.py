@@ -20,7 +20,6 @@ that is not counted; and what is declared all the same has to be right.
 
 from __future__ import annotations
 
-import itertools
 import math
 from pathlib import Path
 import pickle
@@ -32,14 +31,14 @@ import warnings
 
 from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
-from ins_align.experiments.common import config_for, error_of, GRADES, parallel, Report
+from ins_align.experiments.common import (
+    BINS, combination, config_for, counted, error_of, GRADES, JsonDict, parallel, Report, setup)
 from ins_align.experiments.spoilt import FAULTS, SECOND, Stream, stream_of
 from ins_align.gnss.messages import fix_from_msg, imu_from_msg, MessageError, velocity_from_msg
 from ins_align.simulation.simulate import SCENARIOS, simulate, Simulation
 import numpy as np
 
 DURATION = 60.0
-BINS = (3.0, 5.0)
 UPDATE_EVERY = 1.0  # s
 WEIGH_EVERY = 5     # updates
 # What an aligner may hold, pickled; the largest part does not depend on the data.
@@ -51,8 +50,6 @@ HEADER = ('fault', 'runs', 'exceptions', 'non-finite', 'miscounted', 'declared',
           '3 to 5', 'beyond 5', 'worst, sigma', 'aligned beyond 5, s', 'held, MB')
 # `trial` draws the first three again from the index; the counts are only looked at.
 OMITTED = 'simulate', 'config', 'frame', 'counts'
-
-JsonDict = dict[str, Any]
 
 
 def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
@@ -72,17 +69,9 @@ def trial(index: int) -> JsonDict:
         velocities and those parameters of `Config` that differ from what suits the simulation.
 
     """
-    # Every combination comes once before any comes twice.
-    combinations = list(itertools.product(FAULTS, SCENARIOS, GRADES))
-    turn, place = divmod(index, len(combinations))
-    order = np.random.default_rng([3, turn]).permutation(len(combinations))
-    fault, scenario, grade = combinations[order[place]]
+    fault, scenario, grade = combination(index, [3], FAULTS, SCENARIOS, GRADES)
     random = np.random.default_rng([4, index])
-    arguments = {
-        'imu_grade': grade, 'seed': index, 'duration': DURATION,
-        'heading_deg': random.uniform(-180, 180), 'latitude_deg': random.uniform(-75, 75),
-        'lever_arm': random.uniform(-1.5, 1.5, 3).tolist(),
-        'mount_rpy_deg': random.uniform(-20, 20, 3).tolist()}
+    arguments = {'imu_grade': grade, 'seed': index, 'duration': DURATION, **setup(random)}
     config = {'gnss_lateness': Config().gnss_lateness, 'velocity_type': str(random.choice(
         ['TwistWithCovarianceStamped', 'TwistStamped', 'Odometry']))}
     return {'index': index, 'fault': fault, 'scenario': scenario, 'simulate': arguments,
@@ -351,8 +340,7 @@ def row(name: str, trials: list[JsonDict]) -> list[Any]:
     return [name, len(trials), sum(bool(t['exception']) for t in trials),
             sum(bool(t['non_finite']) for t in trials),
             sum(bool(t.get('miscounted')) for t in trials), int(np.sum(declared)),
-            int(np.sum(sigmas <= BINS[0])), int(np.sum((sigmas > BINS[0]) & (sigmas <= BINS[1]))),
-            int(np.sum(sigmas > BINS[1])),
+            *counted(sigmas),
             f'{sigmas[declared].max():.1f}' if declared.any() else None,
             f"{max(t.get('wrong_s', 0.0) for t in trials):.1f}",
             f"{np.median([t['held'] for t in trials]) * 1e-6:.2f}"]
@@ -363,7 +351,6 @@ def write(out: Path, trials: list[JsonDict]) -> None:
     report = Report('faults', 'What drivers get wrong', out, f' --runs {len(trials)}')
     total = row('all', trials)
     numbers = dict(zip(HEADER, total))
-    held = max(t['held'] for t in trials)
     report.text(
         f'{len(trials)} runs of {DURATION:g} s over {len(FAULTS)} faults, all scenarios '
         f'({", ".join(SCENARIOS)}) and grades of IMU, with random heading, latitude, mount, '
@@ -375,28 +362,18 @@ def write(out: Path, trials: list[JsonDict]) -> None:
         'number that is not finite or an attitude that is no rotation, in '
         f"{numbers['miscounted']} the counters do not fit what was sent, "
         f"{sum(bool(t['warnings']) for t in trials)} made numpy warn (target: none). An aligner "
-        f'never held more than {held * 1e-6:.2f} MB (pickled, every {WEIGH_EVERY} updates; '
-        f'limit {MAX_HELD * 1e-6:g}); the resident memory of the process that ran them grew to '
-        f"{max(t['resident_kb'] for t in trials) / 1024:.0f} MB, after the first tenth of the "
-        f'runs it was {_early_resident(trials) / 1024:.0f} MB.')
-    report.text(
-        f"{numbers['declared']} runs were declared ALIGNED at some time. The error is the "
-        'largest, in stated sigmas, of tilt and heading, of the attitude at t0 and the current '
-        'one, at each declaration and at the end where that is still ALIGNED. The time is that '
-        f'during which, within a run, the current attitude was beyond {BINS[1]:g} sigma and '
-        'still called aligned, the longest.')
-    beyond = '; '.join(
-        f'of {len(found)} {where} {_beyond(found, 0)} in tilt and {_beyond(found, 1)} in heading'
-        for where, found in (
-            ('declarations', [moment for t in trials for moment in t.get('declared', [])]),
-            ('runs still aligned at the end', [t['final'] for t in trials if t.get('final')])))
+        f"never held more than {max(t['held'] for t in trials) * 1e-6:.2f} MB (pickled, every "
+        f'{WEIGH_EVERY} updates; limit {MAX_HELD * 1e-6:g}); the processes that ran them grew to '
+        f"{max(t['resident_kb'] for t in trials) / 1024:.0f} MB.")
     share = numbers['3 to 5'] + numbers['beyond 5']
     report.text(
-        f"{share} of the {numbers['declared']} "
-        f"({share / max(numbers['declared'], 1):.1%}) were beyond {BINS[0]:g} sigma at any of "
-        f"these moments, {numbers['beyond 5']} beyond {BINS[1]:g} (target: at most 1 % and "
-        f'none). Beyond {BINS[0]:g}, {beyond}. Normal errors of just the stated sigmas would be '
-        'so at any one moment in 0.5 % in tilt, the worse of two axes, and in 0.3 % in heading.')
+        f"{numbers['declared']} runs were declared ALIGNED at some time, {share} of them "
+        f"({share / max(numbers['declared'], 1):.1%}) beyond {BINS[0]:g} sigma, "
+        f"{numbers['beyond 5']} beyond {BINS[1]:g} (target: at most 1 % and none). The error is "
+        'the largest, in stated sigmas, of tilt and heading, of the attitude at t0 and the '
+        'current one, at each declaration and at the end where that is still ALIGNED. The time '
+        f'is that during which, within a run, the current attitude was beyond {BINS[1]:g} sigma '
+        'and still called aligned, the longest.')
     report.table('What became of it, by fault', HEADER, [
         *(row(name, chosen) for name in FAULTS
           if (chosen := [t for t in trials if t['fault'] == name])), total])
@@ -415,14 +392,3 @@ def write(out: Path, trials: list[JsonDict]) -> None:
         report.table('What broke', ['index', 'fault', 'scenario', 'IMU', 'what'], broken)
     report.write({'runs': len(trials), 'trials': [
         {key: value for key, value in t.items() if key not in OMITTED} for t in trials]})
-
-
-def _beyond(moments: list[JsonDict], angle: int) -> int:
-    """Count the moments at which an angle, 0 tilt, 1 heading, is beyond the first of `BINS`."""
-    return sum(max(moment[name][angle] for name in ('initial', 'current')) > BINS[0]
-               for moment in moments)
-
-
-def _early_resident(trials: list[JsonDict]) -> float:
-    """Kilobytes after a tenth of the runs."""
-    return float(max(t['resident_kb'] for t in trials[:max(1, len(trials) // 10)]))

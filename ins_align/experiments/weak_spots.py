@@ -31,7 +31,7 @@ from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
 from ins_align.experiments import disturbances as of
 from ins_align.experiments import recordings
-from ins_align.experiments.common import config_for, error_of, parallel, Report
+from ins_align.experiments.common import BINS, config_for, error_of, JsonDict, parallel, Report
 from ins_align.experiments.spoilt import SECOND, Stream, stream_of
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.messages import Fix, Velocity
@@ -43,12 +43,10 @@ DURATION = 90.0         # s, unless a case says otherwise
 LOT = 100               # IMU samples given at once
 UPDATE_EVERY = 5.0      # s
 LONGEST = 5.0           # s that an epoch stands for
-BINS = (3.0, 5.0)
 RECORDING, STARTS = 'car_drive0708', (0.0, 100.0, 200.0, 300.0, 400.0)      # s
 HEADER = ('case', 'runs', 'declared', 'at the end', 'declared beyond 3', 'beyond 3', 'beyond 5',
           'beyond 5, s', 'worst, sigma', 'heading, deg', 'aligned, %', 'after, s')
 
-JsonDict = dict[str, Any]
 Message = tuple[int, str, Any]      # when it arrives, ns, what it is, and itself
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 import dataclasses
 from dataclasses import dataclass
+from functools import partial
 import math
 from numbers import Real
 import reprlib
@@ -48,8 +49,8 @@ class SimulationError(ValueError):
     """A simulation cannot be made as asked; the text says why."""
 
 
-def _argument(default: Any, text: str, unit: str = '', minimum: float = -math.inf,
-              maximum: float = math.inf, *, group: str = '', names: tuple[str, ...] = (),
+def _argument(default: Any, text: str, unit: str = '', minimum: float = 0.0,
+              maximum: float = math.inf, *, group: str, names: tuple[str, ...] = (),
               choices: tuple[Any, ...] = ()) -> Any:
     """Describe a number, as many numbers as `names`, or one of `choices`; None means optional."""
     return dataclasses.field(default=default, metadata={
@@ -57,19 +58,7 @@ def _argument(default: Any, text: str, unit: str = '', minimum: float = -math.in
         'names': names, 'choices': choices})
 
 
-def _imu(default: Any, text: str, unit: str = '', minimum: float = 0.0,
-         maximum: float = math.inf, **options: Any) -> Any:
-    return _argument(default, text, unit, minimum, maximum, group='IMU', **options)
-
-
-def _gnss(default: Any, text: str, unit: str = '', minimum: float = 0.0,
-          maximum: float = math.inf, **options: Any) -> Any:
-    return _argument(default, text, unit, minimum, maximum, group='GNSS', **options)
-
-
-def _motion(default: Any, text: str, unit: str = 'deg', minimum: float = -math.inf,
-            maximum: float = math.inf) -> Any:
-    return _argument(default, text, unit, minimum, maximum, group='motion')
+_imu, _motion, _gnss = (partial(_argument, group=group) for group in ('IMU', 'motion', 'GNSS'))
 
 
 @dataclass(frozen=True)
@@ -135,12 +124,13 @@ class Arguments:
     accel_sign: int = _imu(1, '-1: the accelerometers have the sign of gravity', choices=(1, -1))
 
     latitude_deg: float = _motion(48.0, 'where it starts', 'deg', -89.0, 89.0)
-    longitude_deg: float = _motion(11.0, 'where it starts')
+    longitude_deg: float = _motion(11.0, 'where it starts', 'deg', -math.inf)
     altitude: float = _motion(300.0, 'where it starts', 'm', -1e3, 1e5)
     heading_deg: float = _motion(
-        0.0, 'turns the trajectory: course of the start, counter-clockwise from east')
-    crab_deg: float = _motion(0.0, 'the nose points so far left of the course')
-    stand_still: float = _motion(0.0, 'at rest before setting off', 's', 0.0)
+        0.0, 'turns the trajectory: course of the start, counter-clockwise from east', 'deg',
+        -math.inf)
+    crab_deg: float = _motion(0.0, 'the nose points so far left of the course', 'deg', -math.inf)
+    stand_still: float = _motion(0.0, 'at rest before setting off', 's')
 
     gnss_rate: float = _gnss(5.0, 'epochs per second', 'Hz', 1e-3, 1e4)
     gnss_phase: float = _gnss(0.0137, 'stamp of the first epoch; by default no IMU sample is at '

@@ -22,9 +22,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-import itertools
+import heapq
 import json
 import math
+from operator import itemgetter
 import os
 from pathlib import Path
 import tempfile
@@ -40,6 +41,10 @@ import numpy as np
 
 SCENARIOS = tuple(scenarios.SCENARIOS)
 STORAGES = ('mcap', 'sqlite3')
+TOPICS = {'/imu/data_raw': 'sensor_msgs/msg/Imu', '/reference/imu': 'sensor_msgs/msg/Imu',
+          '/fix': 'sensor_msgs/msg/NavSatFix',
+          '/fix_velocity': 'geometry_msgs/msg/TwistWithCovarianceStamped',
+          '/tf_static': 'tf2_msgs/msg/TFMessage'}
 
 _TRUTH_STD = 1e-6  # rad, stated on the reference topic: zero would mean unknown
 
@@ -142,30 +147,13 @@ FEED_BLOCK = 200
 
 def feed(aligner: Any, simulation: Simulation, *, fix: bool = True,
          velocity: bool = True) -> list[Any]:
-    """
-    Give a whole recording to an aligner in the order of arrival.
-
-    Parameters
-    ----------
-    aligner : Aligner
-        Or whatever has its methods.
-    simulation : Simulation
-        What to give it.
-    fix, velocity : bool
-        Leave out positions or velocities.
-
-    Returns
-    -------
-    list of Epoch
-        Of every update and the final flush.
-
-    """
+    """Give a whole recording to an aligner; return the epochs of all updates (see `epochs_of`)."""
     return list(epochs_of(aligner, simulation, fix=fix, velocity=velocity))
 
 
 def epochs_of(aligner: Any, simulation: Simulation, *, fix: bool = True,
               velocity: bool = True) -> Iterator[Any]:
-    """Do as `feed`, and yield the epochs as they come."""
+    """Feed an aligner in the order of arrival, and yield the epochs as they come."""
     for count, (kind, payload) in enumerate(simulation.messages()):
         if kind == 'imu' or (fix if kind == 'fix' else velocity):
             give(aligner, kind, payload)
@@ -217,7 +205,7 @@ def simulate(scenario: str, **options: Any) -> Simulation:
     return Simulation(
         truth_stamps_ns=trajectory.stamps_ns, truth_C_nb=trajectory.C_nv @ C_vb,
         truth_velocity=trajectory.velocity, truth_lla=trajectory.lla, lever_arm=lever_b,
-        meta=vars(asked), _trajectory=trajectory, _C_vb=C_vb,
+        meta=dict(vars(asked)), _trajectory=trajectory, _C_vb=C_vb,
         **_imu(asked, trajectory, C_vb, streams),
         **_gnss(asked, trajectory, C_vb, lever_b, streams))
 
@@ -375,24 +363,25 @@ def _write_messages(simulation: Simulation, path: Path, storage: str, tf: bool) 
             {**simulation.meta, 'gyro_bias': simulation.gyro_bias,
              'accel_bias': simulation.accel_bias}, default=lambda value: value.tolist()))
         connections = {}
-        for topic, message_type, stamp, message in itertools.chain(
-                _static_transforms(simulation, typestore.types) if tf else (),
-                _ros_messages(simulation, typestore.types)):
+        streams = _ros_messages(simulation, typestore.types)
+        if tf:
+            streams.insert(0, _static_transforms(simulation, typestore.types))
+        for arrival, topic, message in heapq.merge(*streams, key=itemgetter(0)):
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, message_type,
+                connections[topic] = writer.add_connection(topic, TOPICS[topic],
                                                            typestore=typestore)
-            writer.write(connections[topic], stamp,
-                         typestore.serialize_cdr(message, message_type))
+            writer.write(connections[topic], arrival,
+                         typestore.serialize_cdr(message, TOPICS[topic]))
 
 
-def _static_transforms(simulation: Simulation, types: Any) -> Iterator[tuple[str, str, int, Any]]:
-    """Yield what a robot publishes of its model: topic, type, time and message."""
+def _static_transforms(simulation: Simulation, types: Any) -> Iterator[tuple[int, str, Any]]:
+    """Yield what a robot publishes of its model: time, topic and message."""
     start = int(simulation.imu_stamps_ns[0])
     vector, turn = types['geometry_msgs/msg/Vector3'], types['geometry_msgs/msg/Quaternion']
     header = types['std_msgs/msg/Header'](
         types['builtin_interfaces/msg/Time'](*divmod(start, 1_000_000_000)), 'base_link')
     C_vb = simulation._C_vb
-    yield '/tf_static', 'tf2_msgs/msg/TFMessage', start, types['tf2_msgs/msg/TFMessage']([
+    yield start, '/tf_static', types['tf2_msgs/msg/TFMessage']([
         types['geometry_msgs/msg/TransformStamped'](
             header, child, types['geometry_msgs/msg/Transform'](
                 vector(*translation.tolist()), turn(*quaternion_from_matrix(C).tolist())))
@@ -400,86 +389,77 @@ def _static_transforms(simulation: Simulation, types: Any) -> Iterator[tuple[str
                                       ('gnss', C_vb @ simulation.lever_arm, np.eye(3)))])
 
 
-def _ros_messages(simulation: Simulation, types: Any) -> Iterator[tuple[str, str, int, Any]]:
-    """Yield topic, type, time of arrival and message in the order of arrival."""
-    imu_type, fix_type = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
-    velocity_type = 'geometry_msgs/msg/TwistWithCovarianceStamped'
-    make_imu, make_fix, make_velocity = types[imu_type], types[fix_type], types[velocity_type]
-    make_vector = types['geometry_msgs/msg/Vector3']
-    make_quaternion = types['geometry_msgs/msg/Quaternion']
+def _ros_messages(simulation: Simulation, types: Any) -> list[Iterator[tuple[int, str, Any]]]:
+    """Return times of arrival, topics and messages: one iterator for IMU, one for GNSS."""
+    make_imu, make_fix, make_velocity = (
+        types[TOPICS[topic]] for topic in ('/imu/data_raw', '/fix', '/fix_velocity'))
+    make_vector, make_quaternion, make_twist, make_covariance = (
+        types[f'geometry_msgs/msg/{name}']
+        for name in ('Vector3', 'Quaternion', 'Twist', 'TwistWithCovariance'))
     make_status = types['sensor_msgs/msg/NavSatStatus']
-    make_twist = types['geometry_msgs/msg/Twist']
-    make_twist_covariance = types['geometry_msgs/msg/TwistWithCovariance']
+    make_header, make_time = types['std_msgs/msg/Header'], types['builtin_interfaces/msg/Time']
 
     def header(stamp: int, frame: str) -> Any:
-        seconds, nanoseconds = divmod(stamp, 1_000_000_000)
-        return types['std_msgs/msg/Header'](
-            types['builtin_interfaces/msg/Time'](seconds, nanoseconds), frame)
+        return make_header(make_time(*divmod(stamp, 1_000_000_000)), frame)
 
-    unknown = np.array([-1.0] + 8 * [0.0])
-    exact = np.zeros(9)
-    gyro_covariance = (simulation.gyro_std ** 2 * np.eye(3)).ravel()
-    accel_covariance = (simulation.accel_std ** 2 * np.eye(3)).ravel()
-    truth_covariance = (_TRUTH_STD ** 2 * np.eye(3)).ravel()
-    no_attitude, no_vector = make_quaternion(0.0, 0.0, 0.0, 1.0), make_vector(0.0, 0.0, 0.0)
-    quaternions = quaternion_from_matrix(simulation.truth_C_nb)
-    twist_covariance = np.zeros((6, 6))
-    twist_covariance[:3, :3] = simulation.velocity_covariance
-    velocity_frame = simulation.meta['velocity_frame']
+    def diagonal(std: float) -> Array:
+        return (std ** 2 * np.eye(3)).ravel()
 
-    sample = epoch = 0
-    for kind, payload in simulation.messages():
-        if kind == 'imu':
-            for stamp, gyro, accel in zip(*map(np.ndarray.tolist, payload)):
-                yield '/imu/data_raw', imu_type, stamp, make_imu(
-                    header(stamp, 'imu'), no_attitude, unknown, make_vector(*gyro),
-                    gyro_covariance, make_vector(*accel), accel_covariance)
-                yield '/reference/imu', imu_type, stamp, make_imu(
-                    header(stamp, 'imu'), make_quaternion(*quaternions[sample].tolist()),
-                    truth_covariance, make_vector(*simulation.truth_gyro[sample].tolist()), exact,
-                    make_vector(*simulation.truth_accel[sample].tolist()), exact)
-                sample += 1
-            continue
-        arrival = int(simulation.gnss_arrival_ns[epoch])
-        if kind == 'fix':
-            yield '/fix', fix_type, arrival, make_fix(
-                header(payload.stamp_ns, 'gnss'), make_status(payload.status, 1),
-                payload.latitude_deg, payload.longitude_deg, payload.altitude_m,
-                payload.covariance.ravel(), make_fix.COVARIANCE_TYPE_KNOWN)
-        else:
-            yield '/fix_velocity', velocity_type, arrival, make_velocity(
-                header(payload.stamp_ns, velocity_frame), make_twist_covariance(
-                    make_twist(make_vector(*payload.velocity.tolist()), no_vector),
-                    twist_covariance.ravel()))
-            epoch += 1
+    def imu() -> Iterator[tuple[int, str, Any]]:
+        unknown, exact, truth = np.array([-1.0] + 8 * [0.0]), np.zeros(9), diagonal(_TRUTH_STD)
+        gyro_covariance, accel_covariance = map(diagonal,
+                                                (simulation.gyro_std, simulation.accel_std))
+        no_attitude = make_quaternion(0.0, 0.0, 0.0, 1.0)
+        for stamp, attitude, gyro, accel, true_gyro, true_accel in zip(*(
+                values.tolist() for values in (
+                    simulation.imu_stamps_ns, quaternion_from_matrix(simulation.truth_C_nb),
+                    simulation.gyro, simulation.accel, simulation.truth_gyro,
+                    simulation.truth_accel)), strict=True):
+            yield stamp, '/imu/data_raw', make_imu(
+                header(stamp, 'imu'), no_attitude, unknown, make_vector(*gyro), gyro_covariance,
+                make_vector(*accel), accel_covariance)
+            yield stamp, '/reference/imu', make_imu(
+                header(stamp, 'imu'), make_quaternion(*attitude), truth, make_vector(*true_gyro),
+                exact, make_vector(*true_accel), exact)
+
+    def gnss() -> Iterator[tuple[int, str, Any]]:
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = simulation.velocity_covariance
+        position_covariance = simulation.position_covariance.ravel()
+        for stamp, arrival, lla, velocity in zip(*(values.tolist() for values in (
+                simulation.gnss_stamps_ns, simulation.gnss_arrival_ns, simulation.lla_deg,
+                simulation.velocity)), strict=True):
+            yield arrival, '/fix', make_fix(
+                header(stamp, 'gnss'), make_status(0, 1), *lla, position_covariance,
+                make_fix.COVARIANCE_TYPE_KNOWN)
+            yield arrival, '/fix_velocity', make_velocity(
+                header(stamp, simulation.meta['velocity_frame']), make_covariance(
+                    make_twist(make_vector(*velocity), make_vector(0.0, 0.0, 0.0)),
+                    covariance.ravel()))
+
+    return [imu(), gnss()]
 
 
 def _parameter_file(simulation: Simulation) -> str:
     """Return the node's YAML with what is known of the recording."""
     meta, noise = simulation.meta, simulation.imu_noise
-    values = {
-        'lever_arm': simulation.lever_arm.tolist(),
-        'gnss_delay': float(meta['gnss_delay']),
-        'velocity_frame': meta['velocity_frame'],
-    }
+    values = {'lever_arm': simulation.lever_arm.tolist(), 'gnss_delay': float(meta['gnss_delay']),
+              'velocity_frame': meta['velocity_frame']}
     lateness = float(meta['gnss_latency']) + LATENESS_MARGIN
     if lateness > Config.gnss_lateness:
         values['gnss_lateness'] = lateness
     preset = PRESETS.get(meta['imu_grade'])
-    if preset is not None:
-        values['imu_grade'] = meta['imu_grade']
-    else:
-        values['imu_grade'] = 'custom'
+    values['imu_grade'] = meta['imu_grade'] if preset else 'custom'
+    if preset is None:
         values['angle_random_walk'] = math.degrees(noise.angle_random_walk) * 60
         values['velocity_random_walk'] = noise.velocity_random_walk * 60
     if preset is None or noise[:4] != preset[:4]:
         values['gyro_bias_std'] = math.degrees(noise.gyro_bias_std)
         values['accel_bias_std'] = float(noise.accel_bias_std)
-    if not meta['ideal']:
-        usual = preset or ImuNoise(0.0, 0.0, 0.0, 0.0)
-        if noise.gyro_scale_std > usual.gyro_scale_std:
-            values['gyro_scale_std'] = float(noise.gyro_scale_std)
-        if noise.rate_random_walk > usual.rate_random_walk:
-            values['rate_random_walk'] = math.degrees(noise.rate_random_walk) * 60
+    usual = preset or ImuNoise(0.0, 0.0, 0.0, 0.0)
+    if noise.gyro_scale_std > usual.gyro_scale_std and not meta['ideal']:
+        values['gyro_scale_std'] = float(noise.gyro_scale_std)
+    if noise.rate_random_walk > usual.rate_random_walk and not meta['ideal']:
+        values['rate_random_walk'] = math.degrees(noise.rate_random_walk) * 60
     return ''.join(['ins_align:\n  ros__parameters:\n',
                     *(f'    {name}: {value}\n' for name, value in values.items())])
