@@ -90,7 +90,8 @@ def test_a_worker_dies(cluster, flight, tmp_path, capsys, monkeypatch):
     assert not list(tmp_path.glob('.*.part'))
 
 
-def test_no_cluster_there(flight, capsys):
+def test_no_cluster_there(flight, capsys, monkeypatch):
+    monkeypatch.setattr('ins_align.batch.CONNECT_TIMEOUT', 0.5)
     assert main(['replay', str(flight), '--dask', 'tcp://127.0.0.1:9']) == 2
     error = capsys.readouterr().err
     assert 'no Dask scheduler answers at tcp://127.0.0.1:9' in error
