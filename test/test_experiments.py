@@ -91,23 +91,40 @@ def test_trials_are_repeatable_and_cover_everything():
     assert len(seen) == combinations
 
 
-def test_imus_worse_than_configured(tmp_path, capsys):
+def test_every_combination_of_faults_is_drawn_once():
     names = {fault for combination in declare_worse.COMBINATIONS for fault in combination}
+    assert names == set(declare_worse.FAULTS)
     seeds = range(len(declare_worse.COMBINATIONS) * len(declare_worse.SCENARIOS))
     drawn = [declare_worse.drawn(seed) for seed in seeds]
+    assert drawn[7] == declare_worse.drawn(7)
     assert len({(d['faults'], d['scenario']) for d in drawn}) == len(drawn)
-    assert names == set(declare_worse.FAULTS)
-    clean = declare_worse.run_one(5, faults=(), scenario='flight')
-    assert clean == declare_worse.run_one(5, faults=(), scenario='flight')
-    assert clean['aligned']['current']['heading_sigmas'] < 5
-    biased = [declare_worse.run_one(seed, faults=('accelerometer bias x 10',), scenario='static',
-                                    trust_imu_axes=True) for seed in range(3)]
-    # Ten times 0.05 m/s^2 is some degrees of tilt, of which the aligner knows nothing.
-    assert max(np.abs(r['levelled']['initial']['error_deg'][:2]).max() for r in biased
-               if r['levelled'] is not None) > 1.0
-    declare_worse.write(tmp_path, [clean, *biased])
-    assert '100.0 %' in capsys.readouterr().out
-    assert len(json.loads((tmp_path / 'declare-worse.json').read_text())['runs']) == 4
+
+
+def test_imus_worse_than_configured(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(declare_worse, 'DURATION', 16.0)
+    monkeypatch.setattr(declare_worse, 'STAND_STILL', 0.0)
+    clean = declare_worse.run_one(5, faults=(), scenario='car')
+    assert clean == declare_worse.run_one(5, faults=(), scenario='car')
+    assert clean['levelled']['current']['tilt_sigmas'] < 5
+    noisy = declare_worse.run_one(5, faults=('noise x 3',), scenario='car')
+    assert noisy['simulate'] == clean['simulate'] and noisy['levelled'] != clean['levelled']
+    declare_worse.write(tmp_path, [clean])
+    assert 'Beyond 3 sigma' in capsys.readouterr().out
+    assert len(json.loads((tmp_path / 'declare-worse.json').read_text())['runs']) == 1
+
+
+def test_shares_beyond_the_limits(tmp_path, capsys):
+    def result(faults, sigma):
+        angles = {'tilt_sigmas': sigma, 'heading_sigmas': 0.5}
+        return {'seed': 1, 'faults': faults, 'scenario': 'car', 'aligned': None,
+                'levelled': {'t_s': 4.0, 'initial': angles, 'current': angles}}
+    fault = next(iter(declare_worse.FAULTS))
+    declare_worse.write(tmp_path, [result((), 1.0), result((), 4.0), result((fault,), 6.0)])
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    none = next(line for line in lines if line[:1] == ['none'])
+    assert none[1:12] == '2 2 4.0 50.0 % 0.0 % 0.0 % 0.0 %'.split()
+    alone = next(line for line in lines if line[:len(fault.split())] == fault.split())
+    assert alone[len(fault.split()):][3:7] == '100.0 % 100.0 %'.split()
 
 
 def test_a_declared_trial_is_judged_against_the_truth(monkeypatch):

@@ -70,9 +70,8 @@ class Bound:
         return self.covariance[np.searchsorted(self.time, seconds + 1e-6) - 1]
 
 
-def bound(simulation: Simulation, *, noise: ImuNoise | None = None, use_velocity: bool = True,
-          use_position: bool = False, lever_arm_std: float = 0.0,
-          delay_std: float = 0.0) -> Bound:
+def bound(simulation: Simulation, *, use_velocity: bool = True, use_position: bool = False,
+          lever_arm_std: float = 0.0, delay_std: float = 0.0) -> Bound:
     """
     Cramer-Rao bound on the true motion of a simulation.
 
@@ -80,8 +79,6 @@ def bound(simulation: Simulation, *, noise: ImuNoise | None = None, use_velocity
     ----------
     simulation : Simulation
         Its truth, epochs and stated covariances are used; its noise is not.
-    noise : ImuNoise, optional
-        By default that of the simulation.
     use_velocity, use_position : bool
         Which measurements count.
     lever_arm_std, delay_std : float
@@ -92,7 +89,7 @@ def bound(simulation: Simulation, *, noise: ImuNoise | None = None, use_velocity
     Bound
 
     """
-    noise = simulation.imu_noise if noise is None else noise
+    noise = simulation.imu_noise
     epochs = _true_epochs_ns(simulation)
     path = _true_path(simulation, epochs)
     H = design_of(path, simulation.lever_arm)
