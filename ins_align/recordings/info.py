@@ -201,12 +201,11 @@ class _Survey:
 
     def _exchanged(self, data: Recorded) -> str:
         """Say that latitude and longitude are exchanged, and exchange them for the rest."""
-        fault = next(filter(None, (
-            exchange_fault(data.series(), velocity.series())
-            for velocity in self._of('velocity') if velocity.usable.any())), '')
-        if fault:
-            data.values = data.values[:, [1, 0, 2]]
-        return fault
+        for velocity in self._of('velocity'):
+            if fault := exchange_fault(data.series(), velocity.series()):
+                data.values = data.values[:, [1, 0, 2]]
+                return fault
+        return ''
 
     def _velocity(self, data: Recorded, positions: Series) -> TopicInfo:
         faults = []
@@ -262,11 +261,10 @@ class _Survey:
         samples = self._data[imu.kind, imu.name]
         newest = np.maximum.accumulate(samples.stamps_ns[samples.usable])
         late = [np.zeros(0)]
-        for data in (self._data[topic.kind, topic.name] for topic in gnss):
+        for data in (self._data[topic.kind, topic.name] for topic in gnss if newest.size):
             before = np.searchsorted(samples.recorded_ns[samples.usable],
                                      data.recorded_ns[data.usable]) - 1
-            if newest.size:
-                late.append((newest[before] - data.stamps_ns[data.usable])[before >= 0] * 1e-9)
+            late.append((newest[before] - data.stamps_ns[data.usable])[before >= 0] * 1e-9)
         lateness = np.concatenate(late)
         return float(np.quantile(lateness, 0.99)) if lateness.size else None
 
@@ -301,10 +299,10 @@ class _Survey:
             self._advise(True, 'there is no velocity that can be used: it is aligned from '
                          'positions alone, which takes longer unless they are RTK')
             return
-        name = velocity.frame.frame
+        name, data = velocity.frame.frame, self._data[velocity.kind, velocity.name]
         self._advise(name == 'unknown', 'nothing tells the frame of the velocity (too little '
                      'motion): it is taken as east-north-up')
-        self._advise(name == 'ned' or name == 'enu' and self._data[velocity.kind, velocity.name].refused,
+        self._advise(name == 'ned' or name == 'enu' and data.refused,
                      setting=f'velocity_frame={name}')
         self._advise(velocity.frame.upside_down, 'the vertical velocity has the wrong sign')
         self._advise(velocity.vertical_absent, setting='velocity_vertical=absent')
