@@ -26,12 +26,12 @@ from typing import Union
 
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array, Index
-from ins_align.gnss.buffer import fault_of_fix, usable_velocity
+from ins_align.gnss.buffer import fault_of_fix, usable_velocity, with_an_altitude
 from ins_align.gnss.messages import Fix, Velocity
+from ins_align.gnss.motion import (
+    EMPTY, GRID, on_grid, Series, series_of, track, velocity_frame, velocity_from_positions,
+    VelocityFrame, without_wild_positions)
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
-from ins_align.recordings.motion_survey import (
-    GRID, on_grid, Series, track, velocity_frame, velocity_from_positions, VelocityFrame,
-    without_wild_positions)
 import numpy as np
 
 MIN_COURSE_SPEED = 2.0  # m/s above which a course means something
@@ -47,39 +47,40 @@ CELLS, GNSS_MESSAGES = 600, 3000  # kept of the latest data: 5 minutes, at up to
 
 
 def degrees_fault(max_rate: float, ratio: float | None) -> str:
-    """
-    Say that angular rates are in deg/s; empty where they are not.
-
-    Parameters
-    ----------
-    max_rate : float
-        As measured, in rad/s if that is the unit.
-    ratio : float or None
-        From `turn_ratio`; its sign does not matter.
-
-    """
+    """Say that angular rates, at most `max_rate`, are in deg/s; `ratio` is from `turn_ratio`."""
     if max_rate > ANY_GYRO_RATE or (ratio is not None and abs(ratio) > DEGREES_RATIO):
         return 'the angular rates look like deg/s: they must be rad/s'
     return ''
 
 
-def turn_ratio(grid: Array, gyro: Array, up: Array, velocities: Series | None) -> float | None:
-    """Return the rate about the vertical over the turn of the course; None: nothing to tell."""
-    if velocities is None or velocities.times.size < 5:
+def turn_ratio(times: Array, gyro: Array, up: Array, velocities: Series) -> float | None:
+    """
+    Return the rate about the vertical over the turn of the course; None: nothing to tell.
+
+    Parameters
+    ----------
+    times : ndarray, shape (N,)
+        s, increasing.
+    gyro : ndarray, shape (N, 3)
+        Rates, rad/s, averaged over GRID s.
+    up : ndarray, shape (3,)
+        Unit vector of the mean specific force.
+    velocities : Series
+        As from `on_grid`.
+
+    """
+    if velocities.times.size < 5:
         return None
     v = velocities.vectors[:, :2]
     course = np.unwrap(np.arctan2(v[:, 1], v[:, 0]))
-    times = velocities.times
-    elapsed = times[2:] - times[:-2]
+    elapsed = velocities.times[2:] - velocities.times[:-2]
     rate = (course[2:] - course[:-2]) / elapsed
     moving = ((np.hypot(*v.T)[1:-1] > MIN_COURSE_SPEED) & (elapsed < 3.0 * GRID)
               & (np.abs(rate) > MIN_COURSE_RATE))
-    turning = np.interp(times[1:-1], grid, gyro @ up)[moving]
-    rate = rate[moving]
-    energy = float(rate @ rate)
+    turning, rate = np.interp(velocities.times[1:-1], times, gyro @ up)[moving], rate[moving]
     if rate.size < 10 or not turning.any():
         return None
-    product = float(turning @ rate)
+    product, energy = float(turning @ rate), float(rate @ rate)
     if abs(product) < MIN_CORRELATION * math.sqrt(energy * float(turning @ turning)):
         return None
     return product / energy
@@ -97,12 +98,12 @@ def exchange_fault(positions_deg: Series, velocities: Series) -> str:
         As if they were ENU, m/s.
 
     """
-    latitude, longitude, altitude = positions_deg.vectors.T
-    if positions_deg.times.size < 2 or np.abs(longitude).max() > 90.0:
+    vectors = positions_deg.vectors
+    if vectors.shape[0] < 2 or np.abs(vectors[:, 1]).max() > 90.0:
         return ''
     as_sent, exchanged = (
-        velocity_frame(velocities, without_wild_positions(track(positions_deg.times, *columns)))
-        for columns in ((latitude, longitude, altitude), (longitude, latitude, altitude)))
+        velocity_frame(velocities, without_wild_positions(track(
+            Series(positions_deg.times, vectors[:, order])))) for order in ([0, 1, 2], [1, 0, 2]))
     if exchanged.frame not in ('enu', 'ned') or as_sent.frame in ('enu', 'unknown'):
         return ''
     # Velocities north-east-down would fit the positions as they are, in length too.
@@ -122,19 +123,7 @@ def beyond_the_poles(latitude_deg: float, longitude_deg: float) -> bool:
 
 
 def lateness_advice(lateness: float) -> tuple[str, str]:
-    """
-    Say how late GNSS messages are, and with which gnss_lateness they are used.
-
-    Parameters
-    ----------
-    lateness : float
-        Behind newer IMU samples, s.
-
-    Returns
-    -------
-    sentence, value : str
-
-    """
+    """Say that GNSS messages come so late, s, behind newer IMU samples; with the gnss_lateness."""
     value = f'{math.ceil(2.0 * lateness) / 2.0 + 0.5:g}'
     return (f'GNSS messages come up to {lateness:.1f} s later than newer IMU samples: set '
             f'gnss_lateness to {value}; if it is their clock that is behind, and not the '
@@ -155,12 +144,11 @@ class InputChecks:
     def __init__(self, config: Config) -> None:
         self._config = config
         self._cells: dict[int, Array] = {}  # count, sums of rate and specific force
-        self._samples = self._too_fast = 0
+        self._samples = self._too_fast = self._beyond_the_poles = 0
         self._newest_ns: int | None = None
         self._late: deque[float] = deque(maxlen=10 * MIN_LATE)
         self._fixes: deque[tuple[float, ...]] = deque(maxlen=GNSS_MESSAGES)
         self._velocities: deque[tuple[float, ...]] = deque(maxlen=GNSS_MESSAGES)
-        self._beyond_the_poles = 0
 
     def add(self, stamps_ns: Index, gyro: Array, accel: Array,
             gnss: Sequence[tuple[int, Union[Fix, Velocity]]]) -> None:
@@ -177,17 +165,15 @@ class InputChecks:
             How many of the samples come before each.
 
         """
-        newest = np.maximum.accumulate(stamps_ns)
-        for before, message in gnss:
-            newest_ns = int(newest[before - 1]) if before else self._newest_ns
-            if before and self._newest_ns is not None:
-                newest_ns = max(newest_ns or 0, self._newest_ns)
-            if newest_ns is not None:
-                self._late.append((newest_ns - message.stamp_ns) * 1e-9)
+        before = np.array([] if self._newest_ns is None else [self._newest_ns], np.int64)
+        newest = np.maximum.accumulate(np.concatenate([before, stamps_ns]))
+        for count, message in gnss:
+            if place := count + before.size:
+                self._late.append((int(newest[place - 1]) - message.stamp_ns) * 1e-9)
             self._add_gnss(message)
         if stamps_ns.size:
             # The newest of these: a clock that was set back goes on from where it is.
-            self._newest_ns = int(newest[-1])
+            self._newest_ns = int(stamps_ns.max())
             self._add_imu(stamps_ns, gyro, accel)
 
     def _add_gnss(self, message: Fix | Velocity) -> None:
@@ -197,8 +183,8 @@ class InputChecks:
             if usable is not None:
                 self._velocities.append((time, *usable.velocity.tolist()))
         elif not fault_of_fix(message):
-            altitude = message.altitude_m if math.isfinite(message.altitude_m) else 0.0
-            self._fixes.append((time, message.latitude_deg, message.longitude_deg, altitude))
+            fix = with_an_altitude(message)
+            self._fixes.append((time, fix.latitude_deg, fix.longitude_deg, fix.altitude_m))
         elif beyond_the_poles(message.latitude_deg, message.longitude_deg):
             self._beyond_the_poles += 1
 
@@ -218,9 +204,11 @@ class InputChecks:
 
     def faults(self) -> list[str]:
         """Return what is wrong, each in a sentence."""
-        fixes, velocities = _series(self._fixes), _series(self._velocities)
+        fixes, velocities = (
+            series_of(*np.split(np.array(rows), [1], axis=1)) if rows else EMPTY
+            for rows in (self._fixes, self._velocities))
         motion = on_grid(velocities) if velocities.times.size > 1 else velocity_from_positions(
-            track(fixes.times, *fixes.vectors.T))
+            track(fixes))
         found = [degrees_fault(
             math.inf if self._too_fast > 1e-3 * self._samples else 0.0, self._turn_ratio(motion))]
         found.append(exchange_fault(fixes, velocities) or (
@@ -239,12 +227,3 @@ class InputChecks:
         up = means[:, 3:].mean(axis=0)
         return turn_ratio((np.array(cells) + 0.5) * GRID, means[:, :3],
                           up / (math.hypot(*up.tolist()) or 1.0), motion)
-
-
-def _series(rows: Sequence[tuple[float, ...]]) -> Series:
-    """Return rows of time and three numbers over increasing time."""
-    if not rows:
-        return Series(np.zeros(0), np.zeros((0, 3)))
-    columns = np.array(rows)
-    times, first = np.unique(columns[:, 0], return_index=True)
-    return Series(times, columns[first, 1:])

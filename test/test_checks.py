@@ -18,8 +18,8 @@ import dataclasses
 from ins_align.checks import BEYOND_THE_POLES, degrees_fault, exchange_fault, InputChecks
 from ins_align.config import Config
 from ins_align.gnss.messages import Fix, Velocity
+from ins_align.gnss.motion import Series
 from ins_align.recordings.info import describe, inspect
-from ins_align.recordings.motion_survey import Series
 from ins_align.recordings.replay import replay
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
@@ -67,6 +67,7 @@ def test_info_and_replay_say_the_same(drive, tmp_path, change, sentence):
     # Nothing else is accused.
     for _, other in WRONG:
         assert (other in info) == (other in result.status.reason) == (other == sentence)
+    assert 'too little motion' not in info or change is far_in_the_east
 
 
 def test_nothing_is_said_of_what_is_right(drive):

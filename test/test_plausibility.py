@@ -340,7 +340,8 @@ def test_what_is_not_the_end_of_a_range(block):
                    np.round(samples / 1e-3) * 1e-3,               # steps of a converter
                    np.repeat(samples[::4], 4, axis=0),            # sent more often than measured
                    np.repeat(samples[::8], 8, axis=0),
-                   np.round(steady / 0.1) * 0.1):                 # coarse, and calm
+                   np.round(steady / 0.1) * 0.1,                  # coarse, and calm
+                   np.round(samples / [[0.01] * 3 + [0.05] * 3]) * [[0.01] * 3 + [0.05] * 3]):
         assert checked(stamps, values, block).stamps.size == 0
 
 

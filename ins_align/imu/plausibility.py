@@ -41,10 +41,11 @@ SPIKE_BEFORE, SPIKE_RANK = 12, 7
 # An IMU that has sent the same six values this often and for this long (ns) measures nothing.
 STUCK_SAMPLES, STUCK_NS = 8, 250_000_000
 # A value that is the largest of its axis, and not of an IMU at rest (rad/s, m/s^2), is
-# the end of the range once it has come so often while so many other values change; the motion may
-# go beyond it by this share.
+# the end of the range once it has come so often while so many other values change, and this many
+# times as often as the next smaller value: coarse values repeat without an end. The motion may go
+# beyond it by this share.
 END_RATE, END_FORCE = 0.5, 15.0
-END_TIMES, END_CHANGING = 5, 3
+END_TIMES, END_CHANGING, PILED_UP = 5, 3, 4
 BEYOND_END = 0.5
 # An attitude is lost when the gyros may have missed this angle (rad).
 BLIND_ANGLE = 0.35
@@ -145,6 +146,8 @@ class RangeCheck:
         # Of each value and its negative.
         self._ends = np.repeat([END_RATE, END_FORCE], 3)[None].repeat(2, axis=0)
         self._times = np.zeros((2, 6), int)
+        # The largest value below the end, and how often it came.
+        self._below, self._times_below = self._ends.copy(), self._times.copy()
         self._last = np.zeros(6)
         # The last sample within the range, of gyros and accelerometers, ns.
         self._within_ns = np.zeros(2, np.int64)
@@ -194,18 +197,27 @@ class RangeCheck:
     def _at_end(self, samples: Array) -> np.ndarray:
         """Which values are at the end of the range, shape (N, 6)."""
         at_end = np.zeros(samples.shape, bool)
-        reached = np.argwhere([samples.max(axis=0), -samples.min(axis=0)] >= self._ends)
+        reached = np.argwhere([samples.max(axis=0), -samples.min(axis=0)] >= self._below)
         if reached.size:
             changed = np.diff(np.vstack([self._last, samples]), axis=0) != 0.0
             changing = np.count_nonzero(changed, axis=1)
         for sign, axis in reached.tolist():
             values = -samples[:, axis] if sign else samples[:, axis]
-            so_far = np.maximum(np.maximum.accumulate(values), self._ends[sign, axis])
-            for k in np.flatnonzero(values == so_far).tolist():
-                if values[k] > self._ends[sign, axis]:
-                    self._ends[sign, axis], self._times[sign, axis] = values[k], 0
-                self._times[sign, axis] += changing[k] - changed[k, axis] >= END_CHANGING
-                at_end[k, axis] |= self._times[sign, axis] >= END_TIMES
+            place = sign, axis
+            for k in np.flatnonzero(values >= self._below[place]).tolist():
+                if values[k] > self._ends[place]:
+                    self._below[place], self._times_below[place] = (
+                        self._ends[place], self._times[place])
+                    self._ends[place], self._times[place] = values[k], 0
+                elif values[k] > self._below[place] and values[k] < self._ends[place]:
+                    self._below[place], self._times_below[place] = values[k], 0
+                among_changing = changing[k] - changed[k, axis] >= END_CHANGING
+                if values[k] == self._ends[place]:
+                    self._times[place] += among_changing
+                    at_end[k, axis] |= self._times[place] >= max(
+                        END_TIMES, PILED_UP * self._times_below[place])
+                elif values[k] == self._below[place]:
+                    self._times_below[place] += among_changing
         return at_end
 
 

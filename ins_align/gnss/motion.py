@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What the GNSS data of a recording tell before any alignment: velocity frame, manoeuvres."""
+"""Motion as GNSS shows it: tracks, the frame of a velocity, manoeuvres."""
 
 from __future__ import annotations
 
@@ -27,10 +27,8 @@ GRID = 0.5  # s, spacing on which velocities are compared
 MAX_GAP = 3.0  # s without GNSS over which nothing is interpolated
 MANOEUVRE_SPEED, MANOEUVRE_TIME = 5.0, 20.0  # m/s of change within so many s
 WEAK_SPEED = 1.0  # m/s: a change below this shows no heading with a usual receiver
-MIN_DISTANCE = 10.0  # m over which velocity and position are compared,
-DISTANCE_SIGMAS = 10.0  # and so many sigmas of a position
-MIN_STEP, STEP_SIGMAS = 1.0, 5.0  # m, so many sigmas: turns between such steps are seen
-MAX_WINDOW = 30.0  # s: who takes longer for the distance is not compared
+MIN_DISTANCE, DISTANCE_SIGMAS = 10.0, 10.0  # m, or so many sigmas of a position, to compare over
+SPANS = 2.0, 4.0, 8.0, 16.0, 30.0  # s in which a vehicle may cover that distance
 MIN_WINDOWS = 4
 MAX_FRAME_ANGLE = math.radians(20.0)
 MIN_CONCENTRATION = 0.9  # mean length of unit vectors above which directions agree
@@ -41,6 +39,9 @@ class Series(NamedTuple):
 
     times: Array  # (N,), s, increasing
     vectors: Array  # (N, 3), ENU
+
+
+EMPTY = Series(np.zeros(0), np.zeros((0, 3)))
 
 
 @dataclass(frozen=True)
@@ -63,22 +64,25 @@ class Manoeuvres:
     starts: tuple[float, ...]  # s, where a change by MANOEUVRE_SPEED begins
 
 
-def track(times: Array, latitude_deg: Array, longitude_deg: Array, altitude: Array) -> Series:
+def series_of(times: Array, vectors: Array) -> Series:
+    """Sort vectors, (N, M), by their times, (N,), s; of equal times the first counts."""
+    times, first = np.unique(times, return_index=True)
+    return Series(times, vectors[first])
+
+
+def track(positions_deg: Series) -> Series:
     """
-    Return positions in metres from the first; times in seconds, all of shape (N,).
+    Return positions in metres from the first, of latitude and longitude, degrees, and altitude.
 
     Source: each step on a sphere, east and north where it is made.
     """
-    order = np.argsort(times, kind='stable')
-    order = order[np.concatenate([[True], np.diff(times[order]) > 0.0])] if times.size else order
-    latitude, longitude = np.radians(latitude_deg[order]), np.radians(longitude_deg[order])
-    steps_east = np.remainder(np.diff(longitude) + np.pi, 2.0 * np.pi) - np.pi
-    east = np.cumsum(steps_east * np.cos(latitude[1:])) * EARTH_RADIUS
-    vectors = np.zeros((order.size, 3))
-    vectors[1:, 0] = east
-    vectors[:, 1] = (latitude - latitude[:1]) * EARTH_RADIUS
-    vectors[:, 2] = altitude[order] - altitude[order][:1]
-    return Series(times[order], vectors)
+    latitude, longitude = np.radians(positions_deg.vectors[:, :2]).T
+    metres = positions_deg.vectors - positions_deg.vectors[:1]
+    steps = np.remainder(np.diff(longitude) + np.pi, 2.0 * np.pi) - np.pi
+    metres[1:, 0] = np.cumsum(steps * np.cos(latitude[1:])) * EARTH_RADIUS
+    metres[:, 1] = (latitude - latitude[:1]) * EARTH_RADIUS
+    metres[:1] = 0.0
+    return Series(positions_deg.times, metres)
 
 
 def position_noise(positions: Series) -> float:
@@ -101,7 +105,7 @@ def without_wild_positions(positions: Series) -> Series:
     if vectors.shape[0] < 5:
         return positions
     medians = np.median(np.lib.stride_tricks.sliding_window_view(vectors, 5, axis=0), axis=-1)
-    limit = 0.5 * _compared_distance(position_noise(positions))
+    limit = 0.5 * _compared_distance(positions)
     off = np.abs(vectors[2:-2] - medians)
     near = np.ones(vectors.shape[0], bool)
     # Receivers are about half as good vertically.
@@ -110,63 +114,62 @@ def without_wild_positions(positions: Series) -> Series:
 
 
 def velocity_from_positions(positions: Series) -> Series:
-    """Differentiate positions over a time that leaves 0.35 m/s of their noise."""
+    """Differentiate positions over a time that leaves 0.35 m/s of their noise, every GRID s."""
     if positions.times.size < 2:
-        return Series(np.zeros(0), np.zeros((0, 3)))
+        return EMPTY
     span = min(max(4.0 * position_noise(positions), 2.0), 20.0)
     times = _grid(positions.times)
     before, after = (_at(positions, times + sign * span / 2) for sign in (-1.0, 1.0))
-    return _finite(Series(times, (after - before) / span))
+    return _finite(times, (after - before) / span)
+
+
+def differences(positions: Series) -> Series:
+    """Return the velocity between each two positions."""
+    times, vectors = positions
+    return EMPTY if times.size < 2 else Series(
+        0.5 * (times[1:] + times[:-1]), np.diff(vectors, axis=0) / np.diff(times)[:, None])
 
 
 def on_grid(velocities: Series) -> Series:
-    """Return velocities every GRID seconds, without single outliers."""
-    if velocities.times.size < 2:
+    """Return velocities every GRID s, without single outliers."""
+    if velocities.times.size < 3:
         return velocities
-    vectors = velocities.vectors
-    if vectors.shape[0] >= 3:
-        vectors = vectors.copy()
-        vectors[1:-1] = np.median([vectors[:-2], vectors[1:-1], vectors[2:]], axis=0)
+    v = velocities.vectors.copy()
+    v[1:-1] = np.median([v[:-2], v[1:-1], v[2:]], axis=0)
     times = _grid(velocities.times)
-    return _finite(Series(times, _at(Series(velocities.times, vectors), times)))
+    return _finite(times, _at(Series(velocities.times, v), times))
 
 
 def velocity_frame(velocities: Series, positions: Series) -> VelocityFrame:
     """
-    Tell the frame of velocities from the change of position.
+    Compare velocities, taken as ENU, m/s, with the change of position, ENU, m.
 
-    Parameters
-    ----------
-    velocities : Series
-        Taken as ENU, m/s.
-    positions : Series
-        ENU, m.
+    Returns
+    -------
+    VelocityFrame
+        Its frame is 'unknown' where the vehicle moved less than MIN_WINDOWS distances.
 
     """
-    moved, travelled, lengths = _distances(velocities, positions)
+    moved, travelled = _distances(velocities, positions)
     count = moved.shape[0]
     if count < MIN_WINDOWS:
         return VelocityFrame('unknown', count)
-    ratio = float(np.median(lengths[:, 1] / lengths[:, 0]))
     moved_h, travelled_h = moved[:, 0] + 1j * moved[:, 1], travelled[:, 0] + 1j * travelled[:, 1]
+    ratio = float(np.median(np.abs(travelled_h) / np.abs(moved_h)))
     as_enu = _mean_direction(moved_h * travelled_h.conj())
     as_ned = _mean_direction(moved_h * (1j * travelled_h.conj()).conj())
-    good_speed = 0.7 < ratio < 1.4
     frames = [(abs(mean), name) for name, mean in (('enu', as_enu), ('ned', as_ned))
               if abs(mean) > MIN_CONCENTRATION and abs(np.angle(mean)) < MAX_FRAME_ANGLE]
-    angle = None
-    if frames and good_speed:
-        frame = max(frames)[1]
-    elif not good_speed:
-        frame = 'contradiction'
-    elif abs(as_enu) > MIN_CONCENTRATION:
-        frame, angle = 'turned', float(np.degrees(-np.angle(as_enu)))
-    else:
-        frame = 'body'
-    up = travelled[:, 2] if frame != 'ned' else -travelled[:, 2]
-    climbs = float(np.sum(moved[:, 2] * up)) if frame in ('enu', 'ned') else 0.0
-    clear = abs(climbs) > 0.5 * float(np.sum(moved[:, 2] ** 2)) > 0.5 * MIN_DISTANCE ** 2
-    return VelocityFrame(frame, count, angle, ratio, clear and climbs < 0.0)
+    if not 0.7 < ratio < 1.4:
+        return VelocityFrame('contradiction', count, speed_ratio=ratio)
+    if not frames and abs(as_enu) > MIN_CONCENTRATION:
+        return VelocityFrame('turned', count, float(np.degrees(-np.angle(as_enu))), ratio)
+    if not frames:
+        return VelocityFrame('body', count, speed_ratio=ratio)
+    frame = max(frames)[1]
+    climbs = float(moved[:, 2] @ travelled[:, 2]) * (1.0 if frame == 'enu' else -1.0)
+    clear = -climbs > 0.5 * float(np.sum(moved[:, 2] ** 2)) > 0.5 * MIN_DISTANCE ** 2
+    return VelocityFrame(frame, count, None, ratio, clear)
 
 
 def find_manoeuvres(velocities: Series) -> Manoeuvres | None:
@@ -190,13 +193,12 @@ def find_manoeuvres(velocities: Series) -> Manoeuvres | None:
     change = np.zeros(times.size)  # from its time on, the largest within MANOEUVRE_TIME
     until = np.full(times.size, math.inf)  # when it first exceeds MANOEUVRE_SPEED
     for lag in range(1, min(round(MANOEUVRE_TIME / GRID), times.size - 1) + 1):
-        elapsed = times[lag:] - times[:-lag]
         step = np.hypot(*(v[lag:] - v[:-lag]).T)
-        step[elapsed > MANOEUVRE_TIME] = 0.0
+        step[times[lag:] - times[:-lag] > MANOEUVRE_TIME] = 0.0
         np.maximum(change[:-lag], step, out=change[:-lag])
         np.minimum(until[:-lag], np.where(step >= MANOEUVRE_SPEED, times[lag:], math.inf),
                    out=until[:-lag])
-    starts = []
+    starts: list[float] = []
     free_from = -math.inf
     for index in np.flatnonzero(np.isfinite(until)).tolist():
         if times[index] >= free_from:
@@ -207,74 +209,50 @@ def find_manoeuvres(velocities: Series) -> Manoeuvres | None:
     return Manoeuvres(float(np.hypot(*v.T).max()), float(change.max()), tuple(starts))
 
 
-def _distances(velocities: Series, positions: Series) -> tuple[Array, Array, Array]:
-    """
-    Return change of position, integral of velocity, shape (K, 3), and the lengths of both ways.
+def heading_in_words(found: Manoeuvres | None) -> str:
+    """Say whether manoeuvres show the heading."""
+    if found is None:
+        return 'unknown: there is no GNSS to tell the motion from'
+    if found.starts:
+        return 'yes: the velocity changes enough'
+    if found.largest_change >= WEAK_SPEED:
+        return 'weakly: the changes of velocity are small, it takes longer and a good receiver'
+    return ('no: turn or change speed (standing, only navigation grade finds north, by the '
+            "Earth's rotation)")
 
-    Of K windows; the lengths, shape (K, 2), are those of the ways with all their turns.
-    """
-    none = np.zeros((0, 3))
+
+def _distances(velocities: Series, positions: Series) -> tuple[Array, Array]:
+    """Return change of position and integral of velocity, shape (K, 3), over K distances."""
+    best = np.zeros((0, 3)), np.zeros((0, 3))
     if velocities.times.size < 2 or positions.times.size < 2:
-        return none, none, np.zeros((0, 2))
-    noise = position_noise(positions)
-    distance = _compared_distance(noise)
-    steps = np.diff(velocities.times)
-    middles = 0.5 * (velocities.vectors[1:] + velocities.vectors[:-1])
-    speeds = np.hypot(*middles[:, :2].T)
-    integral = np.vstack([np.zeros((1, 4)), np.cumsum(
-        np.column_stack([middles, speeds]) * steps[:, None], axis=0)])
-    inside = ((positions.times >= velocities.times[0])
-              & (positions.times <= velocities.times[-1]))
-    times, moved = positions.times[inside], positions.vectors[inside]
-    travelled = np.column_stack([np.interp(times, velocities.times, column)
-                                 for column in integral.T])
-    # After each gap, of either, the count of windows starts afresh.
-    gap_ends = velocities.times[1:][steps > MAX_GAP]
-    gaps = np.searchsorted(gap_ends, times) + np.concatenate(
-        [[0], np.cumsum(np.diff(times) > MAX_GAP)])[:times.size]
-    starts, ends = [], []
-    start = 0
-    for index, (time, east, north) in enumerate(
-            zip(times.tolist(), *moved[:, :2].T.tolist())):
-        if gaps[index] != gaps[start] or time - times[start] > MAX_WINDOW:
-            start = index
-        elif math.hypot(east - moved[start, 0], north - moved[start, 1]) >= distance:
-            starts.append(start)
-            ends.append(index)
-            start = index
-    change = travelled[ends] - travelled[starts]
-    lengths = _length(moved[:, :2], max(MIN_STEP, STEP_SIGMAS * noise))
-    return (moved[ends] - moved[starts], change[:, :3],
-            np.column_stack([lengths[ends] - lengths[starts], change[:, 3]]))
+        return best
+    steps, v = np.diff(velocities.times), velocities.vectors
+    # The fourth column counts gaps.
+    integral = np.zeros((v.shape[0], 4))
+    integral[1:] = np.cumsum(np.column_stack(
+        [0.5 * (v[1:] + v[:-1]) * steps[:, None], steps > MAX_GAP]), axis=0)
+    for span in SPANS:
+        starts = np.unique(np.floor(positions.times / span)) * span
+        moved, travelled = (
+            _at(series, starts + span) - _at(series, starts)
+            for series in (positions, Series(velocities.times, integral)))
+        good = ((np.hypot(moved[:, 0], moved[:, 1]) >= _compared_distance(positions))
+                & (travelled[:, 3] == 0.0))
+        if np.count_nonzero(good) > best[0].shape[0]:
+            best = moved[good], travelled[good, :3]
+    return best
 
 
-def _compared_distance(noise: float) -> float:
-    return max(MIN_DISTANCE, DISTANCE_SIGMAS * noise)
-
-
-def _length(places: Array, step: float) -> Array:
-    """Length of the way to each of N places, shape (N, 2), in steps that noise does not make."""
-    lengths: list[float] = []
-    corner: list[float] = []
-    so_far = 0.0
-    for place in places.tolist():
-        corner = corner or place
-        since = math.dist(place, corner)
-        lengths.append(so_far + since)
-        if since >= step:
-            corner, so_far = place, lengths[-1]
-    return np.array(lengths)
+def _compared_distance(positions: Series) -> float:
+    return max(MIN_DISTANCE, DISTANCE_SIGMAS * position_noise(positions))
 
 
 def _mean_direction(numbers: np.ndarray) -> complex:
     lengths = np.abs(numbers)
-    return complex(np.mean(numbers[lengths > 0.0] / lengths[lengths > 0.0])) \
-        if (lengths > 0.0).any() else 0j
+    return complex(np.sum(numbers / np.where(lengths > 0.0, lengths, np.inf)) / lengths.size)
 
 
 def _grid(times: Array) -> Array:
-    if times.size < 2:
-        return np.zeros(0)
     # Only around data: clocks may jump by years.
     cells = np.unique((times / GRID).astype(np.int64))
     cells = np.unique(cells[:, None] + np.arange(round(MAX_GAP / GRID)))
@@ -291,6 +269,6 @@ def _at(series: Series, times: Array) -> Array:
     return values
 
 
-def _finite(series: Series) -> Series:
-    good = np.isfinite(series.vectors).all(axis=1)
-    return Series(series.times[good], series.vectors[good])
+def _finite(times: Array, vectors: Array) -> Series:
+    good = np.isfinite(vectors).all(axis=1)
+    return Series(times[good], vectors[good])

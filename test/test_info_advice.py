@@ -1,0 +1,206 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What `info` tells of sensors and advises, on simulations whose errors are known."""
+
+import dataclasses
+import math
+import re
+import shlex
+
+from ins_align.cli import main
+from ins_align.recordings.info import describe, inspect
+from ins_align.simulation.simulate import simulate, write_bag
+import numpy as np
+import pytest
+from recordings import real_recording
+
+QUANTUM = math.radians(0.57)
+NO_COVARIANCE = np.zeros((3, 3))
+
+
+def drive(seed=1, duration=100.0, **arguments):
+    return simulate('car', seed=seed, duration=duration, stand_still=20.0, **arguments)
+
+
+def inspected(simulation, path, **changes):
+    """Write a simulation with some of its arrays changed, and inspect it."""
+    write_bag(dataclasses.replace(simulation, **changes), path)
+    return inspect(path)
+
+
+def settings_of(info):
+    """Return the parameters that the command sets."""
+    assert info.command is not None, info.obstacles
+    words = shlex.split(info.command)
+    return dict(words[k + 1].split('=') for k, word in enumerate(words) if word == '--set')
+
+
+def imu_of(info):
+    return next(topic.imu for topic in info.topics if topic.kind == 'imu')
+
+
+def test_coarse_gyros_are_named_as_such(tmp_path):
+    truth = drive()
+    gyro = np.round(truth.gyro / QUANTUM) * QUANTUM
+    info = inspected(truth, tmp_path / 'a', gyro=gyro)
+    imu, said = imu_of(info), describe(info)
+    zeros = np.mean(gyro == 0.0, axis=0).max()
+    assert f'gyroscopes round to multiples of 0.57 deg/s: {zeros:.0%} of the samples' in said
+    assert 'dead band' not in said and 'end of their range' not in said
+    assert 'accelerometers round' not in said
+    # Nothing is measured of a bias that is rounded away.
+    assert re.search(r'rate \(.*\) \+- 0.28 deg/s', said) and 'of rounding' in said
+    settings = settings_of(info)
+    # Uniform within half a quantum.
+    assert float(settings['gyro_bias_std']) >= 0.57 / math.sqrt(12.0) * 0.95
+    assert float(settings['angle_random_walk']) > 0.9
+    assert imu.grade == 'mems' and not imu.grade_covers
+
+
+@pytest.mark.parametrize('quantum, said', [
+    (1e-4, 'round to multiples of 0.0057 deg/s'), (0.0, '')])
+def test_a_quantum_below_the_noise_does_no_harm(tmp_path, quantum, said):
+    truth = drive(duration=40.0)
+    gyro = np.round(truth.gyro / quantum) * quantum if quantum else truth.gyro
+    info = inspected(truth, tmp_path / 'a', gyro=gyro)
+    assert said in describe(info) and ('gyroscopes round' in describe(info)) == bool(said)
+    assert imu_of(info).rounds == (False, False) and settings_of(info) == {}
+    assert imu_of(info).angle_random_walk == pytest.approx(0.3, rel=0.15)
+
+
+@pytest.mark.parametrize('quantum', [0.0, math.radians(0.1)])
+def test_dead_band(tmp_path, quantum):
+    truth = drive()
+    band = math.radians(1.0)
+    gyro = np.where(np.abs(truth.gyro) < band, 0.0, truth.gyro)
+    if quantum:
+        gyro = np.round(gyro / quantum) * quantum
+    info = inspected(truth, tmp_path / 'a', gyro=gyro)
+    assert imu_of(info).gyro.dead_band == pytest.approx(band, abs=quantum + 1e-3)
+    assert imu_of(info).gyro.quantum == pytest.approx(quantum, rel=0.01)
+    assert 'gyroscopes have a dead band: nothing between 0 and 1 deg/s' in describe(info)
+    uniform = 1.0 / math.sqrt(3.0)
+    assert float(settings_of(info)['gyro_bias_std']) == pytest.approx(uniform, rel=0.1)
+    assert 'end of their range' not in describe(info)
+
+
+@pytest.mark.parametrize('error', [-0.4, 0.15, 0.53])
+def test_accelerometers_that_are_off_gravity_at_rest(tmp_path, error):
+    truth = drive(accel_bias_std=0.0, duration=40.0)
+    info = inspected(truth, tmp_path / 'a', accel=truth.accel + [0.0, 0.0, error])
+    assert imu_of(info).rest_force_error == pytest.approx(error, abs=0.01)
+    said = f'specific force {imu_of(info).rest_force_error:+.3f} m/s^2 off gravity'
+    assert said in describe(info)
+    settings = settings_of(info)
+    assert float(settings.pop('accel_bias_std')) == pytest.approx(abs(error), rel=0.05)
+    assert settings == {}
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_an_imu_as_good_as_its_grade_needs_no_setting(tmp_path, seed):
+    info = inspected(drive(seed=seed), tmp_path / 'a')
+    assert settings_of(info) == {} and info.notes == ()
+
+
+@pytest.mark.parametrize('scenario, arguments', [
+    ('launch', {'lever_arm': (0.0, 0.0, 3.0)}), ('car', {'duration': 100.0, 'outlier_rate': 0.02}),
+    *(pytest.param(*more, marks=pytest.mark.campaign) for more in (
+        ('car', {'duration': 200.0, 'gnss_rate': 1.0}), ('flight', {'duration': 300.0})))])
+@pytest.mark.parametrize('delay', [-0.1, 0.3, 0.8])
+def test_delay_of_the_receiver(tmp_path, scenario, arguments, delay):
+    """Whatever the lever arm is, which nobody has stated."""
+    truth = simulate(scenario, seed=4, gnss_delay=max(delay, 0.0),
+                     **{'lever_arm': (1.0, -0.5, 1.5), **arguments})
+    early = round(min(delay, 0.0) * 1e9)
+    info = inspected(truth, tmp_path / 'a', gnss_stamps_ns=truth.gnss_stamps_ns + early)
+    assert info.motion.delay.mean == pytest.approx(delay, abs=0.05)
+    settings = settings_of(info)
+    assert float(settings.pop('gnss_delay')) == pytest.approx(delay, abs=0.05)
+    assert settings == {} and 'as the motion of the IMU shows' in info.notes[0]
+    assert len(info.notes) == 1
+
+
+def test_clocks_that_drift_apart(tmp_path):
+    """By 0.2 s in 200 s, from 0.1 s on."""
+    truth = drive(seed=2, duration=200.0)
+    stamps = truth.gnss_stamps_ns
+    since = stamps - stamps[0]
+    info = inspected(truth, tmp_path / 'a', gnss_stamps_ns=stamps + 100_000_000 + since // 1000)
+    assert float(settings_of(info)['gnss_delay']) == pytest.approx(0.2, abs=0.05)
+    assert info.motion.delay.drift == pytest.approx(0.1, abs=0.04)
+    assert 'clocks of IMU and GNSS drift apart' in info.notes[1]
+
+
+@pytest.mark.parametrize('scenario', ['straight', 'static', 'swing', 'car'])
+def test_no_delay_is_told_where_there_is_none_or_no_motion(tmp_path, scenario):
+    """The antenna of a boat that yaws on its course moves, and its heading is open."""
+    info = inspected(simulate(
+        scenario, seed=3, gnss_delay=0.0 if scenario == 'car' else 0.5, imu_grade='tactical',
+        lever_arm=(2.0, -1.0, 1.0)), tmp_path / 'a')
+    assert 'gnss_delay' not in settings_of(info)
+    assert (info.motion.delay is None) == (scenario != 'car')
+
+
+@pytest.mark.parametrize('scenario', [
+    'car', *(pytest.param(name, marks=pytest.mark.campaign) for name in ('flight', 'static'))])
+@pytest.mark.parametrize('std, vertical', [(0.05, 0.1), (0.3, 0.3), (1.0, 2.0)])
+def test_noise_of_a_velocity_without_covariance(tmp_path, scenario, std, vertical):
+    truth = simulate(scenario, seed=5, velocity_std=std, velocity_std_vertical=vertical,
+                     outlier_rate=0.01)
+    info = inspected(truth, tmp_path / 'a', velocity_covariance=NO_COVARIANCE)
+    settings = settings_of(info)
+    assert 1 / 1.5 < float(settings['velocity_std']) / std < 1.5
+    assert 1 / 1.5 < float(settings['velocity_std_vertical']) / vertical < 1.5
+    assert 'noise of the GNSS velocity' in describe(info)
+    stated = inspected(truth, tmp_path / 'b')
+    assert not [name for name in settings_of(stated) if name.startswith('velocity_std')]
+
+
+def test_everything_at_once_and_its_command_aligns(tmp_path):
+    """A coarse IMU far off its grade beside a receiver that is late and states no covariance."""
+    truth = drive(seed=6, gnss_delay=0.6, duration=200.0, accel_bias_std=0.0)
+    info = inspected(
+        truth, tmp_path / 'a', gyro=np.round(truth.gyro / QUANTUM) * QUANTUM,
+        accel=truth.accel + [0.1, -0.1, 0.4], velocity_covariance=NO_COVARIANCE)
+    settings = settings_of(info)
+    assert float(settings['gnss_delay']) == pytest.approx(0.6, abs=0.05)
+    assert float(settings['accel_bias_std']) == pytest.approx(0.4, abs=0.05)
+    assert {'gyro_bias_std', 'angle_random_walk', 'velocity_std'} < set(settings)
+    assert main([*shlex.split(info.command)[1:], '--set', 'lever_arm=[1,1,1]']) == 0
+
+
+REAL = {
+    'uav_thor75': {'gnss_delay': (0.03, 0.1), 'velocity_std': (0.1, 0.25),
+                   'velocity_std_vertical': (0.1, 0.35)},
+    'car_drive0708': {'accel_bias_std': (0.13, 0.15), 'gnss_delay': (0.03, 0.1)},
+    'quad_dot08.bag': {}}
+
+
+@pytest.mark.parametrize('name', REAL)
+def test_real_recordings(name):
+    info = inspect(real_recording(name))
+    settings = settings_of(info)
+    assert set(settings) == set(REAL[name])
+    for parameter, (least, most) in REAL[name].items():
+        assert least < float(settings[parameter]) < most
+    said = describe(info)
+    assert all(word not in said for word in ('end of their range', 'dead band', 'round to'))
+
+
+def test_both_biases_beyond_the_default_are_another_grade(tmp_path):
+    truth = drive(gyro_bias_std=0.0, accel_bias_std=0.0, duration=60.0)
+    info = inspected(truth, tmp_path / 'a', accel=truth.accel + [0.0, 0.0, 0.5],
+                     gyro=truth.gyro + np.radians([0.8, -0.8, 0.8]))
+    assert settings_of(info) == {'imu_grade': 'chip'}
+    assert 'suits imu_grade chip' in describe(info)
