@@ -28,7 +28,7 @@ extras = {
     'simulation': simulation,
     'experiments': [*replay, *simulation, 'matplotlib>=3.8', 'pillow'],
     'test': [
-        'catkin-pkg', 'hypothesis', 'mypy', 'pytest', 'pytest-cov', 'pytest-xdist',
+        'catkin-pkg', 'hypothesis', 'mcap', 'mypy', 'pytest', 'pytest-cov', 'pytest-xdist',
         'ros-ament-flake8', 'ros-ament-pep257', 'flake8', 'flake8-blind-except', 'flake8-builtins',
         'flake8-class-newline', 'flake8-comprehensions', 'flake8-deprecated', 'flake8-docstrings',
         'flake8-import-order', 'flake8-quotes', 'pydocstyle', 'types-PyYAML',

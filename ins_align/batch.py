@@ -34,6 +34,7 @@ from ins_align.outputs import write_whole
 from ins_align.processes import pool
 from ins_align.recordings import BagError
 from ins_align.recordings.replay import replay
+from ins_align.recordings.results_bag import write_results
 from ins_align.report import plot, save_figure, summary
 
 CONNECT_TIMEOUT = 10.0  # s, to the scheduler of a Dask cluster
@@ -57,6 +58,7 @@ class Task:
     duration: float | None = None
     csv: str | None = None
     plot: str | None = None
+    results: str | None = None
 
 
 @dataclass(frozen=True)
@@ -85,9 +87,13 @@ def process(task: Task, read_ahead: bool = False,
         if task.csv:
             text = result.to_csv().encode()
             write_whole(task.csv, lambda file: file.write(text))
+        if task.results:
+            write_results(result, task.results)
         if task.plot:
             figure, suffix = plot(result), Path(task.plot).suffix
             write_whole(task.plot, lambda file: save_figure(figure, file, suffix))
+    except BagError as error:
+        return _failed(task, str(error))
     except OSError as error:
         return _failed(task, f'cannot write {error.filename}: {error.strerror}')
     warnings = tuple(text.replace(task.bag, task.name) for text in result.warnings)

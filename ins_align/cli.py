@@ -245,6 +245,9 @@ def _add_replay(commands: Any) -> None:
     group.add_argument('--plot', metavar='FILE',
                        help='draw attitude, sigma, innovations, biases, error and track '
                             '(.png, .pdf, .svg)')
+    group.add_argument('--bag', metavar='OUT', dest='results',
+                       help='write a recording (mcap) with the topics of the node, to play and to '
+                            'plot beside the original; a directory to make')
 
 
 def _add_simulate(commands: Any) -> None:
@@ -342,9 +345,12 @@ def run_replay(arguments: argparse.Namespace) -> int:
     for option in ('csv', 'plot'):
         if getattr(arguments, option) == STANDARD_OUTPUT:
             raise UsageError(f'--{option} needs the name of a file')
-    outputs = [path for path in (arguments.json, arguments.csv, arguments.plot) if path]
-    outputs += [with_label(path, label) for path in (arguments.csv, arguments.plot) if path
-                for label in names if label]
+    labelled = arguments.csv, arguments.plot, arguments.results
+    outputs = [path for path in (arguments.json, *labelled) if path]
+    outputs += [with_label(path, label) for path in labelled if path for label in names if label]
+    for label in names if arguments.results else ():
+        if os.path.exists(path := with_label(arguments.results, label) or ''):
+            raise UsageError(f'cannot write {path}: it exists already, choose another name')
     for path in outputs:
         check_writable(path, [*arguments.bags, *filter(None, [arguments.params])])
         if outputs.count(path) > 1:
@@ -356,7 +362,8 @@ def run_replay(arguments: argparse.Namespace) -> int:
 
     tasks = [Task(bag, os.path.abspath(bag), config, arguments.imu_topic, arguments.fix_topic,
                   arguments.velocity_topic, arguments.start, arguments.duration,
-                  absolute(arguments.csv, label), absolute(arguments.plot, label))
+                  absolute(arguments.csv, label), absolute(arguments.plot, label),
+                  absolute(arguments.results, label))
              for bag, label in zip(arguments.bags, names)]
     objects = []
     statuses = []

@@ -22,17 +22,14 @@ import re
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Vector3Stamped
 from ins_align.config import Config, Parameter, parameters
-from ins_align.mounting import base_attitude, Mounting
-from ins_align.results import State, Status
+from ins_align.mounting import Mounting
+from ins_align.results import Status
+from ins_align.status_values import base_values, status_values
 import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.time import Time
 
-LEVELS = {
-    State.ALIGNED: DiagnosticStatus.OK,
-    State.FAULT: DiagnosticStatus.ERROR,
-}
 LOG_AGAIN = 10.0  # s after which a reason that has stayed is worth another line
 _NUMBER = re.compile(r'[-+]?\d[\d.]*(?:e[-+]?\d+)?')
 
@@ -159,56 +156,11 @@ def vector_msg(stamp_ns: int, frame_id: str, values: Sequence[float] | np.ndarra
     return msg
 
 
-def diagnostic_status(name: str, hardware_id: str, level: bytes, status: Status,
+def diagnostic_status(name: str, hardware_id: str, level: int, status: Status,
                       mounting: Mounting | None = None) -> DiagnosticStatus:
     """Return a status as diagnostics have it, with the attitude of the base if it is known."""
     return DiagnosticStatus(
-        level=level, name=f'{name.lstrip("/")}: alignment', hardware_id=hardware_id,
+        level=bytes([level]), name=f'{name.lstrip("/")}: alignment', hardware_id=hardware_id,
         message=f'{status.state.value}: {status.reason}',
         values=[KeyValue(key=key, value=value) for key, value in itertools.chain(
             status_values(status), base_values(status, mounting))])
-
-
-def status_values(status: Status) -> Iterator[tuple[str, str]]:
-    """List what a status says as names and values, angles in degrees."""
-    yield 'state', status.state.value
-    yield 'reason', status.reason
-    for name, value in (('stamp_ns', status.stamp_ns), ('t0_ns', status.t0_ns)):
-        yield name, '' if value is None else str(value)
-    yield 'time_to_align_s', _text(status.time_to_align_s)
-    for name, attitude in (('initial', status.initial), ('current', status.current)):
-        angles = sigma = None
-        if attitude is not None:
-            angles = attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg
-            sigma = attitude.sigma_deg
-        yield f'{name}_roll_pitch_yaw_deg', _text(angles)
-        yield f'{name}_sigma_east_north_up_deg', _text(sigma)
-    yield 'current_heading_deg', _text(
-        None if status.current is None else status.current.heading_deg)
-    for name, estimate, sigma, unit in (
-            ('gyro_bias', status.gyro_bias, status.gyro_bias_std, 'rad_s'),
-            ('accel_bias', status.accel_bias, status.accel_bias_std, 'm_s2'),
-            ('lever_arm', status.lever_arm, status.lever_arm_std, 'm'),
-            ('gnss_delay', status.gnss_delay, status.gnss_delay_std, 's')):
-        yield f'{name}_{unit}', _text(estimate)
-        yield f'{name}_std_{unit}', _text(sigma)
-    for name, count in status.counts.items():
-        yield name, str(count)
-
-
-def base_values(status: Status, mounting: Mounting | None) -> Iterator[tuple[str, str]]:
-    """List the attitude of the configured base like `status_values`."""
-    if mounting is None or not mounting.config.base_frame:
-        return
-    yield 'base_frame', mounting.config.base_frame
-    for name, attitude in (('initial', status.initial), ('current', status.current)):
-        base = base_attitude(attitude, mounting.C_imu_base)
-        yield f'base_{name}_roll_pitch_yaw_deg', _text(
-            None if base is None else (base.roll_deg, base.pitch_deg, base.yaw_deg))
-
-
-def _text(value: float | Sequence[float] | np.ndarray | None) -> str:
-    """Write a number or several; nothing where nothing is known."""
-    if value is None:
-        return ''
-    return ' '.join(f'{number:.6g}' for number in np.atleast_1d(value))

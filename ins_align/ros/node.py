@@ -26,7 +26,7 @@ from operator import itemgetter
 import time
 from typing import Any, NamedTuple
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
 from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
 from ins_align.checks import InputChecks
@@ -37,14 +37,14 @@ from ins_align.imu.prediction import Follower, Prediction
 from ins_align.mounting import Mounting
 from ins_align.results import Severity
 from ins_align.ros.diagnostics import (
-    diagnostic_status, inputs_in_words, LEVELS, parameter_descriptor, ReasonLog, topic_faults,
-    vector_msg)
+    diagnostic_status, inputs_in_words, parameter_descriptor, ReasonLog, topic_faults, vector_msg)
 from ins_align.ros.frames import frame_id_of, MountingSearch, open_buffer
 from ins_align.ros.gnss_inputs import (
     FIX_TOPIC, gnss_from_msg, gnss_topics, REJECTED_AS, VELOCITY_TOPIC, VELOCITY_TYPES)
 from ins_align.ros.imu_bytes import ImuSample, read_imu, with_orientation
 from ins_align.ros.on_demand import OnDemand, queued
 from ins_align.ros.worker import Worker
+from ins_align.status_values import level_of, WARN
 import numpy as np
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -383,7 +383,7 @@ class AlignmentNode(Node):
         first = self._next_status == 0.0  # nobody is known yet who publishes anything
         self._next_status = now + STATUS_PERIOD
         status = self._aligner.status()
-        level = LEVELS.get(status.state, DiagnosticStatus.WARN)
+        level = level_of(status.state)
         silent = 0.0 if self._imu_heard is None else now - self._imu_heard
         more = [] if first else self._input_faults(status, silent > IMU_SILENT)
         if silent > IMU_SILENT:
@@ -393,7 +393,7 @@ class AlignmentNode(Node):
             more.append(f'waits for {self._search.waits_for}')
         reason = f'{status.state.value}: {status.reason}'
         if more:
-            level = max(level, DiagnosticStatus.WARN)
+            level = max(level, WARN)
             status = dataclasses.replace(status, reason='; '.join([status.reason, *more]))
         msg = DiagnosticArray()
         msg.header.stamp = self.get_clock().now().to_msg()

@@ -1,0 +1,204 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Results as a recording (mcap) with the topics of the node, to play beside the original."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import math
+import os
+from pathlib import Path
+import tempfile
+from typing import Any
+
+from ins_align.geometry.earth import EARTH_RATE
+from ins_align.imu.buffer import MAX_GAP_NS
+from ins_align.imu.prediction import Prediction
+from ins_align.mounting import Mounting
+from ins_align.recordings import BagError
+from ins_align.recordings.bag import Bag
+from ins_align.recordings.decode import decode_imu_topic, deserialize
+from ins_align.recordings.replay import ReplayResult
+from ins_align.results import Epoch, State, Status
+from ins_align.status_values import base_values, level_of, status_values
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_typestore, Stores
+
+NAMESPACE = '/ins_align'
+IMU, ATTITUDE = 'sensor_msgs/msg/Imu', 'geometry_msgs/msg/QuaternionStamped'
+STATUS, VECTOR = 'diagnostic_msgs/msg/DiagnosticArray', 'geometry_msgs/msg/Vector3Stamped'
+TOPICS = {'imu': IMU, 'initial_attitude': ATTITUDE, 'status': STATUS,
+          'roll_pitch_yaw_deg': VECTOR, 'sigma_deg': VECTOR}
+STATUS_PERIOD_NS = 1_000_000_000  # and whenever the state is another one
+# Without GNSS there is an epoch every 2 s: what is older is not carried on with the gyros.
+MAX_AGE_NS = 2_500_000_000
+
+Record = tuple[str, int, Any]  # topic without its namespace, recorded time, message
+
+
+def write_results(result: ReplayResult, path: str | os.PathLike[str]) -> None:
+    """
+    Write the results of a recording as a rosbag2 (mcap) with the topics of the node.
+
+    Stamps are those of the input; the recorded time is that of the IMU message which follows.
+
+    Parameters
+    ----------
+    result : ReplayResult
+        What came of a recording, which is read once more for its IMU messages.
+    path : path
+        Directory to be made; written whole or not at all.
+
+    Raises
+    ------
+    BagError
+        If the path exists or the recording cannot be read any more.
+    OSError
+        If it cannot be written.
+
+    """
+    path = Path(path)
+    if path.exists():
+        raise BagError(f'{path} exists already: choose another name for the results or remove it')
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with tempfile.TemporaryDirectory(prefix=f'.{path.name}.', dir=path.parent) as directory:
+        unfinished = Path(directory) / path.name
+        with Writer(unfinished, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            connections = {name: writer.add_connection(f'{NAMESPACE}/{name}', msgtype,
+                                                       typestore=store)
+                           for name, msgtype in TOPICS.items()}
+            for name, time_ns, message in _Results(result, store.types).records():
+                writer.write(connections[name], time_ns,
+                             store.serialize_cdr(message, TOPICS[name]))
+        unfinished.rename(path)
+
+
+class _Results:
+    """Makes the messages of a result."""
+
+    def __init__(self, result: ReplayResult, types: Any) -> None:
+        self._result, self._types = result, types
+        self._mounting = Mounting(result.config, result.topics.C_imu_base)
+        self._state: State | None = None  # of the epoch before
+        self._status_ns = -STATUS_PERIOD_NS
+
+    def records(self) -> Iterator[Record]:
+        """Go through the recording's IMU messages, epochs between them."""
+        epochs = list(self._result.epochs)
+        prediction: Prediction | None = None
+        before_ns, before = 0, np.zeros(3)
+        time_ns = epoch_ns = 0
+        for time_ns, data, stamp_ns, gyro, accel in self._samples():
+            while epochs and epochs[0].stamp_ns <= stamp_ns:
+                epoch = epochs.pop(0)
+                yield from self._of_epoch(epoch, time_ns)
+                part = ((epoch.stamp_ns - before_ns) / (stamp_ns - before_ns)
+                        if before_ns < stamp_ns else 1.0)
+                prediction = self._prediction(epoch, before + max(part, 0.0) * (gyro - before))
+                epoch_ns = epoch.stamp_ns
+            before_ns, before = stamp_ns, gyro
+            if prediction is None:
+                if not epochs:
+                    break
+                continue
+            if stamp_ns > prediction.stamp_ns + MAX_GAP_NS \
+                    or stamp_ns > epoch_ns + MAX_AGE_NS:
+                prediction = None
+            elif prediction.carry(stamp_ns, gyro.tolist()) or stamp_ns == epoch_ns:
+                yield 'imu', time_ns, self._imu(prediction, data, gyro, accel)
+        for epoch in epochs:
+            yield from self._of_epoch(epoch, time_ns)
+        yield 'status', time_ns, self._status(self._result.status)
+
+    def _samples(self) -> Iterator[tuple[int, Any, int, Any, Any]]:
+        """Yield recorded time, message, stamp, rate and specific force of the IMU."""
+        topic = self._result.topics.imu
+        with Bag(self._result.bag) as bag:
+            for block in bag.blocks([topic]):
+                messages = block.messages[0]
+                samples = decode_imu_topic(messages, topic)
+                places = np.flatnonzero(samples.decoded)
+                for place, *numbers in zip(
+                        places.tolist(), samples.stamps_ns.tolist(), samples.gyro, samples.accel):
+                    yield int(block.times_ns[place]), messages[place], *numbers
+
+    def _prediction(self, epoch: Epoch, rate: Any) -> Prediction | None:
+        """Return the attitude to be carried on from an epoch while it is declared."""
+        if epoch.state is not State.ALIGNED or epoch.current is None:
+            return None
+        noise = self._result.config.imu_noise
+        return Prediction(
+            epoch.current.stamp_ns, epoch.current.C_nb, epoch.current.covariance, epoch.gyro_bias,
+            np.zeros((3, 3)), noise.angle_random_walk,
+            noise.gyro_bias_std ** 2 + EARTH_RATE ** 2, rate.tolist())
+
+    def _of_epoch(self, epoch: Epoch, time_ns: int) -> Iterator[Record]:
+        declared = epoch.state is State.ALIGNED and self._state is not State.ALIGNED
+        if declared and epoch.initial is not None:
+            yield 'initial_attitude', time_ns, self._types[ATTITUDE](
+                self._header(epoch.initial.stamp_ns), self._quaternion(
+                    epoch.initial.quaternion_xyzw))
+        if epoch.current is not None:
+            now = epoch.current
+            for name, values in (
+                    ('roll_pitch_yaw_deg', (now.roll_deg, now.pitch_deg, now.yaw_deg)),
+                    ('sigma_deg', now.sigma_deg.tolist())):
+                yield name, time_ns, self._types[VECTOR](
+                    self._header(now.stamp_ns), self._types['geometry_msgs/msg/Vector3'](*values))
+        if epoch.state is not self._state or epoch.stamp_ns >= self._status_ns + STATUS_PERIOD_NS:
+            self._status_ns = epoch.stamp_ns
+            yield 'status', time_ns, self._status(_status_of(epoch))
+        self._state = epoch.state
+
+    def _imu(self, prediction: Prediction, data: bytes, gyro: Any, accel: Any) -> Any:
+        """Return the input message with the orientation filled in."""
+        message = deserialize(data, self._result.topics.imu)
+        make = self._types
+        if self._result.topics.imu.msgtype == IMU:
+            rest = (message.angular_velocity, message.angular_velocity_covariance,
+                    message.linear_acceleration, message.linear_acceleration_covariance)
+        else:  # a driver's own
+            vector, unknown = make['geometry_msgs/msg/Vector3'], np.zeros(9)
+            rest = vector(*gyro.tolist()), unknown, vector(*accel.tolist()), unknown
+        return make[IMU](
+            self._header(prediction.stamp_ns, getattr(message, 'header', None)),
+            self._quaternion(prediction.quaternion_xyzw), np.array(prediction.covariance), *rest)
+
+    def _status(self, status: Status) -> Any:
+        make = self._types
+        values = [*status_values(status), *base_values(status, self._mounting)]
+        return make[STATUS](self._header(status.stamp_ns or 0), [
+            make['diagnostic_msgs/msg/DiagnosticStatus'](
+                level_of(status.state), 'ins_align: alignment',
+                f'{status.state.value}: {status.reason}'.removesuffix(': '), '',
+                [make['diagnostic_msgs/msg/KeyValue'](*each) for each in values])])
+
+    def _header(self, stamp_ns: int, source: Any = None) -> Any:
+        """Return a header; its frame_id is that of a source, or the world's."""
+        time = self._types['builtin_interfaces/msg/Time'](*divmod(stamp_ns, 1_000_000_000))
+        frame = self._result.config.world_frame_id if source is None else source.frame_id
+        return self._types['std_msgs/msg/Header'](time, frame)
+
+    def _quaternion(self, xyzw: Any) -> Any:
+        return self._types['geometry_msgs/msg/Quaternion'](*map(float, xyzw))
+
+
+def _status_of(epoch: Epoch) -> Status:
+    """Return what an epoch knows of a status: neither reason nor counts."""
+    unknown = np.full(3, math.nan)
+    return Status(
+        epoch.state, '', epoch.stamp_ns, None if epoch.initial is None else epoch.initial.stamp_ns,
+        None, epoch.initial, epoch.current, epoch.gyro_bias, unknown, epoch.accel_bias, unknown,
+        unknown, unknown, math.nan, math.nan, {})
