@@ -245,7 +245,7 @@ def test_an_imu_that_sends_no_numbers_is_silent(tmp_path):
 
 
 def test_an_imu_that_falls_silent_is_told(tmp_path):
-    messages = simulated_messages(flight(duration=20.0))
+    messages = simulated_messages(flight(duration=27.0))
     split = 2 * len(messages) // 3
     with Listener() as listener, running_node(PARAMETERS):
         play(script_of(messages[:split]), tmp_path, RATE)

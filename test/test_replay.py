@@ -13,7 +13,7 @@
 # limitations under the License.
 """Replay: the same numbers whatever the format, the blocks, the reference."""
 
-import dataclasses
+from dataclasses import replace
 import json
 from pathlib import Path
 import re
@@ -27,7 +27,7 @@ from ins_align.recordings import bag, BagError
 from ins_align.recordings.decode import Attitudes, Orientations
 from ins_align.recordings.replay import Reference, replay
 from ins_align.results import CSV_HEADER
-from ins_align.simulation.simulate import feed, simulate, Simulation, write_bag
+from ins_align.simulation.simulate import feed, simulate, write_bag
 import numpy as np
 import pytest
 from recordings import real_recording, write_recording
@@ -167,13 +167,9 @@ def test_window_is_by_recorded_time(flight, simulation):
 
 def test_track_is_of_fixes_that_are_some(tmp_path, simulation):
     """Receivers say 0, 0 while they look for satellites."""
-    class Cold(Simulation):
-
-        def fix(self, k):
-            fix = super().fix(k)
-            return fix if k >= 10 else fix._replace(latitude_deg=0.0, longitude_deg=0.0, status=-1)
-
-    write_bag(Cold(**vars(simulation)), tmp_path / 'cold')
+    places = simulation.lla_deg.copy()
+    places[:10] = 0.0
+    write_bag(replace(simulation, lla_deg=places), tmp_path / 'cold')
     result = replay(tmp_path / 'cold', CONFIG)
     assert result.status.counts['fix_no_fix'] == 10
     assert len(result.track) == len(simulation.gnss_stamps_ns) - 10
@@ -231,7 +227,7 @@ def test_body_frame_velocity_is_counted(flight, tmp_path):
 
 
 def test_positions_only(flight):
-    alone = replay(flight, dataclasses.replace(CONFIG, use_velocity=False))
+    alone = replay(flight, replace(CONFIG, use_velocity=False))
     assert alone.topics.velocity is None
     assert 'velocity' not in alone.status.counts
     assert alone.status.initial is not None

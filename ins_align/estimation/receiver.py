@@ -19,10 +19,9 @@ from ins_align.geometry.rotation import Array
 import numpy as np
 
 # The noise is taken to be larger than stated when innovations are LOUD times as large in the mean
-# square. That of a receiver that states none is estimated so that they are UNSTATED, less than 1
-# because the errors of such receivers last, down to LEAST_NOISE of the configured variance. It
-# follows at this rate, a single epoch counting up to the last.
-LOUD, UNSTATED, LEAST_NOISE, FOLLOW, CLIP = 2.0, 0.7, 1e-2, 0.02, 5.0
+# square; that of a receiver that states none is estimated, from LEAST_NOISE of the configured
+# variance on. It follows at this rate, a single epoch counting up to the last.
+LOUD, LEAST_NOISE, FOLLOW, CLIP = 2.0, 1e-2, 0.02, 5.0
 # A mean of innovations over some epochs, which forgets this share with each, shows errors that
 # last; so much more than white noise makes of it is chance.
 LASTING, CHANCE = 0.2, 0.5
@@ -77,7 +76,7 @@ class ReceiverNoise:
         east, north, up = np.square(normalised).tolist()
         noise = self._noise[kind]
         noise += FOLLOW * (np.minimum([0.5 * (east + north), up], CLIP)
-                           - (LOUD if stated else UNSTATED))
+                           - (LOUD if stated else 1.0))
         np.maximum(noise, 0.0 if stated else math.log(LEAST_NOISE), out=noise)
         self._heard += 1
         share = 1 / min(self._heard, MEMORY)

@@ -130,9 +130,12 @@ class Start:
         while True:
             C, residual, moments = _solved(s, a, time, places, kind)
             usual = float(np.mean(variance[places]))
-            noise = residual / (3 * (len(places) - 2 - kind) * usual)
+            rows = 3 * (len(places) - 2 - kind)
+            noise = residual / (rows * usual)
             values, vectors = np.linalg.eigh(moments)
             stated = any(epochs[k].stated[kind] for k in places)
+            if not stated:                          # by chance it may be so much more
+                noise *= 1 + math.sqrt(2 / rows)
             noise = max(noise, 1.0 if stated else LEAST_NOISE)
             if values[-1] < START_RATIO ** 2 * usual * noise:
                 return None
