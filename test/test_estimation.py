@@ -30,7 +30,8 @@ from ins_align.gnss.antenna import Antenna
 from ins_align.gnss.buffer import GnssBuffer
 from ins_align.imu.buffer import ImuBuffer
 from ins_align.imu.cutter import ImuCutter
-from ins_align.imu.preintegration import Noise, preintegrate, SensorErrors, split_at_epochs
+from ins_align.imu.intervals import SensorErrors
+from ins_align.imu.preintegration import Noise, preintegrate, split_at_epochs
 from ins_align.imu.recent import recent_motion
 from ins_align.results import Attitude
 import numpy as np
@@ -69,14 +70,20 @@ def exact_measurement(C, u, w, x):
     """Go back from the second epoch by the delay: velocity and position of the antenna there."""
     errors, delay, now = SensorErrors.of(x[GYRO:]), x[DELAY], EPOCHS[1]
 
+    def rate(time):
+        return (np.eye(3) - errors.gyro_matrix) @ rate_of(time) - errors.gyro_bias
+
+    def force(time):
+        return (np.eye(3) - errors.accel_matrix) @ force_of(time) - errors.accel_bias
+
     def back(age, y):
         B = y[:9].reshape(3, 3)
-        return np.concatenate([(-B @ skew(errors.rate(rate_of(now - age)))).ravel(),
-                               B @ errors.force(force_of(now - age)), y[9:12]])
+        return np.concatenate([(-B @ skew(rate(now - age))).ravel(), B @ force(now - age),
+                               y[9:12]])
 
     y = solve_ivp(back, (0.0, delay), np.concatenate([np.eye(3).ravel(), np.zeros(6)]),
                   rtol=1e-11, atol=1e-12).y[:, -1]
-    B, omega = y[:9].reshape(3, 3), errors.rate(rate_of(now - delay))
+    B, omega = y[:9].reshape(3, 3), rate(now - delay)
     return np.stack([u + C @ (B @ np.cross(omega, x[:3]) - y[9:12]), w + C @ (B @ x[:3] + y[12:])])
 
 

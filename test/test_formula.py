@@ -20,7 +20,8 @@ from ins_align.estimation.track import InertialTrack
 from ins_align.experiments.dense import bound
 from ins_align.experiments.note import exact_lever_remainder
 from ins_align.geometry.earth import EARTH_RATE, earth_rate_n
-from ins_align.imu.preintegration import Noise, preintegrate, SensorErrors, split_at_epochs
+from ins_align.imu.intervals import SensorErrors
+from ins_align.imu.preintegration import Noise, preintegrate, split_at_epochs
 from ins_align.simulation.simulate import simulate
 import numpy as np
 import pytest

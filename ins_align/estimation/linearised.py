@@ -21,7 +21,7 @@ means of a rival (docs, "Theory").
 from dataclasses import dataclass
 
 from ins_align.geometry.rotation import apply, Array, by_row, cross, exp_so3, skew
-from ins_align.imu.preintegration import Intervals
+from ins_align.imu.intervals import Intervals
 from ins_align.imu.recent import AGES, exact, smooth
 import numpy as np
 

@@ -27,9 +27,9 @@ from typing import NamedTuple
 from ins_align.config import ImuNoise
 from ins_align.geometry.rotation import Array, Index
 from ins_align.imu.buffer import ImuBuffer, MAX_GAP_NS
+from ins_align.imu.intervals import Intervals, SensorErrors
 from ins_align.imu.plausibility import IMU_BEFORE, RangeCheck, stuck, without_spikes
-from ins_align.imu.preintegration import (
-    Intervals, Noise, preintegrate, SensorErrors, split_at_epochs, Steps, white_noise)
+from ins_align.imu.preintegration import Noise, preintegrate, split_at_epochs, Steps, white_noise
 from ins_align.imu.recent import AGES, Recent, recent_motion
 import numpy as np
 

@@ -19,13 +19,13 @@ samples both are taken as cubics in time; a GNSS stamp inside a step splits it t
 of an interval, and all intervals of a batch, are handled as arrays.
 """
 
-from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from dataclasses import dataclass
 
 from ins_align.geometry.rotation import (
-    apply, Array, cross, cumulative_rotations, exp_and_left_jacobian, exp_so3, Index, log_so3,
-    orthonormalized, product, skew)
-from ins_align.imu.recent import Recent, RUNGS
+    Array, cross, cumulative_rotations, exp_and_left_jacobian, Index, orthonormalized, product,
+    skew)
+from ins_align.imu.intervals import Intervals, SensorErrors
+from ins_align.imu.recent import Recent
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -33,176 +33,6 @@ from numpy.typing import ArrayLike
 UNEVEN = 0.1
 # So many steps of the IMU are one to the derivatives.
 DERIVATIVE_STEPS = 4
-
-
-class SensorErrors(NamedTuple):
-    """
-    Errors of gyros and accelerometers that stay: true = measured - matrix @ measured - bias.
-
-    Attributes
-    ----------
-    gyro_bias, accel_bias : ndarray, shape (3,) or (K, 3)
-        rad/s, m/s^2.
-    gyro_matrix, accel_matrix : ndarray, shape (3, 3) or (K, 3, 3)
-        Scale factor errors on the diagonal, misalignment beside it.
-
-    """
-
-    gyro_bias: Array
-    gyro_matrix: Array
-    accel_bias: Array
-    accel_matrix: Array
-
-    @staticmethod
-    def none() -> 'SensorErrors':
-        """Return those of perfect sensors."""
-        return SensorErrors.of(np.zeros(24))
-
-    @staticmethod
-    def of(vector: Array) -> 'SensorErrors':
-        """Return those that make up a vector, shape (..., 24), the matrices row by row."""
-        gyro, accel = vector[..., :12], vector[..., 12:]
-        square = vector.shape[:-1] + (3, 3)
-        return SensorErrors(gyro[..., :3], gyro[..., 3:].reshape(square),
-                            accel[..., :3], accel[..., 3:].reshape(square))
-
-    def vector(self) -> Array:
-        """Return all of them, shape (24,): those of the gyros first, bias before matrix."""
-        return np.concatenate([array.ravel() for array in self])
-
-    def rate(self, measured: Array, biases: float = 1.0) -> Array:
-        """Return the true angular rate, or what is made of it and holds so many biases."""
-        return measured - apply(self.gyro_matrix, measured) - biases * self.gyro_bias
-
-    def force(self, measured: Array, biases: float = 1.0) -> Array:
-        """Return the true specific force, or what is made of it and holds so many biases."""
-        return measured - apply(self.accel_matrix, measured) - biases * self.accel_bias
-
-
-@dataclass(frozen=True)
-class Intervals:
-    """
-    Preintegrated IMU data of K intervals, each in the body frame at the interval's start.
-
-    Attributes
-    ----------
-    duration : ndarray, shape (K,)
-        Seconds.
-    R : ndarray, shape (K, 3, 3)
-        Rotation from the body frame at the end to the one at the start.
-    v, p : ndarray, shape (K, 3)
-        Integral and double integral of the specific force, m/s and m.
-    J_Rg, J_vg, J_pg, J_va, J_pa : ndarray, shape (K, 3, 12)
-        Derivatives to bias and matrix of the gyros (g) and of the accelerometers (a), in the order
-        of `SensorErrors.vector`: of the rotation as a left error (``R <- exp_so3(J_Rg d) R``), of
-        v, of p.
-    Q : ndarray, shape (K, 9, 9)
-        Covariance of the errors (rotation at the start, v, p) that the sensors' noise leaves.
-    Q_excess : ndarray, shape (K, 9, 9)
-        The same for the noise that was measured in excess of what is stated.
-    omega : ndarray, shape (K, 3)
-        Angular rate at the end of the interval, as measured.
-    gained, turned : ndarray, shape (K, RUNGS, 3)
-        Before the end of the interval, as measured; see `Recent`.
-
-    """
-
-    duration: Array
-    R: Array
-    v: Array
-    p: Array
-    J_Rg: Array
-    J_vg: Array
-    J_pg: Array
-    J_va: Array
-    J_pa: Array
-    Q: Array
-    Q_excess: Array
-    omega: Array
-    gained: Array
-    turned: Array
-
-    @staticmethod
-    def empty(capacity: int) -> 'Intervals':
-        """Room for `capacity` intervals, to be filled by `put`."""
-        shapes = {'duration': (), 'R': (3, 3), 'v': (3,), 'p': (3,), 'omega': (3,), 'Q': (9, 9),
-                  'Q_excess': (9, 9), 'gained': (RUNGS, 3), 'turned': (RUNGS, 3)}
-        return Intervals(**{field.name: np.zeros((capacity,) + shapes.get(field.name, (3, 12)))
-                            for field in fields(Intervals)})
-
-    def put(self, index: slice, other: 'Intervals') -> None:
-        """Copy the intervals of `other` into the places `index`."""
-        for name, array in vars(self).items():
-            array[index] = getattr(other, name)
-
-    def take(self, index: 'slice | Array') -> 'Intervals':
-        """Return the intervals of `index`."""
-        return Intervals(**{name: array[index] for name, array in vars(self).items()})
-
-    def end(self) -> 'Intervals':
-        """Return the interval of no length, and without noise, at the end of a single one."""
-        none = Intervals.empty(1)
-        none.R[:] = np.eye(3)
-        return replace(none, omega=self.omega, gained=self.gained, turned=self.turned)
-
-    def mirrored(self, signs: Array) -> 'Intervals':
-        """
-        Return what the intervals would be with the signs of sensors changed, leading axes (K, M).
-
-        To second order in the rotation over an interval, with rate and force steady in it: good
-        for telling the signs apart.
-
-        Parameters
-        ----------
-        signs : ndarray, shape (M, 4)
-            +1 or -1: of the gyros x, y, z and of the accelerometers.
-
-        """
-        gyro, accel = signs[:, :3], signs[:, 3:]
-        wider = {name: array[:, None] for name, array in vars(self).items()}
-        if (signs == 1).all():
-            shape = self.duration.size, len(signs)
-            return Intervals(**wider | {
-                name: np.broadcast_to(array, shape + array.shape[2:])
-                for name, array in wider.items() if name != 'duration'} | {
-                    'duration': self.duration})
-        turn = log_so3(self.R)[:, None]
-        # Forces act on average half and, for the way, a third of the rotation after the start.
-        half, third = (exp_so3(part * gyro * turn) @ exp_so3(-part * turn) for part in (1/2, 1/3))
-        ones = np.ones((len(signs), 3))
-        # What a bias does stays; an entry of a matrix is one in proportion to what is mirrored.
-        of_gyro = np.hstack([ones, np.tile(gyro, 3)])[:, None]
-        of_accel = np.hstack([ones, np.tile(accel, 9)])[:, None]
-        force = accel[:, None]
-        return Intervals(**wider | {
-            'duration': self.duration, 'R': exp_so3(gyro * turn),
-            'v': accel * apply(half, wider['v']), 'p': accel * apply(third, wider['p']),
-            'J_Rg': of_gyro * (half @ wider['J_Rg']),
-            'J_vg': force * of_gyro * (half @ wider['J_vg']),
-            'J_pg': force * of_gyro * (third @ wider['J_pg']),
-            'J_va': of_accel * (half @ wider['J_va']), 'J_pa': of_accel * (third @ wider['J_pa']),
-            'omega': gyro * wider['omega'], 'gained': force * wider['gained'],
-            'turned': gyro[:, None] * wider['turned']})
-
-    def corrected(self, change: Array) -> 'Intervals':
-        """
-        First-order correction of R, v and p for a change of the sensors' errors.
-
-        Noise and derivatives are left as they are: they change in second order only.
-
-        Parameters
-        ----------
-        change : ndarray, shape (24,) or (K, 24)
-            By how much they are larger than those that the samples were integrated with, in the
-            order of `SensorErrors.vector`.
-
-        """
-        gyro, accel = change[..., :12], change[..., 12:]
-        return Intervals(**{
-            **vars(self),
-            'R': exp_so3(apply(self.J_Rg, gyro)) @ self.R,
-            'v': self.v + apply(self.J_vg, gyro) + apply(self.J_va, accel),
-            'p': self.p + apply(self.J_pg, gyro) + apply(self.J_pa, accel)})
 
 
 @dataclass(frozen=True)
@@ -426,24 +256,7 @@ def preintegrate(steps: Steps, sensors: SensorErrors, noise: Noise,
     v, p = v_end[:, -1], p_end[:, -1]
     v_rest = v[:, None] - v_mid
     p_rest = p[:, None] - (p_end - 0.5 * p_step) - v_mid * remaining[..., None]
-    Q = Q_excess = np.zeros((dt.shape[0], 9, 9))
-    if any(np.any(density) for density in vars(noise).values()):
-        gyro_noise = _of_gyros(dt, v_rest, p_rest)
-        accel_noise = _of_accelerometers(dt, dt, remaining)
-
-        def covariance(gyro: ArrayLike, accel: ArrayLike) -> Array:
-            """Of the errors at the end, from densities in each step."""
-            gyro_least, gyro_more = _least_and_more(gyro, dt)
-            accel_least, accel_more = _least_and_more(accel, dt)
-            total = gyro_least * gyro_noise + accel_least * accel_noise
-            if gyro_more.any():
-                total += _of_gyros(gyro_more * dt, v_rest, p_rest)
-            if accel_more.any():
-                total += _of_accelerometers(accel_more * dt, dt, remaining)
-            return total
-
-        Q = covariance(noise.angle_random_walk, noise.velocity_random_walk)
-        Q_excess = covariance(noise.gyro_excess, noise.accel_excess)
+    Q, Q_excess = _covariances(noise, dt, v_rest, p_rest, remaining)
     # Intervals are chained for hours.
     R = orthonormalized(turned[:, -1])
     if recent is None:
@@ -452,6 +265,29 @@ def preintegrate(steps: Steps, sensors: SensorErrors, noise: Noise,
     return Intervals(*map(np.ascontiguousarray, (
         duration, R, v, p, *derivatives, Q, Q_excess, steps.omega[:, -1], recent.gained,
         recent.turned)))
+
+
+def _covariances(noise: Noise, dt: Array, v_rest: Array, p_rest: Array,
+                 remaining: Array) -> tuple[Array, Array]:
+    """Return covariances of the errors at the end from what is stated and from what is beyond."""
+    if not any(np.any(density) for density in vars(noise).values()):
+        return (np.zeros((dt.shape[0], 9, 9)),) * 2
+    gyro_noise = _of_gyros(dt, v_rest, p_rest)
+    accel_noise = _of_accelerometers(dt, dt, remaining)
+
+    def covariance(gyro: ArrayLike, accel: ArrayLike) -> Array:
+        """Of the errors at the end, from densities in each step."""
+        gyro_least, gyro_more = _least_and_more(gyro, dt)
+        accel_least, accel_more = _least_and_more(accel, dt)
+        total = gyro_least * gyro_noise + accel_least * accel_noise
+        if gyro_more.any():
+            total += _of_gyros(gyro_more * dt, v_rest, p_rest)
+        if accel_more.any():
+            total += _of_accelerometers(accel_more * dt, dt, remaining)
+        return total
+
+    return (covariance(noise.angle_random_walk, noise.velocity_random_walk),
+            covariance(noise.gyro_excess, noise.accel_excess))
 
 
 def _applied(matrix: Array, vectors: Array) -> Array:
