@@ -156,13 +156,15 @@ class Config:
         0.0, "rate random walk of the gyroscopes: how their biases change; 0: the preset's",
         'deg/s/sqrt(h)', minimum=0.0, maximum=100.0)
     velocity_std: float = _parameter(
-        0.3, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none', 'm/s',
+        0.3, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none, and '
+        'where its estimate starts then', 'm/s',
         minimum=1e-4, maximum=100.0)
     velocity_std_vertical: float = _parameter(
         0.6, 'vertical GNSS velocity, 1 sigma, where messages carry none', 'm/s',
         minimum=1e-4, maximum=100.0)
     position_std: float = _parameter(
-        2.5, 'horizontal GNSS position, 1 sigma per axis, where messages carry none', 'm',
+        2.5, 'horizontal GNSS position, 1 sigma per axis, where messages carry none, and '
+        'where its estimate starts then', 'm',
         minimum=1e-4, maximum=1000.0)
     position_std_vertical: float = _parameter(
         5.0, 'vertical GNSS position, 1 sigma, where messages carry none', 'm',
