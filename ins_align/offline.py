@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 MESSAGES = 2500
 # Stamps that were seconds are below this (ns); those that were nanoseconds by mistake are not.
 MAX_STAMP_NS = 9e18
+# Stamps of a receiver that are closer were not nanoseconds.
+MIN_INTERVAL_NS = 1000
 
 
 class Recorded:
@@ -106,8 +108,8 @@ class Recorded:
 
 
 def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
-          fixes: ArrayLike | Sequence[Fix], velocities: ArrayLike | Sequence[Velocity] = (),
-          **config: Any) -> Result:
+          fixes: ArrayLike | Sequence[Fix],
+          velocities: ArrayLike | Sequence[Velocity] | None = None, **config: Any) -> Result:
     """
     Align arrays.
 
@@ -121,7 +123,7 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
         Columns: stamp, in the unit of `stamps` and of the same clock; latitude, longitude,
         degrees; altitude, m; if known three standard deviations, m, or nine covariances, m^2,
         east-north-up.
-    velocities : array_like, shape (L, 4), (L, 7) or (L, 13); or sequence of Velocity
+    velocities : array_like, shape (L, 4), (L, 7) or (L, 13); or sequence of Velocity; or None
         Columns: stamp; east, north, up, m/s; if known three standard deviations, m/s, or nine
         covariances, m^2/s^2.
     **config
@@ -139,7 +141,7 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     ConfigError
         If a parameter is not known or its value is wrong.
     ValueError
-        If an array has the wrong shape or its stamps are no times.
+        If an array has the wrong shape, or its stamps are no times or in another unit.
 
     """
     settings = config_from_mapping(config)
@@ -151,7 +153,8 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
             raise ValueError(f'{name} has the shape {array.shape} and stamps {stamps_ns.shape}: '
                              'they must be (N, 3) and (N,)')
     gnss = _messages('fixes', fixes, Fix, unit_ns)
-    gnss += _messages('velocities', velocities, Velocity, unit_ns, settings)
+    if velocities is not None:
+        gnss += _messages('velocities', velocities, Velocity, unit_ns, settings)
     gnss.sort(key=lambda message: message.stamp_ns)
     # Each message comes behind the IMU samples that have its stamp or an older one.
     before = np.searchsorted(np.maximum.accumulate(stamps_ns),
@@ -189,6 +192,9 @@ def _messages(name: str, given: Any, kind: type, unit_ns: float,
                          f'(K, 13), with stamp, {columns}, and three standard deviations or nine '
                          'covariances if they are known')
     stamps_ns = _nanoseconds(name, table[:, 0], unit_ns)
+    if unit_ns == 1.0 and 0 < np.ptp(stamps_ns) < len(table) * MIN_INTERVAL_NS:
+        raise ValueError(f'the stamps of {name} must be nanoseconds, as those of the IMU, which '
+                         'are integers: they look like seconds')
     known = table.shape[1] > 4
     covariances = np.zeros((len(table), 6, 6))
     if table.shape[1] == 7:

@@ -261,9 +261,6 @@ class Result:
     def to_json(self) -> dict[str, Any]:
         """Return the object that ``--json`` writes; numbers that are not finite are None."""
         status = self.status
-        final = attitude_json(status.current)
-        if final is not None and status.current is not None:
-            final = {'stamp': status.current.stamp_ns, **final}
         return {
             'aligned': self.aligned,
             'state': status.state.value,
@@ -271,7 +268,8 @@ class Result:
             't0': status.t0_ns,
             'time_to_align_s': status.time_to_align_s,
             'initial_attitude': attitude_json(status.initial),
-            'final_attitude': final,
+            'declared_attitude': _stamped(self.declared),
+            'final_attitude': _stamped(status.current),
             'gyro_bias_rad_s': _finite(status.gyro_bias),
             'accel_bias_m_s2': _finite(status.accel_bias),
             'lever_arm_m': _finite(status.lever_arm),
@@ -293,6 +291,13 @@ class Result:
                 cells += [repr(number) if math.isfinite(number) else '' for number in numbers]
             out.write(','.join(cells) + '\n')
         return out.getvalue()
+
+
+def _stamped(attitude: Attitude | None) -> dict[str, Any] | None:
+    values = attitude_json(attitude)
+    if attitude is None or values is None:
+        return None
+    return {'stamp': attitude.stamp_ns, **values}
 
 
 def attitude_json(attitude: Attitude | None) -> dict[str, Any] | None:

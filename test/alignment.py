@@ -26,7 +26,7 @@ LEVER = (1.0, 1.0, 1.0)
 
 @lru_cache(maxsize=64)
 def simulated(scenario, **options):
-    """Return a simulation; the same arguments give the same object."""
+    """Return a simulation; the same arguments give the same object, so change only copies."""
     return simulate(scenario, **options)
 
 

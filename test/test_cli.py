@@ -71,8 +71,8 @@ def test_aligned(flight, tmp_path, capsys):
     result = json.loads(outputs['json'].read_text())
     assert list(result) == [
         'bag', 'aligned', 'state', 'reason', 't0', 'time_to_align_s', 'initial_attitude',
-        'final_attitude', 'gyro_bias_rad_s', 'accel_bias_m_s2', 'lever_arm_m', 'gnss_delay_s',
-        'counts']
+        'declared_attitude', 'final_attitude', 'gyro_bias_rad_s', 'accel_bias_m_s2', 'lever_arm_m',
+        'gnss_delay_s', 'counts']
     assert result['aligned'] is True and result['state'] == 'ALIGNED'
     assert type(result['t0']) is int and type(result['final_attitude']['stamp']) is int
     assert list(result['initial_attitude']) == [
@@ -137,7 +137,7 @@ def test_too_little_for_an_attitude(flight, tmp_path, capsys):
                  '--json', str(tmp_path / 'a.json'), '--csv', str(tmp_path / 'a.csv'),
                  '--plot', str(tmp_path / 'a.png')]) == 1
     result = json.loads((tmp_path / 'a.json').read_text())
-    assert result['initial_attitude'] is None and result['final_attitude'] is None
+    assert all(result[f'{name}_attitude'] is None for name in ('initial', 'declared', 'final'))
     assert result['t0'] is None
     assert result['gyro_bias_rad_s'] == [0.0, 0.0, 0.0] and result['lever_arm_m'] == [1, 2, 3]
     assert len((tmp_path / 'a.csv').read_text().splitlines()) == 1

@@ -463,6 +463,7 @@ def test_topics_that_are_missing(tmp_path, topics):
     assert info.command is None
     assert 'has no ' in info.obstacles[-1]
     assert 'it cannot be aligned' in describe(info)
+    assert ('positions alone' in describe(info)) == (topics == {'/fix': FIX})
     json.dumps(info.to_json(), allow_nan=False)
 
 

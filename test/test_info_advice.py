@@ -204,3 +204,14 @@ def test_both_biases_beyond_the_default_are_another_grade(tmp_path):
                      gyro=truth.gyro + np.radians([0.8, -0.8, 0.8]))
     assert settings_of(info) == {'imu_grade': 'chip'}
     assert 'suits imu_grade chip' in describe(info)
+
+
+@pytest.mark.parametrize('error, is_set', [(0.0, False), (0.4, True)])
+def test_a_bias_is_among_the_settings_only_where_it_is_said(tmp_path, error, is_set):
+    truth = drive(accel_bias_std=0.0, duration=40.0)
+    noise = np.radians(0.5) * np.random.default_rng(1).standard_normal(truth.gyro.shape)
+    info = inspected(truth, tmp_path / 'a', gyro=truth.gyro + noise,
+                     accel=truth.accel + [0.0, 0.0, error])
+    assert 'worse than imu_grade mems: more noise' in describe(info)
+    assert ('more bias is among the settings' in describe(info)) == is_set
+    assert ('accel_bias_std' in settings_of(info)) == is_set

@@ -70,6 +70,9 @@ def test_attitudes_are_right_and_their_covariances_too(flight, result):
     assert result.initial.stamp_ns == result.status.t0_ns
     assert result.current.stamp_ns == result.epochs[-1].stamp_ns
     assert len(result.epochs) == len(flight.gnss_stamps_ns)
+    declared = result.to_json()['declared_attitude']
+    assert declared['stamp'] == result.declared.stamp_ns
+    assert declared['quaternion_xyzw'] == result.declared.quaternion_xyzw.tolist()
 
 
 def test_it_is_what_replay_says(flight, result, tmp_path):
@@ -119,7 +122,7 @@ def test_velocities_north_east_down(flight, result):
 
 def test_positions_alone():
     s = simulated('car', duration=60.0, seed=1, position_std=0.02)
-    alone = ins_align.align(*imu(s), tables(s, 'std')[0], **LEVER)
+    alone = ins_align.align(*imu(s), tables(s, 'std')[0], None, **LEVER)
     assert alone.aligned and 'velocity' not in alone.status.counts
     assert np.all(np.abs(error_of(alone.current, s))
                   < 4 * np.sqrt(np.diag(alone.current.covariance)))
@@ -168,6 +171,8 @@ def test_no_data():
     ({'velocities': np.zeros((5, 8))}, r'velocities have the shape \(5, 8\).*north'),
     ({'fixes': np.full((5, 4), np.nan)}, 'stamps of fixes must be seconds'),
     ({'stamps': np.arange(3001.0) + 1.7e18}, 'stamps of the IMU must be seconds'),
+    ({'velocities': np.outer(np.arange(30.0), [0.2, 0.1, 0.1, 0.0])},
+     'stamps of velocities must be nanoseconds'),
 ])
 def test_wrong_arrays_end_in_a_sentence(flight, change, message):
     stamps, gyro, accel = imu(flight)

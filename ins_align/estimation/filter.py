@@ -34,7 +34,8 @@ from ins_align.geometry.rotation import apply, Array, exp_so3, Index, log_so3
 import numpy as np
 
 # Normalised innovation squared of three rows above which a measurement is an outlier: one good
-# one in 60 000 is (chi-square with three degrees of freedom).
+# one in 60 000 is (chi-square with three degrees of freedom). To the weights it counts as this
+# much, so whatever else rejects a measurement must not leave its value below.
 GATE = 25.0
 _EYE = np.eye(3)
 

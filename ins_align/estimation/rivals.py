@@ -52,8 +52,10 @@ class Rival:
         What to do then.
     signs : tuple of float
         Of the gyros x, y, z and of the accelerometers.
-    gyro, accel : float
-        Factor on the gyros' bias and rate random walk; on the accelerometers' bias.
+    gyro : float
+        Factor on the gyros' bias and rate random walk.
+    accel : float
+        Factor on the accelerometers' bias.
     lever_arm_std, gnss_delay_std, gyro_bias_std, accel_bias_std : float
         At least so much (SI).
     prior : float

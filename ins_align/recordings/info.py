@@ -296,7 +296,7 @@ class _Survey:
         self._advise(no_fix > MAX_NO_FIX, f'{no_fix:.0%} of the positions are without a fix')
         if velocity is None or velocity.frame is None:
             self._advise(velocities, setting='use_velocity=false')
-            self._advise(True, 'there is no velocity that can be used: it is aligned from '
+            self._advise(fix, 'there is no velocity that can be used: it is aligned from '
                          'positions alone, which takes longer unless they are RTK')
             return
         name, data = velocity.frame.frame, self._data[velocity.kind, velocity.name]
@@ -449,8 +449,8 @@ def _about_imu(imu: ImuFacts) -> list[str]:
         return [*lines, f'imu_grade: no worse than {imu.grade}' if imu.grade_covers else
                 f'imu_grade: never at rest to measure it; {Config.imu_grade} is the default']
     return [*lines, f'suits imu_grade {imu.grade}' if imu.grade_covers else
-            f'worse than imu_grade {imu.grade}: more noise is measured while aligning, more bias '
-            'is among the settings']
+            f'worse than imu_grade {imu.grade}: more noise is measured while aligning'
+            + ', more bias is among the settings' * ('bias_std' in str(imu.settings))]
 
 
 def _about_resolution(name: str, found: Resolution, scale: float, unit: str) -> list[str]:
