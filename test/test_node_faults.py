@@ -55,6 +55,7 @@ def wait_until_taken(listener, messages):
     listener.wait_for_next_status()
 
 
+@pytest.mark.campaign
 def test_faulty_drivers(tmp_path):
     simulation = flight(duration=30.0, imu_jitter=0.2, gnss_rate=10.0, gnss_latency=0.9)
     messages, faults = spoilt(simulated_messages(simulation))
@@ -182,6 +183,7 @@ def test_velocity_in_a_body_frame_is_refused(tmp_path):
     assert not listener.attitudes
 
 
+@pytest.mark.campaign
 def test_frame_of_the_imu_changes(tmp_path):
     simulation = flight(duration=36.0)
     messages = simulated_messages(simulation)
@@ -202,6 +204,7 @@ def test_frame_of_the_imu_changes(tmp_path):
     assert listener.statuses[-1].status[0].hardware_id == 'imu_of_the_other_make'
 
 
+@pytest.mark.campaign
 def test_two_imus_on_one_topic(tmp_path):
     simulation = flight(duration=24.0)
     messages = simulated_messages(simulation)
@@ -230,6 +233,7 @@ def replaced_imu(msg):
     return other
 
 
+@pytest.mark.campaign
 def test_an_imu_that_sends_no_numbers_is_silent(tmp_path):
     messages = simulated_messages(flight(duration=20.0))
     for k, (_, topic, msg) in enumerate(messages):
@@ -262,6 +266,7 @@ def test_an_imu_that_falls_silent_is_told(tmp_path):
     assert listener.count('imu_gap') == 0  # by the stamps there was none
 
 
+@pytest.mark.campaign
 def test_a_bag_that_loops_in_simulated_time(tmp_path):
     simulation = flight()
     once = simulated_messages(simulation)
@@ -294,6 +299,7 @@ def test_a_bag_that_loops_in_simulated_time(tmp_path):
     assert len([stamp for stamp in stamps if end - stamp < 100_000_000]) >= 3
 
 
+@pytest.mark.campaign
 def test_reset_in_the_middle(tmp_path):
     simulation = flight(duration=36.0)
     messages = simulated_messages(simulation)
@@ -322,6 +328,7 @@ def test_reset_in_the_middle(tmp_path):
     assert severities(node, 'alignment starts over: requested by service') == ['WARN']
 
 
+@pytest.mark.campaign
 def test_accelerations_in_g_are_an_error(tmp_path):
     messages = simulated_messages(flight(duration=12.0))
     for _, topic, msg in messages:

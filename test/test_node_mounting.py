@@ -116,7 +116,8 @@ def test_what_is_wanted_is_waited_for_and_named():
     assert np.array_equal(mounting.C_imu_base, np.eye(3))
 
 
-@pytest.mark.parametrize('base_frame', ['', 'base_link'])
+@pytest.mark.parametrize('base_frame', [
+    '', pytest.param('base_link', marks=pytest.mark.campaign)])
 def test_node_with_tf_gives_the_numbers_of_the_parameter(tmp_path, monkeypatch, base_frame):
     package = tmp_path / 'path' / 'tf2_ros'
     package.mkdir(parents=True)
