@@ -28,7 +28,8 @@ from ins_align.estimation.filter import Filters, Track
 from ins_align.estimation.linearised import (
     DELAY, FIRST, GYRO, Linearised, linearised, MAX_DELAY, MIN_DELAY, PHI, PHI0, triads)
 from ins_align.estimation.receiver import ReceiverNoise
-from ins_align.estimation.rivals import in_words, log_sum, Parameters, rivals_of, SHARE
+from ins_align.estimation.rivals import (
+    in_words, level_in_words, log_sum, Parameters, rivals_of, SHARE)
 from ins_align.estimation.start import all_headings, HEADINGS, OPEN_POSITION, RoughAttitude, Start
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.rotation import Array, exp_so3, log_so3
@@ -400,10 +401,13 @@ class Bank:
             return Fit(self._offered, delay=self._config.gnss_delay)
         words, contradicted = self._doubt()
         velocity, position, either = self._rejected
+        level = self._rivals[filters.ids[self._best(filters)]]
         return Fit(self._offered, 3 * (self._offered - either), self._receiver.misfit,
                    self._nis, self._innovation, velocity, position, either,
                    delay=self._config.gnss_delay + float(self._body()[0][DELAY]),
-                   objection=words if contradicted else '', remarks=self._remarks(filters))
+                   objection=words if contradicted else '',
+                   remarks=(self._receiver.in_words()
+                            + level_in_words(level, self._config.imu_noise)))
 
     def move_t0(self) -> None:
         """Move t0 to the last epoch."""
@@ -449,18 +453,6 @@ class Bank:
             return in_words(self._rivals[filters.ids[worst]], filters.x[filters.lead[worst]],
                             self._config.gnss_delay), True
         return 'the signs of the IMU axes are not confirmed by the motion yet: turn', False
-
-    def _remarks(self, filters: Filters) -> str:
-        """Return how the sensors are others than configured, as the end of a sentence."""
-        words, noise = self._receiver.in_words(), self._config.imu_noise
-        level = self._rivals[filters.ids[self._best(filters)]]
-        if level.gyro > 1:
-            words += ('; the gyros are worse than configured: set gyro_bias_std to '
-                      f'{level.gyro * math.degrees(noise.gyro_bias_std):.2g}')
-        if level.accel > 1:
-            words += ('; the accelerometers are worse than configured: set accel_bias_std to '
-                      f'{level.accel * noise.accel_bias_std:.2g}')
-        return words
 
     def _body(self) -> tuple[Array, Array]:
         filters = self._filters

@@ -22,7 +22,7 @@ others are levels of the same configuration: what they say counts by their likel
 from dataclasses import dataclass
 import math
 
-from ins_align.config import Config, PRESETS
+from ins_align.config import Config, ImuNoise, PRESETS
 from ins_align.estimation.linearised import DELAY, FIRST, GYRO, LEVER_ARM, triads
 from ins_align.geometry.rotation import Array
 import numpy as np
@@ -191,6 +191,20 @@ def in_words(rival: Rival, x: Array, gnss_delay: float) -> str:
         gyro=listed(np.degrees(x[gyro][:3]), '.2g'),
         accel=listed(x[accel][:3], '.2g'))
     return f'the data fit better with {better}: {rival.advice}'
+
+
+def level_in_words(level: Rival, noise: ImuNoise) -> str:
+    """Return how a level is worse than the configured noise, as the end of a sentence, or ''."""
+    words = ''
+    if level.gyro > 1:
+        bias, walk = (level.gyro * math.degrees(value)
+                      for value in (noise.gyro_bias_std, noise.rate_random_walk))
+        words += (f'; the gyros look worse than configured: gyro_bias_std {bias:.2g} and '
+                  f'rate_random_walk {60 * walk:.2g} fit better')
+    if level.accel > 1:
+        words += ('; the accelerometers look worse than configured: accel_bias_std '
+                  f'{level.accel * noise.accel_bias_std:.2g} fits better')
+    return words
 
 
 def gyro_matrix_std(scale_std: float) -> Array:
