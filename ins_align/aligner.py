@@ -30,7 +30,6 @@ from ins_align.config import Config, ConfigError, parameters
 from ins_align.estimation.bank import Bank, Learnt
 from ins_align.estimation.declaration import Declaration, Fit
 from ins_align.estimation.formula import NoteMethod
-from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.antenna import Antenna, AntennaEpoch
 from ins_align.gnss.buffer import GnssBuffer, GnssEpoch, PAIR_NS
@@ -441,11 +440,10 @@ class Aligner:
         stamps, rates, rate = since
         if self._prediction is None:
             sensors = method.sensor_errors()
-            bias_std = float(np.max(method.nuisance().gyro_bias_std))
-            self._prediction = Prediction(
-                current.stamp_ns, current.C_nb, current.covariance, sensors.gyro_bias,
-                sensors.gyro_matrix, self.config.imu_noise.angle_random_walk,
-                bias_std ** 2 + EARTH_RATE ** 2, rate.tolist())
+            self._prediction = Prediction.of(
+                current, sensors.gyro_bias, sensors.gyro_matrix,
+                float(np.max(method.nuisance().gyro_bias_std)),
+                self.config.imu_noise.angle_random_walk, rate)
         self._prediction.carry_many(stamps, rates)
         return copy(self._prediction)
 

@@ -39,7 +39,7 @@ MAX_STAMP_NS = 9e18
 MIN_INTERVAL_NS = 1000
 
 
-class Recorded:
+class OfflineAligner:
     """
     An aligner that takes recorded data, and collects what comes of it.
 
@@ -159,7 +159,7 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     # Each message comes behind the IMU samples that have its stamp or an older one.
     before = np.searchsorted(np.maximum.accumulate(stamps_ns),
                              [message.stamp_ns for message in gnss], side='right')
-    run = Recorded(settings)
+    run = OfflineAligner(settings)
     first = 0
     for start in range(0, stamps_ns.size, MESSAGES):
         part = slice(start, start + MESSAGES)

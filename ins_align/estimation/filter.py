@@ -17,7 +17,7 @@ Error-state Kalman filters whose errors are the body's: many means, one covarian
 A mean is the attitude ``C = C_n0b``, the velocity u and the position w of the IMU in n0, the
 attitude C0 at t0 and the parameters x of the body (lever arm, delay, errors of gyros and
 accelerometers). n0 is the local level frozen at the last epoch that was processed before; gravity
-and the rotation of the Earth are in the GNSS side s_v, s_p (`formula.InertialTrack`), so that
+and the rotation of the Earth are in the GNSS side s_v, s_p (`track.InertialTrack`), so that
 propagation is pure integration of preintegrated intervals. u and w are those which a receiver
 whose measurements are late by its delay sees. Errors are
 
@@ -43,7 +43,7 @@ _EYE = np.eye(3)
 @dataclass
 class Track:
     """
-    The GNSS side of K epochs in n0; see `formula.InertialTrack`.
+    The GNSS side of K epochs in n0; see `track.InertialTrack`.
 
     Attributes
     ----------

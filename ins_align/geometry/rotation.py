@@ -268,16 +268,14 @@ def log_so3(matrix: ArrayLike) -> Array:
         axis[..., 0] = m[..., 2, 1] - m[..., 1, 2]
         axis[..., 1] = m[..., 0, 2] - m[..., 2, 0]
         axis[..., 2] = m[..., 1, 0] - m[..., 0, 1]
-        sine = 0.5 * np.sqrt(_squared_norm(axis))
-        small = sine < 1e-12
-        scale = np.where(small, 0.5, 0.5 * _arctan2(sine, cosine) / np.where(small, 1.0, sine))
-        return axis * scale[..., None]
-    q = quaternion_from_matrix(m)
-    sine = np.sqrt(np.sum(q[..., :3] ** 2, axis=-1))
-    angle = 2 * _arctan2(sine, q[..., 3])
+        axis, part = 0.5 * axis, 1.0                # of the angle, whose sine the axis has
+    else:
+        q = quaternion_from_matrix(m)
+        axis, cosine, part = q[..., :3], q[..., 3], 2.0
+    sine = np.sqrt(_squared_norm(axis))
     small = sine < 1e-12
-    scale = np.where(small, 2.0, angle / np.where(small, 1.0, sine))
-    return q[..., :3] * scale[..., None]
+    scale = np.where(small, part, part * _arctan2(sine, cosine) / np.where(small, 1.0, sine))
+    return axis * scale[..., None]
 
 
 def _arctan2(y: Array, x: Array) -> Array:

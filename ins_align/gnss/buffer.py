@@ -144,11 +144,7 @@ class GnssBuffer:
                 self._counts['fix_status_unknown'] += 1
             if not fix.vertical:
                 self._counts['fix_no_altitude'] += 1
-            epoch = self._epoch(fix.stamp_ns, imu_newest_ns, 'fix')
-            if epoch is not None and epoch.fix is None:
-                epoch.fix = fix
-            elif epoch is not None:
-                self._counts['fix_duplicate'] += 1
+            self._put('fix', fix, imu_newest_ns)
 
     def add_velocity(self, velocity: Velocity, imu_newest_ns: int | None) -> None:
         """Take a velocity, or count why not."""
@@ -156,13 +152,16 @@ class GnssBuffer:
         usable = usable_velocity(velocity)
         if usable is None:
             self._counts['velocity_nan'] += 1
-            return
-        velocity = usable
-        epoch = self._epoch(velocity.stamp_ns, imu_newest_ns, 'velocity')
-        if epoch is not None and epoch.velocity is None:
-            epoch.velocity = velocity
+        else:
+            self._put('velocity', usable, imu_newest_ns)
+
+    def _put(self, kind: str, message: Fix | Velocity, imu_newest_ns: int | None) -> None:
+        """Put a fix or a velocity into the epoch of its stamp; of two the first counts."""
+        epoch = self._epoch(message.stamp_ns, imu_newest_ns, kind)
+        if epoch is not None and getattr(epoch, kind) is None:
+            setattr(epoch, kind, message)
         elif epoch is not None:
-            self._counts['velocity_duplicate'] += 1
+            self._counts[f'{kind}_duplicate'] += 1
 
     def _off(self, stamp_ns: int, imu_newest_ns: int | None) -> str:
         """Return how a stamp is too far from the IMU to be used: ``late``, ``ahead`` or ''."""

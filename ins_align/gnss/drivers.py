@@ -149,8 +149,8 @@ def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velo
     for field, degrees, limit in zip(row.position, position, (90.0, 360.0)):
         if has_fix and abs(degrees) > limit:
             raise MessageError(
-                f'{field} of {in_words(msgtype)} comes to {degrees:.6g} deg: it must be in units '
-                f'of {row.position[field]:.6g} deg')
+                f'{field} of {type_in_words(msgtype)} comes to {degrees:.6g} deg: it must be in '
+                f'units of {row.position[field]:.6g} deg')
     fix, = fixes([stamp_ns], [position], _covariance(position_std),
                  [getattr(msg, 'position_covariance_type', 2)], [0 if has_fix else -1])
     velocity, = velocities(
@@ -178,14 +178,14 @@ def imu_from_driver(msg: Any, msgtype: str) -> tuple[int, np.ndarray, np.ndarray
         raise _no_field(msgtype, error) from None
 
 
-def in_words(msgtype: str) -> str:
+def type_in_words(msgtype: str) -> str:
     """Return a message type as users know it: sensor_msgs/Imu."""
     return msgtype.replace('/msg/', '/')
 
 
 def _no_field(msgtype: str, error: AttributeError) -> MessageError:
-    return MessageError(f'{in_words(msgtype)} has no field {error.name} here: its definition is '
-                        'of another version than the ones that are known')
+    return MessageError(f'{type_in_words(msgtype)} has no field {error.name} here: its '
+                        'definition is of another version than the ones that are known')
 
 
 def _numbers(msg: Any, row: Receiver, fields: Mapping[str, float]) -> list[Any]:

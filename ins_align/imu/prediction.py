@@ -23,9 +23,11 @@ from collections.abc import Sequence
 import copy
 import math
 
+from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import (
     apply, Array, matrix_from_quaternion, quaternion_from_matrix)
 from ins_align.imu.buffer import MAX_GAP_NS, MAX_RATE
+from ins_align.results import Attitude
 import numpy as np
 
 # So many samples are kept until it is known from which of them on to carry.
@@ -70,6 +72,14 @@ class Prediction:
         self._rate = tuple(rate)            # as measured last
         self._white_variance = angle_random_walk ** 2
         self._rate_variance = rate_variance
+
+    @staticmethod
+    def of(attitude: Attitude, gyro_bias: Array, gyro_matrix: Array, gyro_bias_std: float,
+           angle_random_walk: float, rate: Array) -> 'Prediction':
+        """Stand at an estimate; that the Earth turns, too, is left out and counts as an error."""
+        return Prediction(attitude.stamp_ns, attitude.C_nb, attitude.covariance, gyro_bias,
+                          gyro_matrix, angle_random_walk, gyro_bias_std ** 2 + EARTH_RATE ** 2,
+                          rate.tolist())
 
     def carry(self, stamp_ns: int, gyro: Sequence[float]) -> bool:
         """

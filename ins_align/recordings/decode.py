@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from ins_align.config import Config
 from ins_align.gnss.drivers import (
-    DRIVER_TYPES, imu_from_driver, in_words, receiver_from_msg, RECEIVERS)
+    DRIVER_TYPES, imu_from_driver, receiver_from_msg, RECEIVERS, type_in_words)
 from ins_align.gnss.messages import Fix, fixes, MessageError, velocities, Velocity
 from ins_align.recordings import Topic
 import numpy as np
@@ -217,8 +217,9 @@ def deserialize(data: bytes, topic: Topic) -> Any:
     """
     if topic.msgtype in DRIVER_TYPES and not topic.definition:
         raise MessageError(
-            f'the recording has no definition of {in_words(topic.msgtype)}: record as mcap, where '
-            'the package of that message is installed, or "ros2 bag convert" it there to mcap')
+            f'the recording has no definition of {type_in_words(topic.msgtype)}: record as mcap, '
+            'where the package of that message is installed, or "ros2 bag convert" it there to '
+            'mcap')
     try:
         store = _typestore(topic.encoding, topic.msgtype,
                            topic.definition if topic.msgtype in DRIVER_TYPES else '')
@@ -230,15 +231,18 @@ def deserialize(data: bytes, topic: Topic) -> Any:
                            f'{topic.msgtype}') from None
 
 
-def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config, kind: str = '',
-                ) -> list[Fix | Velocity | Refused]:
-    """
-    Decode messages of one of GNSS_TYPES or RECEIVERS, or say of each why not.
+def decode_by_kind(messages: Sequence[bytes], topic: Topic, config: Config,
+                   ) -> dict[str, Sequence[Fix | Velocity | Refused]]:
+    """Decode a GNSS topic: its fixes or its velocities, of one of RECEIVERS both."""
+    if topic.msgtype not in RECEIVERS:
+        return {GNSS_TYPES[topic.msgtype].kind: decode_gnss(messages, topic, config)}
+    both = [_of_receiver(data, topic, config) for data in messages]
+    return {'fix': [fix for fix, _ in both], 'velocity': [velocity for _, velocity in both]}
 
-    Of the latter, which have both, `kind` says which is wanted, fix or velocity.
-    """
-    if topic.msgtype in RECEIVERS:
-        return [_of_receiver(data, topic, config, kind) for data in messages]
+
+def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config,
+                ) -> list[Fix | Velocity | Refused]:
+    """Decode messages of one of GNSS_TYPES, or say of each why not."""
     kind, values, covariance, more = GNSS_TYPES[topic.msgtype]
     read = attrgetter('header.stamp.sec', 'header.stamp.nanosec',
                       *f'{values} {more} {covariance}'.split())
@@ -267,10 +271,11 @@ def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config, kind: s
     return decoded
 
 
-def _of_receiver(data: bytes, topic: Topic, config: Config, kind: str) -> Fix | Velocity | Refused:
-    """Return what is wanted of a message of one of RECEIVERS."""
+def _of_receiver(data: bytes, topic: Topic, config: Config,
+                 ) -> tuple[Fix | Refused, Velocity | Refused]:
+    """Return position and velocity of a message of one of RECEIVERS."""
     try:
-        both = receiver_from_msg(deserialize(data, topic), topic.msgtype, config)
+        return receiver_from_msg(deserialize(data, topic), topic.msgtype, config)
     except MessageError as error:
-        return Refused(f'{kind}_undecodable', str(error))
-    return both[kind == 'velocity']
+        return (Refused('fix_undecodable', str(error)),
+                Refused('velocity_undecodable', str(error)))

@@ -28,6 +28,7 @@ from ins_align.checks import (
 from ins_align.config import Config, config_from_mapping, parse_override
 from ins_align.geometry.earth import normal_gravity
 from ins_align.gnss.buffer import MAX_AHEAD_NS
+from ins_align.gnss.drivers import type_in_words
 from ins_align.gnss.motion import (
     differences, EMPTY, find_manoeuvres, heading_in_words, MANOEUVRE_SPEED, MANOEUVRE_TIME,
     Manoeuvres, on_grid, Series, track, velocity_frame, velocity_from_positions, VelocityFrame,
@@ -37,7 +38,7 @@ from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.imu_survey import ImuFacts, Resolution, survey_imu
 from ins_align.recordings.motion_fit import fit_motion, MotionFit
-from ins_align.recordings.reader import choose_topics
+from ins_align.recordings.reader import choose_topics, is_command
 from ins_align.recordings.topic_survey import (
     Gap, KINDS, MAX_ASTRAY, read_candidates, Recorded, Timing)
 from ins_align.report import format_table
@@ -186,7 +187,7 @@ class _Survey:
         if stated.size:
             more['sigma'] = tuple(np.median(stated, axis=0).tolist())
         return TopicInfo(
-            data.topic.name, data.topic.msgtype.replace('/msg/', '/'), data.kind, data.timing(),
+            data.topic.name, type_in_words(data.topic.msgtype), data.kind, data.timing(),
             tuple(faults), float(np.mean(data.usable)) if count else 0.0, **more)
 
     def _fix(self, data: Recorded) -> TopicInfo:
@@ -209,7 +210,7 @@ class _Survey:
 
     def _velocity(self, data: Recorded, positions: Series) -> TopicInfo:
         faults = []
-        if 'cmd' in data.topic.name.rsplit('/', 1)[-1]:
+        if is_command(data.topic):
             faults.append('its name is that of a command, not of a measurement')
         if not data.usable.any():
             return self._topic(data, faults + ['no message has numbers that can be used']

@@ -25,14 +25,14 @@ from typing import NamedTuple
 
 from ins_align.config import Config
 from ins_align.gnss.drivers import (
-    DRIVER_TYPES, imu_from_driver, in_words, INERTIAL_UNITS, LIVE_TYPES, NoTimeError,
-    receiver_from_msg, RECEIVERS)
+    DRIVER_TYPES, imu_from_driver, INERTIAL_UNITS, LIVE_TYPES, NoTimeError, receiver_from_msg,
+    RECEIVERS, type_in_words)
 from ins_align.gnss.messages import Fix, MessageError, Velocity, velocity_from_msg
 from ins_align.mounting import find_mounting, FixedFrames, Mounting
 from ins_align.recordings import BagError, Topic
 from ins_align.recordings.bag import Bag, Block
 from ins_align.recordings.decode import (
-    decode_gnss, decode_imu_topic, decode_orientations, deserialize, GNSS_TYPES, IMU_TYPE,
+    decode_by_kind, decode_imu_topic, decode_orientations, deserialize, GNSS_TYPES, IMU_TYPE,
     ImuSamples, Orientations, Refused)
 from ins_align.results import Severity
 import numpy as np
@@ -199,9 +199,12 @@ def _decoded(block: Block, wanted: list[Topic], topics: Topics, config: Config, 
             before = np.cumsum(before)
         elif topic is topics.reference:
             orientations = messages
-        for kind, source in (('fix', topics.fix), ('velocity', topics.velocity)):
-            if topic is source:
-                gnss += zip(places.tolist(), decode_gnss(messages, topic, config, kind))
+        kinds = [kind for kind, source in (('fix', topics.fix), ('velocity', topics.velocity))
+                 if topic is source]
+        if kinds:
+            found = decode_by_kind(messages, topic, config)
+            for kind in kinds:
+                gnss += zip(places.tolist(), found[kind])
     gnss.sort(key=itemgetter(0))
     return Part(topics, config, samples,
                 tuple((int(before[place]), message) for place, message in gnss),
@@ -307,7 +310,7 @@ def _warn_of_others(bag: Bag, velocity: Topic, types: list[str]) -> None:
 def _warn_of_unstamped(bag: Bag) -> None:
     """Say which topics may be velocities, of types that an alignment cannot use."""
     for topic in sorted(_candidates(bag, UNSTAMPED_TYPES), key=attrgetter('name')):
-        if not _is_command(topic):
+        if not is_command(topic):
             bag.warn(f'{topic.name} cannot be used: {_in_words([topic.msgtype])} has no stamp; a '
                      f'velocity needs {_in_words(VELOCITY_TYPES)}')
 
@@ -318,7 +321,7 @@ def may_be_velocity(topic: Topic) -> bool:
     return topic.msgtype != VECTOR_TYPE or ('vel' in name and 'ang' not in name)
 
 
-def _is_command(topic: Topic) -> bool:
+def is_command(topic: Topic) -> bool:
     """Whether a topic is a wish, not a measurement: /cmd_vel."""
     return 'cmd' in topic.name.rsplit('/', 1)[-1]
 
@@ -329,7 +332,7 @@ def _measures(bag: Bag, topic: Topic, config: Config = Config(), say: bool = Tru
 
     With `say` there is a warning of a message that cannot be used.
     """
-    if _is_command(topic) or not may_be_velocity(topic):
+    if is_command(topic) or not may_be_velocity(topic):
         return False
     data = bag.first_message(topic)
     if data is None:
@@ -365,4 +368,4 @@ def _short(msgtype: str) -> str:
 
 
 def _in_words(types: list[str]) -> str:
-    return ' or '.join(map(in_words, types))
+    return ' or '.join(map(type_in_words, types))

@@ -26,7 +26,7 @@ from ins_align.geometry.rotation import (
 from ins_align.gnss.buffer import fault_of_fix
 from ins_align.gnss.messages import Fix
 from ins_align.mounting import base_attitude
-from ins_align.offline import Recorded
+from ins_align.offline import OfflineAligner
 from ins_align.processes import run_ahead
 from ins_align.recordings.decode import Attitudes
 from ins_align.recordings.reader import read, Request, Topics
@@ -164,11 +164,11 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
     """
     request = Request(path, config or Config(), imu_topic, fix_topic, velocity_topic, start,
                       duration)
-    run: Recorded | None = None
+    run: OfflineAligner | None = None
     fixes: list[tuple[int, float, float]] = []
     attitudes: list[Attitudes] = []
     for part in run_ahead(read, request) if read_ahead else read(request):
-        run = run or Recorded(part.config)
+        run = run or OfflineAligner(part.config)
         run.reject('imu_undecodable', np.count_nonzero(~part.imu.decoded))
         run.add(part.imu.stamps_ns, part.imu.gyro, part.imu.accel, part.gnss)
         fixes += [(message.stamp_ns, message.latitude_deg, message.longitude_deg)

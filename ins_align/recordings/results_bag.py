@@ -22,7 +22,6 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from ins_align.geometry.earth import EARTH_RATE
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.imu.prediction import Prediction
 from ins_align.mounting import Mounting
@@ -139,10 +138,8 @@ class _Results:
         if epoch.state is not State.ALIGNED or epoch.current is None:
             return None
         noise = self._result.config.imu_noise
-        return Prediction(
-            epoch.current.stamp_ns, epoch.current.C_nb, epoch.current.covariance, epoch.gyro_bias,
-            np.zeros((3, 3)), noise.angle_random_walk,
-            noise.gyro_bias_std ** 2 + EARTH_RATE ** 2, rate.tolist())
+        return Prediction.of(epoch.current, epoch.gyro_bias, np.zeros((3, 3)),
+                             noise.gyro_bias_std, noise.angle_random_walk, rate)
 
     def _of_epoch(self, epoch: Epoch, time_ns: int) -> Iterator[Record]:
         declared = epoch.state is State.ALIGNED and self._state is not State.ALIGNED

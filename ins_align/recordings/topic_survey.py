@@ -30,7 +30,7 @@ from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.recordings import Topic
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import (
-    decode_gnss, decode_imu_topic, deserialize, GNSS_TYPES, IMU_TYPE, Refused)
+    decode_by_kind, decode_gnss, decode_imu_topic, deserialize, GNSS_TYPES, IMU_TYPE, Refused)
 from ins_align.recordings.reader import may_be_velocity, REFERENCE_NAMESPACE
 import numpy as np
 
@@ -107,7 +107,7 @@ class Recorded:
             self._rows.append((times_ns[samples.decoded], samples.stamps_ns,
                                np.hstack([samples.gyro, samples.accel])))
             return
-        decoded = decode_gnss(messages, self.topic, Config(), self.kind)
+        decoded = decode_by_kind(messages, self.topic, Config())[self.kind]
         refusals = [message.why for message in decoded
                     if isinstance(message, Refused) and message.why]
         if refusals and self.topic.msgtype in RECEIVERS:

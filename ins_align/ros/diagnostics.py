@@ -22,6 +22,7 @@ import re
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Vector3Stamped
 from ins_align.config import Config, Parameter, parameters
+from ins_align.gnss.drivers import type_in_words
 from ins_align.mounting import Mounting
 from ins_align.results import Status
 from ins_align.status_values import base_values, status_values
@@ -84,7 +85,7 @@ def type_name(msg_type: type) -> str:
 
 def inputs_in_words(node: Node, inputs: Mapping[str, type], config: Config) -> str:
     """Say what a node reads, and with which parameters."""
-    topics = ', '.join(f'{node.resolve_topic_name(topic)} ({_short(type_name(msg_type))})'
+    topics = ', '.join(f'{node.resolve_topic_name(topic)} ({type_in_words(type_name(msg_type))})'
                        for topic, msg_type in inputs.items())
     default = Config()
     changed = ''.join(
@@ -124,11 +125,7 @@ def topic_faults(node: Node, inputs: Mapping[str, type], expected: Iterable[str]
         known = [parameter for parameter, velocity in velocity_types.items()
                  if msg_type in velocity_types.values() and type_name(velocity) == other]
         hint = f': set velocity_type to {known[0]}' if known else ''
-        yield f'{name} is published as {_short(other)}, not {_short(wanted)}{hint}'
-
-
-def _short(name: str) -> str:
-    return name.replace('/msg/', '/')
+        yield f'{name} is published as {type_in_words(other)}, not {type_in_words(wanted)}{hint}'
 
 
 def parameter_descriptor(parameter: Parameter) -> ParameterDescriptor:
