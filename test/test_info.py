@@ -617,7 +617,7 @@ def test_real_recordings(name, rate, frame, rest, first):
     if frame:
         assert by_name(info, '/fix_velocity').frame.frame == frame
     assert info.manoeuvres.starts[0] == pytest.approx(first, abs=2.0)
-    lines = describe(info).splitlines()
+    lines = describe(info).replace(info.command, '').splitlines()  # has the path, however long
     assert max(map(len, lines)) < 130
 
 
