@@ -24,11 +24,11 @@ import os
 from typing import NamedTuple
 
 from ins_align.config import Config
+from ins_align.geometry.transform import Transform
 from ins_align.gnss.drivers import (
     DRIVER_TYPES, imu_from_driver, INERTIAL_UNITS, LIVE_TYPES, NoTimeError, receiver_from_msg,
     RECEIVERS, type_in_words)
 from ins_align.gnss.messages import Fix, MessageError, Velocity, velocity_from_msg
-from ins_align.geometry.transform import Transform
 from ins_align.mounting import find_mounting, FixedFrames, Mounting
 from ins_align.recordings import BagError, Topic
 from ins_align.recordings.bag import Bag, Block
