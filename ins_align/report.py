@@ -41,6 +41,7 @@ DECLARED_GREEN = STATE_COLOURS[State.ALIGNED]
 INNOVATION_LIMIT = 5.0  # sigmas shown at least
 METRES_PER_DEGREE = 6_371_000.0 * math.pi / 180.0  # of latitude, mean sphere: good for a picture
 BREAK_INTERVALS = 5.0  # a line ends where epochs are further apart than so many usual distances
+CHANGES_AT_ENDS = 3  # of the state: the first and the last so many are in the table
 LOST_SIGMA_DEG = 60.0  # above this a heading is not worth drawing
 
 
@@ -111,11 +112,7 @@ def summary(result: ReplayResult) -> str:
     """Return the table that ``ins_align replay`` prints of a recording."""
     status = result.status
     lines = [result.bag, f'  {_state_in_words(result)}: {status.reason}']
-    spans = declared_spans(result.epochs)
-    # Where it is not one from then to the end.
-    if spans and (status.state is not State.ALIGNED or len(spans) > 1):
-        lines.append('  it was ALIGNED from ' + ', '.join(
-            f'{start:.1f} to {end:.1f} s' for start, end in spans))
+    lines += _list_of_changes(result)
     declared = None if status.initial is None else result.declared
     attitudes = [('declared', declared), ('initial', status.initial), ('final', status.current)]
     start_ns = result.first_t0_ns or 0
@@ -141,6 +138,19 @@ def summary(result: ReplayResult) -> str:
                   'at its t0, as the node publishes it', '', _nuisance_table(result)]
     counts = ', '.join(f'{name} {count}' for name, count in sorted(status.counts.items()) if count)
     return '\n'.join([*lines, '', f'  counts: {counts or "nothing read"}'])
+
+
+def _list_of_changes(result: ReplayResult) -> list[str]:
+    """Return a line for each change of the state, of many for the first and the last."""
+    lines = [f'  {change.t_s:8.1f} s  {change.state.value}: {change.reason}'
+             for change in result.changes]
+    if len(lines) < 2:
+        return []  # what it says is the state at the end
+    left_out = len(lines) - 2 * CHANGES_AT_ENDS
+    if left_out > 1:
+        lines[CHANGES_AT_ENDS:-CHANGES_AT_ENDS] = [
+            f'{"":13}... {left_out} more, all of them in --json']
+    return ['', *lines]
 
 
 def _nuisance_table(result: ReplayResult) -> str:
