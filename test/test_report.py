@@ -21,14 +21,16 @@ from types import SimpleNamespace
 
 from ins_align.config import Config
 from ins_align.outputs import write_whole
+from ins_align.panels import declared_spans, STATE_COLOURS
 from ins_align.recordings.replay import replay
-from ins_align.report import (
-    DECLARED_GREEN, declared_spans, format_table, plot, save_figure, STATE_COLOURS, summary)
+from ins_align.report import format_table, plot, save_figure, summary
 from ins_align.results import State
 from ins_align.simulation.simulate import simulate, write_bag
 from matplotlib.colors import to_rgb
 import numpy as np
 import pytest
+
+DECLARED_GREEN = STATE_COLOURS[State.ALIGNED]
 
 
 @pytest.fixture(scope='module')
@@ -365,7 +367,7 @@ def test_figure_shows_innovations_and_biases(result):
     assert np.clip(tested, -5.0, 5.0) == pytest.approx(np.clip(up.get_ydata(), -5.0, 5.0))
     z = lines_of(axes['gyro bias (deg/s)'])['z']
     assert z.get_ydata() == pytest.approx(np.degrees([epoch.gyro_bias[2] for epoch in shown]))
-    x = lines_of(axes['accelerometer bias (m/s$^2$)'])['x']
+    x = lines_of(axes['accelerometer bias (m/s\u00b2)'])['x']
     assert x.get_ydata() == pytest.approx([epoch.accel_bias[0] for epoch in shown])
 
 

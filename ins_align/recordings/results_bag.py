@@ -197,5 +197,6 @@ def _status_of(epoch: Epoch) -> Status:
     unknown = np.full(3, math.nan)
     return Status(
         epoch.state, epoch.reason, epoch.stamp_ns,
-        None if epoch.initial is None else epoch.initial.stamp_ns, None, epoch.initial, epoch.current, epoch.gyro_bias, unknown, epoch.accel_bias, unknown,
-        unknown, unknown, math.nan, math.nan, {})
+        None if epoch.initial is None else epoch.initial.stamp_ns, None, epoch.initial,
+        epoch.current, epoch.gyro_bias, unknown, epoch.accel_bias, unknown, unknown, unknown,
+        math.nan, math.nan, {})
