@@ -56,7 +56,7 @@ def result(folder):
 
 def embedded(html):
     """Return the traces, layout and configuration in a page."""
-    text = html[html.index('Plotly.newPlot('):]
+    text = html[html.rindex('Plotly.newPlot('):]
     decoder, found = json.JSONDecoder(), []
     for begin in ('[', '{', '{'):
         start = text.index(begin)
