@@ -422,7 +422,7 @@ def test_simulate_passes_its_options_on(tmp_path, capsys):
 
 
 def test_help_names_the_scenarios():
-    from ins_align.simulation.simulate import SCENARIOS as simulated
+    from ins_align.simulation.scenarios import SCENARIOS as simulated
     assert SCENARIOS.split(', ') == list(simulated)
 
 
