@@ -131,8 +131,9 @@ def _traces(curve: Curve, number: str) -> Iterator[dict[str, Any]]:
     """Yield what plotly draws of a curve: the band first, then the line or the marks."""
     common = {'type': 'scatter', 'xaxis': f'x{number}', 'yaxis': f'y{number}',
               'legend': f'legend{number}'}
-    trace = {**common, 'name': curve.name, 'x': curve.x, 'y': curve.y, 'mode': 'lines',
-             'hoverinfo': 'all' if curve.name or curve.notes else 'skip'}
+    trace: dict[str, Any] = {
+        **common, 'name': curve.name, 'x': curve.x, 'y': curve.y, 'mode': 'lines',
+        'hoverinfo': 'all' if curve.name or curve.notes else 'skip'}
     if curve.is_line:
         if curve.sigma is not None:
             x, y = _outline(curve.x, curve.y, curve.sigma)
@@ -158,11 +159,12 @@ def _outline(x: Array, y: Array, sigma: Array) -> tuple[Array, Array]:
     """Return the closed outlines of a band, one for each piece between gaps, nan between them."""
     there = np.isfinite(x + y + sigma).astype(int)
     pieces = np.flatnonzero(np.diff(there, prepend=0, append=0)).reshape(-1, 2)
-    empty = np.zeros(0)
-    return tuple(
-        np.concatenate([empty, *(part for start, end in pieces for part in (
+
+    def around(upper: Array, lower: Array) -> Array:
+        return np.concatenate([np.zeros(0), *(part for start, end in pieces for part in (
             upper[start:end], lower[start:end][::-1], [np.nan]))])
-        for upper, lower in ((x, x), (y + sigma, y - sigma)))
+
+    return around(x, x), around(y + sigma, y - sigma)
 
 
 def _shade(shapes: list[dict[str, Any]], shown: Picture, number: str) -> None:
