@@ -30,10 +30,11 @@ from pathlib import Path
 from typing import Any
 
 from ins_align.config import Config
-from ins_align.outputs import write_whole
+from ins_align.outputs import PAGE_SUFFIX, write_whole
+from ins_align.page import page
 from ins_align.processes import pool
 from ins_align.recordings import BagError
-from ins_align.recordings.replay import replay
+from ins_align.recordings.replay import replay, ReplayResult
 from ins_align.recordings.results_bag import write_results
 from ins_align.report import plot, save_figure, summary
 
@@ -90,14 +91,23 @@ def process(task: Task, read_ahead: bool = False,
         if task.results:
             write_results(result, task.results)
         if task.plot:
-            figure, suffix = plot(result), Path(task.plot).suffix
-            write_whole(task.plot, lambda file: save_figure(figure, file, suffix))
+            _write_picture(result, task.plot)
     except BagError as error:
         return _failed(task, str(error))
     except OSError as error:
         return _failed(task, f'cannot write {error.filename}: {error.strerror}')
     warnings = tuple(text.replace(task.bag, task.name) for text in result.warnings)
     return Outcome(result.to_json(), summary(result), warnings)
+
+
+def _write_picture(result: ReplayResult, path: str) -> None:
+    suffix = Path(path).suffix
+    if suffix.lower() == PAGE_SUFFIX:
+        html = page(result).encode()
+        write_whole(path, lambda file: file.write(html))
+    else:
+        figure = plot(result)
+        write_whole(path, lambda file: save_figure(figure, file, suffix))
 
 
 def _lost(task: Task, error: Exception) -> Outcome:
