@@ -31,6 +31,7 @@ from ins_align.estimation.bank import Bank, Learnt
 from ins_align.estimation.declaration import Declaration, Fit
 from ins_align.estimation.formula import NoteMethod
 from ins_align.geometry.rotation import Array
+from ins_align.geometry.transform import Transform
 from ins_align.gnss.antenna import Antenna, AntennaEpoch
 from ins_align.gnss.buffer import GnssBuffer, GnssEpoch, PAIR_NS
 from ins_align.gnss.messages import Fix, Velocity
@@ -59,6 +60,9 @@ class Aligner:
     ----------
     config : Config, optional
         By default all parameters at their defaults.
+    base : Transform, optional
+        From the vehicle's frame to that of the IMU, of use with ``vehicle``; by default they are
+        the same.
 
     Attributes
     ----------
@@ -68,9 +72,10 @@ class Aligner:
 
     """
 
-    def __init__(self, config: Config | None = None) -> None:
+    def __init__(self, config: Config | None = None, base: Transform | None = None) -> None:
         """Wait for the first messages."""
         self.config = Config() if config is None else config
+        self._base = base
         self._counts: Counter[str] = Counter()      # of messages, by what became of them
         self._events: list[Event] = []
         self._warned: set[str] = set()
@@ -371,7 +376,8 @@ class Aligner:
         self._without_velocity = no_velocity if wanted and epoch.v_n is None else ''
         imu = self._cutter.start(epoch.stamp_ns).integrated()
         if config.method == 'bank':
-            self._method = Bank(config, epoch, imu, bool(use_position), self._learnt)
+            self._method = Bank(config, epoch, imu, bool(use_position), self._learnt,
+                                self._base)
         else:
             self._method = NoteMethod(config, epoch, imu, epoch.v_n is None)
         self._judge(epoch, self._method)

@@ -19,6 +19,7 @@ gives the attitude as a mixture (docs, "Theory").
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 import math
 from typing import NamedTuple
 
@@ -32,7 +33,9 @@ from ins_align.estimation.rivals import (
     in_words, level_in_words, log_sum, Parameters, rivals_of, SHARE)
 from ins_align.estimation.start import all_headings, HEADINGS, OPEN_POSITION, RoughAttitude, Start
 from ins_align.estimation.track import InertialTrack
+from ins_align.estimation.vehicle import NOT_USED, Vehicle
 from ins_align.geometry.rotation import Array, exp_so3, log_so3
+from ins_align.geometry.transform import Transform
 from ins_align.gnss.antenna import AntennaEpoch, velocities_of
 from ins_align.imu.intervals import Intervals, SensorErrors
 from ins_align.results import Nuisance
@@ -87,20 +90,30 @@ class Bank:
     """
 
     def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals, use_position: bool,
-                 prior: Learnt | None = None) -> None:
+                 prior: Learnt | None = None, base: Transform | None = None) -> None:
         """Start at t0."""
-        self._config = config
+        self._base = base or Transform(np.eye(3), np.zeros(3))
+        self._not_used = ''
+        self._assume(config)
         self._use_position = use_position
         self._velocity_ns = epoch.stamp_ns          # the last one
         self._velocities_since_ns: int | None = None
         self.moved = 0
-        self._rivals = rivals_of(config)
-        self._signs = np.array([rival.signs for rival in self._rivals])
-        self._prior = np.array([rival.prior for rival in self._rivals])
-        self._wrong = np.array([rival.wrong for rival in self._rivals])
         self._offered = 0
         self._rejected = [0, 0, 0]
         self._begin(epoch, imu, prior)
+
+    def _assume(self, config: Config) -> None:
+        """Set up the rivals."""
+        self._config = config
+        self._rivals = rivals = rivals_of(config)
+        self._signs = np.array([rival.signs for rival in rivals])
+        self._prior = np.array([rival.prior for rival in rivals])
+        self._wrong = np.array([rival.wrong for rival in rivals])
+        self._along = np.array([rival.along for rival in rivals])
+        # Levels that are no vehicle are there to contradict it; they are no part of a result.
+        self._free = ~self._wrong & (self._along == 0) & (config.vehicle != 'none')
+        self._aside = self._wrong | self._free
 
     def _begin(self, epoch: AntennaEpoch, imu: Intervals, prior: Learnt | None = None) -> None:
         """Wait for a start, with nothing known but what was learnt before."""
@@ -112,9 +125,12 @@ class Bank:
             self._remember(prior)
         gyro, accel = triads(self._known[0].x.size)
         errors = gyro.stop - gyro.start
-        self._reach = np.concatenate([_REACH[:gyro.stop], _REACH[16:16 + errors]])
+        self._reach = np.full(self._known[0].x.size, np.inf)      # of a vehicle: linear
+        self._reach[:accel.stop] = np.concatenate([_REACH[:gyro.stop], _REACH[16:16 + errors]])
         self._filters: Filters | None = None
         self._mixed: tuple[Array, Array] | None = None      # the attitudes, once asked for
+        self._vehicle = (None if self._config.vehicle == 'none'
+                         else Vehicle(self._config, self._base))
         self._start = Start(self._config)
         self._last = epoch                          # the last epoch that was processed
         self._C_nn0 = np.eye(3)
@@ -132,9 +148,12 @@ class Bank:
         for rival, known in zip(self._rivals, self._known):
             if rival.wrong:
                 continue
-            known.x[:] = learnt.x
-            grown = np.minimum(learnt.P.diagonal() + age * known.walk[FIRST:], known.P.diagonal())
-            known.P = learnt.P + np.diag(np.maximum(grown - learnt.P.diagonal(), 0.0))
+            body = slice(learnt.x.size)             # it may be without what is of the vehicle
+            known.x[body] = learnt.x
+            walk, most = known.walk[FIRST:][body], known.P.diagonal()[body]
+            grown = np.minimum(learnt.P.diagonal() + age * walk, most)
+            known.P[body, body] = learnt.P + np.diag(
+                np.maximum(grown - learnt.P.diagonal(), 0.0))
 
     # Input
 
@@ -171,7 +190,7 @@ class Bank:
             self._C_nn0 = track.C_n0n[k].T
             self._last = epoch
             self._left -= 1
-            if self._in_a_row >= ASTRAY:
+            if self._in_a_row >= ASTRAY or self._drop_vehicle(filters):
                 self._begin(epoch, imu.take(slice(k, k + 1)).end())
                 yield epoch
                 return
@@ -220,7 +239,8 @@ class Bank:
             np.stack([track.s_v(velocities_of(epochs)), track.s_p], axis=1),
             C_n0n @ covariance @ C_n0n.swapaxes(-1, -2),
             [(epoch.v_n is not None, epoch.position_measured and self._use_position)
-             for epoch in epochs], [epoch.stated for epoch in epochs], track.C_n0n)
+             for epoch in epochs], [epoch.stated for epoch in epochs], track.C_n0n,
+            track.still_v)
 
     def _point_of(self, filters: Filters) -> Array:
         """Return the parameters of the likeliest mean of each rival, with one delay for all."""
@@ -231,7 +251,8 @@ class Bank:
     def _model(self, filters: Filters, point: Array, imu: Intervals) -> Linearised:
         """Linearise epochs."""
         return linearised(point, imu.mirrored(self._signs[filters.ids]),
-                          (imu.Q + SHARE * imu.Q_excess)[:, None], self._use_position)
+                          (imu.Q + SHARE * imu.Q_excess)[:, None], self._use_position,
+                          None if self._vehicle is None else self._vehicle.position)
 
     def _anchor(self, filters: Filters, track: InertialTrack) -> None:
         """Freeze n0 at the last epoch that was processed; the track is there."""
@@ -242,6 +263,8 @@ class Bank:
     def _step(self, filters: Filters, model: Linearised, k: int, track: Track) -> None:
         self._mixed = None
         filters.propagate(model, k)
+        vehicle = self._vehicle
+        look = vehicle is not None and vehicle.is_due(model.duration[k])
         self._nis, self._innovation = math.nan, NOTHING_NEW
         if not any(track.present[k]):
             return
@@ -266,7 +289,18 @@ class Bank:
         self._rejected[2] += bad
         self._in_a_row = self._in_a_row + 1 if astray else 0
         self._nis, self._innovation = sum(nis) / len(nis), first
+        if vehicle is not None and look:
+            filters.hold(vehicle.look(filters, model, k, track, self._along[filters.ids]))
         self._select(filters)
+
+    def _drop_vehicle(self, filters: Filters) -> bool:
+        """Assume nothing of the vehicle any more where the motion contradicts it."""
+        free, level = self._free[filters.ids], self._posterior(filters)
+        if not free.any() or log_sum(level[free]) < log_sum(level[~free]) + MARGIN:
+            return False
+        self._not_used = NOT_USED.format(vehicle=self._config.vehicle)
+        self._assume(replace(self._config, vehicle='none'))
+        return True
 
     def _best(self, filters: Filters) -> int:
         """Return the place of the likeliest level."""
@@ -274,11 +308,18 @@ class Bank:
 
     def _posterior(self, filters: Filters) -> Array:
         """Return the log of how likely each rival is, but for a constant, shape (M,)."""
-        return filters.evidence + self._prior[filters.ids]
+        return filters.evidence + self._before(filters)
+
+    def _before(self, filters: Filters) -> Array:
+        """Return the log of how likely each rival was before the data, shape (M,)."""
+        prior = self._prior[filters.ids]
+        if self._vehicle is None:
+            return prior
+        return prior - (self._along[filters.ids] < 0) * self._vehicle.against_backwards
 
     def _of_levels(self, filters: Filters) -> Array:
-        """Return the same where those that are wrong are out of the question."""
-        return np.where(self._wrong[filters.ids], -np.inf, self._posterior(filters))
+        """Return the same where those that are no levels in use are out of the question."""
+        return np.where(self._aside[filters.ids], -np.inf, self._posterior(filters))
 
     def _select(self, filters: Filters) -> None:
         """Drop means and rivals that are unlikely, merge means that agree."""
@@ -287,14 +328,18 @@ class Bank:
             return
         wrong = self._wrong[ids]
         level = self._posterior(filters)
-        best = np.max(level[~wrong])
-        filters.evidence = np.where(wrong, filters.evidence,
-                                    np.maximum(level, best - LEAST) - self._prior[ids])
+        best = np.max(level[~self._aside[ids]])
+        filters.evidence = np.where(wrong, filters.evidence, np.maximum(level, best - LEAST)
+                                    - self._before(filters))
         filters.evidence = filters.evidence - best
         if len(filters.C) == len(ids) and not wrong.any():
             return
         keep = filters.weight > filters.weight[filters.lead][filters.place] - UNLIKELY
         keep &= (~wrong | (filters.evidence > -HOPELESS))[filters.place]
+        for direction in {1, -1} & set(self._along[ids].tolist()):
+            there = self._along[ids] == direction
+            if np.max(level[there]) < best - LEAST:
+                keep &= ~there[filters.place]
         if not keep.all():
             filters.keep(keep)
         filters.merge(ALIKE)
@@ -334,7 +379,7 @@ class Bank:
             model = self._model(filters, self._point_of(filters), imu.take(one))
             self._step(filters, model, 0, Track(track.s[one], track.covariance[one],
                                                 track.present[one], track.stated[one],
-                                                track.C_n0n[one]))
+                                                track.C_n0n[one], track.still[one]))
         self._start = Start(self._config)
         self._last = epochs[-1]
         self._anchor(filters, inertial.at(len(epochs) - 1))
@@ -406,8 +451,17 @@ class Bank:
                    self._nis, self._innovation, velocity, position, either,
                    delay=self._config.gnss_delay + float(self._body()[0][DELAY]),
                    objection=words if contradicted else '',
-                   remarks=(self._receiver.in_words()
-                            + level_in_words(level, self._config.imu_noise)))
+                   remarks=(self._receiver.in_words() + self._not_used
+                            + level_in_words(level, self._config.imu_noise)
+                            + self._vehicle_in_words(filters)))
+
+    def _vehicle_in_words(self, filters: Filters) -> str:
+        if self._vehicle is None:
+            return ''
+        level = self._of_levels(filters)
+        likely = level > np.max(level) - MARGIN
+        return self._vehicle.in_words(self._body()[0],
+                                      set(self._along[filters.ids[likely]].tolist()))
 
     def move_t0(self) -> None:
         """Move t0 to the last epoch."""
@@ -438,7 +492,7 @@ class Bank:
             return '', False
         # How much likelier each of them is than all levels.
         wrong, level = self._wrong[filters.ids], self._posterior(filters)
-        ahead = np.where(wrong, level - log_sum(level[~wrong]), -np.inf)
+        ahead = np.where(wrong, level - log_sum(level[~self._aside[filters.ids]]), -np.inf)
         ahead = ahead / max(self._receiver.misfit, 1.0)
         if not np.any(ahead > -MARGIN):
             return '', False

@@ -19,11 +19,13 @@ it is as likely as the configuration and would give another attitude, no heading
 others are levels of the same configuration: what they say counts by their likelihood.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 from ins_align.config import Config, ImuNoise, PRESETS
-from ins_align.estimation.linearised import DELAY, FIRST, GYRO, LEVER_ARM, triads
+from ins_align.estimation.linearised import (
+    DELAY, FIRST, GYRO, LEVER_ARM, OF_VEHICLE, triads)
+from ins_align.estimation.vehicle import known_of_vehicle
 from ins_align.geometry.rotation import Array
 import numpy as np
 
@@ -58,6 +60,8 @@ class Rival:
         Factor on the accelerometers' bias.
     lever_arm_std, gnss_delay_std, gyro_bias_std, accel_bias_std : float
         At least so much (SI).
+    along : int
+        Of a vehicle: 1 forwards, -1 backwards along its x axis; 0: it moves as it likes.
     prior : float
         Log of how likely it is before the data, over the configuration.
 
@@ -72,6 +76,7 @@ class Rival:
     gnss_delay_std: float = 0.0
     gyro_bias_std: float = 0.0
     accel_bias_std: float = 0.0
+    along: int = 0
     prior: float = 0.0
 
     @property
@@ -116,7 +121,11 @@ def rivals_of(config: Config) -> tuple[Rival, ...]:
     """Return the rivals of a configuration, which itself comes first."""
     stated = vars(config) | config.imu_noise._asdict()
     told = tuple(rival for name, std, rival in TOLD if stated[name] < std)
-    return (*LEVELS, *(() if config.trust_imu_axes else SIGNS), *told)
+    rivals = (*LEVELS, *(() if config.trust_imu_axes else SIGNS), *told)
+    if config.vehicle == 'none':
+        return rivals
+    return (*(replace(rival, along=1) for rival in rivals),
+            *(replace(level, along=-1) for level in LEVELS), *LEVELS)
 
 
 @dataclass
@@ -155,8 +164,11 @@ class Parameters:
         """
         noise = config.imu_noise
         matrices = noise.gyro_scale_std > 0
-        x, std, walk = np.zeros((3, GYRO + (24 if matrices else 6)))
+        vehicle = OF_VEHICLE if config.vehicle != 'none' else 0
+        x, std, walk = np.zeros((3, GYRO + (24 if matrices else 6) + vehicle))
         accel = triads(x.size)[1].start
+        if vehicle:
+            std[-vehicle:], walk[-vehicle:] = known_of_vehicle(config)
         x[LEVER_ARM] = config.lever_arm
         std[LEVER_ARM] = max(config.lever_arm_std, rival.lever_arm_std)
         std[DELAY] = max(config.gnss_delay_std, rival.gnss_delay_std)
@@ -175,7 +187,7 @@ class Parameters:
             told = np.eye(12)
             told[:3, 3:] = -np.kron(np.eye(3), force)
             sigmas = np.repeat([accel_std, scale], [3, 9])
-            P[accel:, accel:] = told @ np.diag(sigmas ** 2) @ told.T
+            P[accel:accel + 12, accel:accel + 12] = told @ np.diag(sigmas ** 2) @ told.T
         return Parameters(x, P, np.concatenate([np.zeros(FIRST), walk]))
 
 

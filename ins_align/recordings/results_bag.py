@@ -89,7 +89,7 @@ class _Results:
 
     def __init__(self, result: ReplayResult, types: Any) -> None:
         self._result, self._types = result, types
-        self._mounting = Mounting(result.config, result.topics.C_imu_base)
+        self._mounting = Mounting(result.config, result.topics.base)
         self._state: State | None = None  # of the epoch before
         self._status_ns = -STATUS_PERIOD_NS
 
