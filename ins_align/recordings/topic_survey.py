@@ -30,7 +30,7 @@ from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.recordings import Topic
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import (
-    decode_by_kind, decode_gnss, decode_imu_topic, deserialize, GNSS_TYPES, IMU_TYPE, Refused)
+    decode_gnss, decode_imu, deserialize, IMU_TYPE, KINDS as KINDS_OF, Refused)
 from ins_align.recordings.reader import may_be_velocity, REFERENCE_NAMESPACE
 import numpy as np
 
@@ -102,19 +102,19 @@ class Recorded:
         if self.kind == 'imu':
             if not self._rows and self.topic.msgtype == IMU_TYPE:
                 self._look_at(messages[0])
-            samples = decode_imu_topic(messages, self.topic)
+            samples = decode_imu(messages, self.topic)
             self.undecodable += int(np.count_nonzero(~samples.decoded))
             self._rows.append((times_ns[samples.decoded], samples.stamps_ns,
                                np.hstack([samples.gyro, samples.accel])))
             return
-        decoded = decode_by_kind(messages, self.topic, Config())[self.kind]
+        decoded = decode_gnss(messages, self.topic, Config())[self.kind]
         refusals = [message.why for message in decoded
                     if isinstance(message, Refused) and message.why]
         if refusals and self.topic.msgtype in RECEIVERS:
             self.undecodable_why = refusals[0]
         elif refusals:  # for their frame_id, which may be wrong: the motion will tell
             self._refusals += refusals
-            decoded = decode_gnss(messages, self.topic, Config(velocity_frame='enu'))
+            decoded = decode_gnss(messages, self.topic, Config(velocity_frame="enu"))[self.kind]
         for time_ns, message in zip(times_ns.tolist(), decoded):
             if isinstance(message, Refused):
                 self.undecodable += 1
@@ -243,6 +243,6 @@ def _kinds(topic: Topic) -> Sequence[str]:
         return ['imu']
     if topic.msgtype in RECEIVERS:
         return ['fix', 'velocity']
-    if topic.msgtype not in GNSS_TYPES or not may_be_velocity(topic):
+    if topic.msgtype not in KINDS_OF or not may_be_velocity(topic):
         return []
-    return [GNSS_TYPES[topic.msgtype].kind]
+    return KINDS_OF[topic.msgtype]
