@@ -97,47 +97,44 @@ def decode_orientations(messages: Sequence[bytes], topic: Topic) -> Orientations
 def _imu_numbers(messages: Sequence[bytes], topic: Topic,
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return stamps, (N,), numbers, (N, 37), and which of the M messages they come from."""
+    if topic.msgtype == IMU_TYPE and len(set(map(len, messages))) == 1:
+        data = np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), -1)
+        if (found := _of_one_layout(data, topic.encoding)) is not None:
+            return (*found, np.ones(len(messages), bool))
     stamps_ns = np.zeros(len(messages), np.int64)
     numbers = np.zeros((len(messages), IMU_NUMBERS))
     decoded = np.zeros(len(messages), bool)
-    # As usual they are alike: all at once. rosbags takes the rest, one by one.
-    length = len(messages[-1]) if messages else 0
-    start = length - 8 * IMU_NUMBERS
-    if topic.msgtype == IMU_TYPE and start >= HEADER_BYTES:
-        alike = np.array([len(data) == length for data in messages])
-        raw = np.frombuffer(b''.join(data for data in messages if len(data) == length),
-                            np.uint8).reshape(-1, length)
-        seconds, nanoseconds, frame_length = raw[:, 4:HEADER_BYTES].copy().view('<u4').T
-        end = HEADER_BYTES + frame_length.astype(np.int64)
-        good = np.ones(len(raw), bool)
-        if topic.encoding == 'cdr':  # little endian: OMG DDSI-RTPS 2.3, 10.2
-            good = (raw[:, 0] == 0) & (raw[:, 1] == 1)
-            end += -(end - 4) % 8  # numbers of eight bytes are aligned, counted from byte 4
-        good &= end == start
-        decoded[alike] = good
-        stamps_ns[decoded] = (seconds.astype(np.int32).astype(np.int64) * 1_000_000_000
-                              + nanoseconds)[good]
-        numbers[decoded] = raw[good, start:].copy().view('<f8')
-    for place in np.flatnonzero(~decoded).tolist():
+    for place, data in enumerate(messages):
         with suppress(MessageError):
-            message = deserialize(messages[place], topic)
-            stamps_ns[place], numbers[place] = _numbers_of(message, topic.msgtype)
+            message = deserialize(data, topic)
+            if topic.msgtype == IMU_TYPE:
+                stamps_ns[place], numbers[place, GYRO], numbers[place, ACCEL] = imu_from_msg(
+                    message)
+                turn = message.orientation
+                numbers[place, ORIENTATION] = turn.x, turn.y, turn.z, turn.w
+                numbers[place, ORIENTATION_COVARIANCE] = message.orientation_covariance
+            else:
+                stamps_ns[place], numbers[place, GYRO], numbers[place, ACCEL] = imu_from_driver(
+                    message, topic.msgtype)
             decoded[place] = True
-    if decoded.all():
-        return stamps_ns, numbers, decoded
     return stamps_ns[decoded], numbers[decoded], decoded
 
 
-def _numbers_of(message: Any, msgtype: str) -> tuple[int, np.ndarray]:
-    numbers = np.zeros(IMU_NUMBERS)
-    if msgtype in INERTIAL_UNITS:
-        stamp_ns, numbers[GYRO], numbers[ACCEL] = imu_from_driver(message, msgtype)
-        return stamp_ns, numbers
-    turn = message.orientation
-    stamp_ns, numbers[GYRO], numbers[ACCEL] = imu_from_msg(message)
-    numbers[ORIENTATION] = turn.x, turn.y, turn.z, turn.w
-    numbers[ORIENTATION_COVARIANCE] = message.orientation_covariance
-    return stamp_ns, numbers
+def _of_one_layout(data: np.ndarray, encoding: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return stamps and numbers of sensor_msgs/Imu, a row each; None if they differ in layout."""
+    start = data.shape[1] - 8 * IMU_NUMBERS
+    if start < HEADER_BYTES:
+        return None
+    seconds, nanoseconds, frame_length = data[:, 4:HEADER_BYTES].copy().view('<u4').T
+    end = HEADER_BYTES + frame_length.astype(np.int64)
+    if encoding == 'cdr':
+        end += -(end - 4) % 8  # numbers of eight bytes are aligned, counted from byte 4
+        if np.any(data[:, :2] != (0, 1)):  # little endian: OMG DDSI-RTPS 2.3, 10.2
+            return None
+    if np.any(end != start):
+        return None
+    return (seconds.astype(np.int32).astype(np.int64) * 1_000_000_000 + nanoseconds,
+            data[:, start:].copy().view('<f8'))
 
 
 def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config) -> dict[str, list[Gnss]]:
