@@ -34,7 +34,7 @@ from ins_align.gnss.motion import (
     Manoeuvres, on_grid, Series, track, velocity_frame, velocity_from_positions,
     without_wild_positions)
 from ins_align.imu.buffer import MAX_GAP_NS
-from ins_align.recordings import BagError
+from ins_align.recordings import BagError, printable
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.imu_survey import ImuFacts, Resolution, survey_imu
 from ins_align.recordings.motion_fit import fit_motion, MotionFit
@@ -449,8 +449,3 @@ def _about_motion(found: Manoeuvres | None, fit: MotionFit | None) -> list[str]:
         lines.append('noise of the GNSS velocity: {:.2g} m/s horizontally, {:.2g} m/s vertically'
                      .format(*fit.velocity_std))
     return lines
-
-
-def printable(line: str) -> str:
-    """Make a line that quotes a recording fit for a terminal."""
-    return ''.join(letter if letter.isprintable() else '?' for letter in line)
