@@ -98,8 +98,8 @@ def _imu_numbers(messages: Sequence[bytes], topic: Topic,
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return stamps, (N,), numbers, (N, 37), and which of the M messages they come from."""
     if topic.msgtype == IMU_TYPE and len(set(map(len, messages))) == 1:
-        data = np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), -1)
-        if (found := _of_one_layout(data, topic.encoding)) is not None:
+        rows = np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), -1)
+        if (found := _of_one_layout(rows, topic.encoding)) is not None:
             return (*found, np.ones(len(messages), bool))
     stamps_ns = np.zeros(len(messages), np.int64)
     numbers = np.zeros((len(messages), IMU_NUMBERS))

@@ -205,35 +205,35 @@ def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | N
     fix_topic = _required(bag, 'position', *(
         ([FIX_TYPE], [*RECEIVERS]) if config.fix_type == 'NavSatFix' else
         ([LIVE_TYPES[config.fix_type]], [FIX_TYPE, *RECEIVERS])), fix)
-    if velocity is not None:
-        velocity_topic = _named(bag, 'velocity', [*VELOCITY_TYPES, *RECEIVERS], velocity)
-        _measures(bag, velocity_topic, config)  # for the warning: it is read as the user wishes
-    else:
-        velocity_topic = _velocity(bag, config, fix_topic)
+    velocity_topic = _velocity(bag, config, fix_topic, velocity)
     reference = next((topic for topic in bag.topics if topic.name == REFERENCE_TOPIC
                       and topic.msgtype == IMU_TYPE), None)
     return Topics(imu_topic, fix_topic, velocity_topic, reference)
 
 
-def _velocity(bag: Bag, config: Config, fix: Topic) -> Topic | None:
+def _velocity(bag: Bag, config: Config, fix: Topic, name: str | None) -> Topic | None:
     """Choose a velocity, if there is one, and warn of those that are left out."""
+    if name is not None:
+        topic = _named(bag, 'velocity', [*VELOCITY_TYPES, *RECEIVERS], name)
+        _measures(bag, topic, config)  # for the warning: it is read as the user wishes
+        return topic
     if config.use_velocity is False:
         return None
     if fix.msgtype in RECEIVERS:
         return fix
     preferred = [name for name in VELOCITY_TYPES if short_name(name) == config.velocity_type]
     others = [name for name in VELOCITY_TYPES if name not in preferred]
-    if topic := _only(bag, 'velocity', preferred, config):
+    if chosen := _only(bag, 'velocity', preferred, config):
         if names := sorted(f'{other.name} ({short_name(other.msgtype)})'
                            for other in _candidates(bag, others)
                            if _measures(bag, other, say=False)):
-            bag.warn(f'the velocity is read from {topic.name} ({short_name(topic.msgtype)}), not '
-                     f'from {", ".join(names)}: --velocity-topic chooses')
-        return topic
+            bag.warn(f'the velocity is read from {chosen.name} ({short_name(chosen.msgtype)}), '
+                     f'not from {", ".join(names)}: --velocity-topic chooses')
+        return chosen
     twists = [name for name in others if name != VECTOR_TYPE]
     for types in (twists, [VECTOR_TYPE], [*RECEIVERS]):
-        if topic := _only(bag, 'velocity', types, config):
-            return topic
+        if chosen := _only(bag, 'velocity', types, config):
+            return chosen
     for topic in sorted(_candidates(bag, UNSTAMPED_TYPES), key=attrgetter('name')):
         if not is_command(topic):
             bag.warn(f'{topic.name} cannot be used: {type_in_words(topic.msgtype)} has no stamp; '
