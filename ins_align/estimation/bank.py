@@ -30,10 +30,10 @@ from ins_align.estimation.linearised import (
     DELAY, FIRST, GYRO, Linearised, linearised, MAX_DELAY, MIN_DELAY, PHI, PHI0, triads)
 from ins_align.estimation.receiver import ReceiverNoise
 from ins_align.estimation.rivals import (
-    in_words, level_in_words, log_sum, Parameters, rivals_of, SHARE)
+    level_in_words, Parameters, Rivals, SHARE)
 from ins_align.estimation.start import all_headings, HEADINGS, OPEN_POSITION, RoughAttitude, Start
 from ins_align.estimation.track import InertialTrack
-from ins_align.estimation.vehicle import NOT_USED, Vehicle
+from ins_align.estimation.vehicle import NOT_USED
 from ins_align.geometry.rotation import Array, exp_so3, log_so3
 from ins_align.geometry.transform import Transform
 from ins_align.gnss.antenna import AntennaEpoch, velocities_of
@@ -41,14 +41,6 @@ from ins_align.imu.intervals import Intervals, SensorErrors
 from ins_align.results import Nuisance
 import numpy as np
 
-# Means whose log weight is so much below the likeliest's are dropped, and so are rivals that are
-# wrong; levels stay, for what they assume may become true.
-UNLIKELY, HOPELESS, LEAST = 14.0, 25.0, 13.0
-# Means of a rival that agree to so many sigmas are merged.
-ALIKE = 2.0
-# A wrong rival has to be less likely by this (log likelihood) or to give the same attitude, to so
-# many sigmas.
-MARGIN, HARMLESS = 6.0, 1.0
 # Parameters are linearised anew when the likeliest mean has gone so far from the point: lever arm
 # (m), delay (s), bias and matrix of the gyros (rad/s, 1) and of the accelerometers (m/s^2, 1).
 _REACH = np.array([0.2] * 3 + [0.01] + [3e-3] * 3 + [0.02] * 9 + [0.1] * 3 + [0.02] * 9)
@@ -94,7 +86,7 @@ class Bank:
         """Start at t0."""
         self._base = base or Transform(np.eye(3), np.zeros(3))
         self._not_used = ''
-        self._assume(config)
+        self._config = config
         self._use_position = use_position
         self._velocity_ns = epoch.stamp_ns          # the last one
         self._velocities_since_ns: int | None = None
@@ -103,24 +95,13 @@ class Bank:
         self._rejected = [0, 0, 0]
         self._begin(epoch, imu, prior)
 
-    def _assume(self, config: Config) -> None:
-        """Set up the rivals."""
-        self._config = config
-        self._rivals = rivals = rivals_of(config)
-        self._signs = np.array([rival.signs for rival in rivals])
-        self._prior = np.array([rival.prior for rival in rivals])
-        self._wrong = np.array([rival.wrong for rival in rivals])
-        self._along = np.array([rival.along for rival in rivals])
-        # Levels that are no vehicle are there to contradict it; they are no part of a result.
-        self._free = ~self._wrong & (self._along == 0) & (config.vehicle != 'none')
-        self._aside = self._wrong | self._free
-
     def _begin(self, epoch: AntennaEpoch, imu: Intervals, prior: Learnt | None = None) -> None:
         """Wait for a start, with nothing known but what was learnt before."""
         self.t0_ns = epoch.stamp_ns
         force = imu.gained[0, -1]
         force = STANDARD_GRAVITY * force / max(float(np.linalg.norm(force)), 1e-3)
-        self._known = [Parameters.of(self._config, rival, force) for rival in self._rivals]
+        self._rivals = Rivals(self._config, self._base)
+        self._known = [Parameters.of(self._config, rival, force) for rival in self._rivals.table]
         if prior is not None:
             self._remember(prior)
         gyro, accel = triads(self._known[0].x.size)
@@ -129,8 +110,6 @@ class Bank:
         self._reach[:accel.stop] = np.concatenate([_REACH[:gyro.stop], _REACH[16:16 + errors]])
         self._filters: Filters | None = None
         self._mixed: tuple[Array, Array] | None = None      # the attitudes, once asked for
-        self._vehicle = (None if self._config.vehicle == 'none'
-                         else Vehicle(self._config, self._base))
         self._start = Start(self._config)
         self._last = epoch                          # the last epoch that was processed
         self._C_nn0 = np.eye(3)
@@ -145,7 +124,7 @@ class Bank:
     def _remember(self, learnt: Learnt) -> None:
         """Start with what was learnt before, as old as it is."""
         age = (self.t0_ns - learnt.stamp_ns) * 1e-9
-        for rival, known in zip(self._rivals, self._known):
+        for rival, known in zip(self._rivals.table, self._known):
             if rival.wrong:
                 continue
             body = slice(learnt.x.size)             # it may be without what is of the vehicle
@@ -245,14 +224,14 @@ class Bank:
     def _point_of(self, filters: Filters) -> Array:
         """Return the parameters of the likeliest mean of each rival, with one delay for all."""
         point = filters.x[filters.lead]
-        point[:, DELAY] = np.clip(point[self._best(filters), DELAY], MIN_DELAY, MAX_DELAY)
+        point[:, DELAY] = np.clip(point[self._rivals.best(filters), DELAY], MIN_DELAY, MAX_DELAY)
         return point
 
     def _model(self, filters: Filters, point: Array, imu: Intervals) -> Linearised:
         """Linearise epochs."""
-        return linearised(point, imu.mirrored(self._signs[filters.ids]),
+        return linearised(point, imu.mirrored(self._rivals.signs[filters.ids]),
                           (imu.Q + SHARE * imu.Q_excess)[:, None], self._use_position,
-                          None if self._vehicle is None else self._vehicle.position)
+                          self._rivals.base_position)
 
     def _anchor(self, filters: Filters, track: InertialTrack) -> None:
         """Freeze n0 at the last epoch that was processed; the track is there."""
@@ -263,7 +242,7 @@ class Bank:
     def _step(self, filters: Filters, model: Linearised, k: int, track: Track) -> None:
         self._mixed = None
         filters.propagate(model, k)
-        vehicle = self._vehicle
+        vehicle = self._rivals.vehicle
         look = vehicle is not None and vehicle.is_due(model.duration[k])
         self._nis, self._innovation = math.nan, NOTHING_NEW
         if not any(track.present[k]):
@@ -275,7 +254,7 @@ class Bank:
             if not present:
                 continue
             new = filters.update(model, k, kind, track, self._receiver.factors(kind))
-            best = self._best(filters)
+            best = self._rivals.best(filters)
             square = float(new.nis[best]) / 3
             normalised = new.residual[best] / np.sqrt(np.diagonal(new.covariance[best]))
             self._receiver.hear(kind, square, normalised, track.stated[k][kind])
@@ -290,59 +269,16 @@ class Bank:
         self._in_a_row = self._in_a_row + 1 if astray else 0
         self._nis, self._innovation = sum(nis) / len(nis), first
         if vehicle is not None and look:
-            filters.hold(vehicle.look(filters, model, k, track, self._along[filters.ids]))
-        self._select(filters)
+            filters.hold(vehicle.look(filters, model, k, track))
+        self._rivals.select(filters)
 
     def _drop_vehicle(self, filters: Filters) -> bool:
         """Assume nothing of the vehicle any more where the motion contradicts it."""
-        free, level = self._free[filters.ids], self._posterior(filters)
-        if not free.any() or log_sum(level[free]) < log_sum(level[~free]) + MARGIN:
+        if not self._rivals.vehicle_contradicted(filters):
             return False
         self._not_used = NOT_USED.format(vehicle=self._config.vehicle)
-        self._assume(replace(self._config, vehicle='none'))
+        self._config = replace(self._config, vehicle='none')
         return True
-
-    def _best(self, filters: Filters) -> int:
-        """Return the place of the likeliest level."""
-        return int(np.argmax(self._of_levels(filters)))
-
-    def _posterior(self, filters: Filters) -> Array:
-        """Return the log of how likely each rival is, but for a constant, shape (M,)."""
-        return filters.evidence + self._before(filters)
-
-    def _before(self, filters: Filters) -> Array:
-        """Return the log of how likely each rival was before the data, shape (M,)."""
-        prior = self._prior[filters.ids]
-        if self._vehicle is None:
-            return prior
-        return prior - (self._along[filters.ids] < 0) * self._vehicle.against_backwards
-
-    def _of_levels(self, filters: Filters) -> Array:
-        """Return the same where those that are no levels in use are out of the question."""
-        return np.where(self._aside[filters.ids], -np.inf, self._posterior(filters))
-
-    def _select(self, filters: Filters) -> None:
-        """Drop means and rivals that are unlikely, merge means that agree."""
-        ids = filters.ids
-        if len(filters.C) == 1:
-            return
-        wrong = self._wrong[ids]
-        level = self._posterior(filters)
-        best = np.max(level[~self._aside[ids]])
-        filters.evidence = np.where(wrong, filters.evidence, np.maximum(level, best - LEAST)
-                                    - self._before(filters))
-        filters.evidence = filters.evidence - best
-        if len(filters.C) == len(ids) and not wrong.any():
-            return
-        keep = filters.weight > filters.weight[filters.lead][filters.place] - UNLIKELY
-        keep &= (~wrong | (filters.evidence > -HOPELESS))[filters.place]
-        for direction in {1, -1} & set(self._along[ids].tolist()):
-            there = self._along[ids] == direction
-            if np.max(level[there]) < best - LEAST:
-                keep &= ~there[filters.place]
-        if not keep.all():
-            filters.keep(keep)
-        filters.merge(ALIKE)
 
     # Start
 
@@ -366,8 +302,8 @@ class Bank:
     def _begin_with(self, rough: RoughAttitude) -> None:
         """Start filters for all headings and rivals at t0, and feed them what has come since."""
         epochs, imu = self._start.epochs, self._start.imu
-        C = np.concatenate([all_headings(rough, sign) for sign in self._signs[:, 3]])
-        rival = np.repeat(np.arange(len(self._rivals)), HEADINGS)
+        C = np.concatenate([all_headings(rough, sign) for sign in self._rivals.signs[:, 3]])
+        rival = np.repeat(np.arange(len(self._rivals.table)), HEADINGS)
         P = self._start.covariance(rough, np.array([known.P for known in self._known]))
         v_n = next((epoch.v_n for epoch in epochs if epoch.v_n is not None), np.zeros(3))
         self._freeze(epochs[0])
@@ -388,7 +324,7 @@ class Bank:
 
     def _shares_of(self, filters: Filters) -> Array:
         """Return the weight of each mean in the mixture."""
-        level = self._of_levels(filters)
+        level = self._rivals.of_levels(filters)
         share = np.exp(level - level.max())
         return (share / share.sum())[filters.place] * np.exp(filters.weight)
 
@@ -446,22 +382,14 @@ class Bank:
             return Fit(self._offered, delay=self._config.gnss_delay)
         words, contradicted = self._doubt()
         velocity, position, either = self._rejected
-        level = self._rivals[filters.ids[self._best(filters)]]
+        level = self._rivals.table[filters.ids[self._rivals.best(filters)]]
         return Fit(self._offered, 3 * (self._offered - either), self._receiver.misfit,
                    self._nis, self._innovation, velocity, position, either,
                    delay=self._config.gnss_delay + float(self._body()[0][DELAY]),
                    objection=words if contradicted else '',
                    remarks=(self._receiver.in_words() + self._not_used
                             + level_in_words(level, self._config.imu_noise)
-                            + self._vehicle_in_words(filters)))
-
-    def _vehicle_in_words(self, filters: Filters) -> str:
-        if self._vehicle is None:
-            return ''
-        level = self._of_levels(filters)
-        likely = level > np.max(level) - MARGIN
-        return self._vehicle.in_words(self._body()[0],
-                                      set(self._along[filters.ids[likely]].tolist()))
+                            + self._rivals.vehicle_in_words(filters)))
 
     def move_t0(self) -> None:
         """Move t0 to the last epoch."""
@@ -476,43 +404,17 @@ class Bank:
         return self._doubt()[0]
 
     def _doubt(self) -> tuple[str, bool]:
-        """
-        Hear the rivals that are wrong.
-
-        Returns
-        -------
-        words : str
-            Why a heading is not to be declared, or ''.
-        contradicted : bool
-            Whether the data fit better with one of them.
-
-        """
+        """Return why a heading is not to be declared, and whether the data contradict it."""
         filters = self._filters
-        if filters is None or not self._wrong[filters.ids].any():
+        if filters is None or not self._rivals.any_wrong(filters):
             return '', False
-        # How much likelier each of them is than all levels.
-        wrong, level = self._wrong[filters.ids], self._posterior(filters)
-        ahead = np.where(wrong, level - log_sum(level[~self._aside[filters.ids]]), -np.inf)
-        ahead = ahead / max(self._receiver.misfit, 1.0)
-        if not np.any(ahead > -MARGIN):
-            return '', False
-        mean, P = self._attitudes()
-        C = np.stack([filters.C0[filters.lead], filters.C[filters.lead]], axis=1)
-        away = log_so3(C @ mean.swapaxes(-1, -2)) / np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-        harm = np.abs(away).max(axis=(1, 2))
-        worst = int(np.argmax(np.where(harm > HARMLESS, ahead, -np.inf)))
-        if harm[worst] <= HARMLESS or ahead[worst] <= -MARGIN:
-            return '', False
-        if ahead[worst] > MARGIN:
-            return in_words(self._rivals[filters.ids[worst]], filters.x[filters.lead[worst]],
-                            self._config.gnss_delay), True
-        return 'the signs of the IMU axes are not confirmed by the motion yet: turn', False
+        return self._rivals.doubt(filters, *self._attitudes(), self._receiver.misfit)
 
     def _body(self) -> tuple[Array, Array]:
         filters = self._filters
         if filters is None:
             return self._known[0].x, self._known[0].P
-        best = self._best(filters)
+        best = self._rivals.best(filters)
         return filters.x[filters.lead[best]], filters.P[best, FIRST:, FIRST:]
 
     def nuisance(self) -> Nuisance:

@@ -265,7 +265,7 @@ class Filters:
         PH = self.P @ look.H.swapaxes(1, 2)
         S = look.H @ PH + look.variance[:, None, None] * np.eye(2)
         inverse = np.linalg.inv(S)
-        weighted = apply(inverse[q], look.innovation)
+        weighted = apply(np.asarray(inverse[q], float), look.innovation)
         nis = (np.sum(look.innovation * weighted, axis=1)
                + look.backwards ** 2 / S[q, 0, 0])
         nis = held[q] * np.where(look.tumbled, GATE, np.minimum(nis, GATE))

@@ -193,9 +193,10 @@ class _Results:
 
 
 def _status_of(epoch: Epoch) -> Status:
-    """Return what an epoch knows of a status: neither reason nor counts."""
+    """Return what an epoch knows of a status: no counts."""
     unknown = np.full(3, math.nan)
     return Status(
-        epoch.state, '', epoch.stamp_ns, None if epoch.initial is None else epoch.initial.stamp_ns,
-        None, epoch.initial, epoch.current, epoch.gyro_bias, unknown, epoch.accel_bias, unknown,
-        unknown, unknown, math.nan, math.nan, {})
+        epoch.state, epoch.reason, epoch.stamp_ns,
+        None if epoch.initial is None else epoch.initial.stamp_ns, None, epoch.initial,
+        epoch.current, epoch.gyro_bias, unknown, epoch.accel_bias, unknown, unknown, unknown,
+        math.nan, math.nan, {})

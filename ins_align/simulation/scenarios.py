@@ -280,10 +280,10 @@ SCENARIOS = {
     'flight': Scenario(_flight, 100.0, 40.0),
     'car': Scenario(_car, 100.0, 1.0),
     'straight': Scenario(_straight, 100.0, 15.0),
-    'highway': Scenario(_highway, 60.0, 5.0),
     'static': Scenario(_static, 60.0, 1.0),
     'hover': Scenario(_hover, 60.0, 2.0),
     'launch': Scenario(_launch, 60.0, 2.0),
     'reverse': Scenario(_reverse, 100.0, 1.0),
     'swing': Scenario(_swing, 100.0, 5.0),
+    'highway': Scenario(_highway, 60.0, 5.0),
 }
