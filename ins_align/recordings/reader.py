@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 import dataclasses
 from dataclasses import dataclass
+import itertools
 from operator import attrgetter, itemgetter
 import os
 from typing import NamedTuple
@@ -201,53 +202,46 @@ def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | N
         the option that chooses one.
 
     """
-    imu_topic = _required(bag, 'IMU', [IMU_TYPE], [*INERTIAL_UNITS], imu)
-    fix_topic = _required(bag, 'position', *(
+    imu_topic = _required(bag, 'IMU', ([IMU_TYPE], [*INERTIAL_UNITS]), imu)
+    fix_topic = _required(bag, 'position', (
         ([FIX_TYPE], [*RECEIVERS]) if config.fix_type == 'NavSatFix' else
         ([LIVE_TYPES[config.fix_type]], [FIX_TYPE, *RECEIVERS])), fix)
-    velocity_topic = _velocity(bag, config, fix_topic, velocity)
     reference = next((topic for topic in bag.topics if topic.name == REFERENCE_TOPIC
                       and topic.msgtype == IMU_TYPE), None)
-    return Topics(imu_topic, fix_topic, velocity_topic, reference)
+    return Topics(imu_topic, fix_topic, _velocity(bag, config, fix_topic, velocity), reference)
 
 
 def _velocity(bag: Bag, config: Config, fix: Topic, name: str | None) -> Topic | None:
     """Choose a velocity, if there is one, and warn of those that are left out."""
-    if name is not None:
-        topic = _named(bag, 'velocity', [*VELOCITY_TYPES, *RECEIVERS], name)
-        _measures(bag, topic, config)  # for the warning: it is read as the user wishes
-        return topic
-    if config.use_velocity is False:
+    if name is None and config.use_velocity is False:
         return None
-    if fix.msgtype in RECEIVERS:
+    if name is None and fix.msgtype in RECEIVERS:
         return fix
-    preferred = [name for name in VELOCITY_TYPES if short_name(name) == config.velocity_type]
-    others = [name for name in VELOCITY_TYPES if name not in preferred]
-    if chosen := _only(bag, 'velocity', preferred, config):
+    preferred = [each for each in VELOCITY_TYPES if short_name(each) == config.velocity_type]
+    others = [each for each in VELOCITY_TYPES if each not in preferred]
+    twists = [each for each in others if each != VECTOR_TYPE]
+    topic = _choose(bag, 'velocity', (preferred, twists, [VECTOR_TYPE], [*RECEIVERS]), name,
+                    config)
+    if topic is None:
+        for other in sorted(_candidates(bag, UNSTAMPED_TYPES), key=attrgetter('name')):
+            if not is_command(other):
+                bag.warn(f'{other.name} cannot be used: {type_in_words(other.msgtype)} has no '
+                         f'stamp; a velocity needs {_in_words(VELOCITY_TYPES)}')
+    elif name is not None:
+        _measures(bag, topic, config)  # for the warning: it is read as the user wishes
+    elif topic.msgtype in preferred:
         if names := sorted(f'{other.name} ({short_name(other.msgtype)})'
                            for other in _candidates(bag, others)
                            if _measures(bag, other, say=False)):
-            bag.warn(f'the velocity is read from {chosen.name} ({short_name(chosen.msgtype)}), '
+            bag.warn(f'the velocity is read from {topic.name} ({short_name(topic.msgtype)}), '
                      f'not from {", ".join(names)}: --velocity-topic chooses')
-        return chosen
-    twists = [name for name in others if name != VECTOR_TYPE]
-    for types in (twists, [VECTOR_TYPE], [*RECEIVERS]):
-        if chosen := _only(bag, 'velocity', types, config):
-            return chosen
-    for topic in sorted(_candidates(bag, UNSTAMPED_TYPES), key=attrgetter('name')):
-        if not is_command(topic):
-            bag.warn(f'{topic.name} cannot be used: {type_in_words(topic.msgtype)} has no stamp; '
-                     f'a velocity needs {_in_words(VELOCITY_TYPES)}')
-    return None
+    return topic
 
 
-def _required(bag: Bag, what: str, types: list[str], others: list[str], name: str | None,
-              ) -> Topic:
-    """Return the one topic of some types, or of others where there is none of these."""
-    topic = (_only(bag, what, types) or _only(bag, what, others) if name is None
-             else _named(bag, what, [*types, *others], name))
+def _required(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None) -> Topic:
+    topic = _choose(bag, what, groups, name)
     if topic is None:
-        raise BagError(f'{bag.path} has no {what} topic ({_in_words(types)}); {_listing(bag)}')
+        raise BagError(f'{bag.path} has no {what} topic ({_in_words(groups[0])}); {_listing(bag)}')
     return topic
 
 
@@ -256,16 +250,23 @@ def _candidates(bag: Bag, types: list[str]) -> list[Topic]:
             and REFERENCE_NAMESPACE not in topic.name]
 
 
-def _only(bag: Bag, what: str, types: list[str], config: Config = Config()) -> Topic | None:
-    """Return the one topic of some types; where there are more the one that measures."""
-    candidates = _candidates(bag, types)
-    if what == 'velocity' or len(candidates) > 1 or types[0] in DRIVER_TYPES:
-        candidates = [topic for topic in candidates if _measures(bag, topic, config)]
-    if len(candidates) > 1:
-        names = ', '.join(sorted(topic.name for topic in candidates))
-        raise BagError(f'{bag.path} has more than one {what} topic ({names}): '
-                       f'choose one with {OPTIONS[what]}')
-    return candidates[0] if candidates else None
+def _choose(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None,
+            config: Config = Config()) -> Topic | None:
+    """Return the topic of a name, or the one that measures of the first types that there are."""
+    if name is not None:
+        return _named(bag, what, list(dict.fromkeys(itertools.chain(*groups))), name)
+    for types in groups:
+        candidates = _candidates(bag, types)
+        # The only one of a standard type is read whatever it says of itself.
+        if what == 'velocity' or len(candidates) > 1 or types[0] in DRIVER_TYPES:
+            candidates = [topic for topic in candidates if _measures(bag, topic, config)]
+        if len(candidates) > 1:
+            names = ', '.join(sorted(topic.name for topic in candidates))
+            raise BagError(f'{bag.path} has more than one {what} topic ({names}): '
+                           f'choose one with {OPTIONS[what]}')
+        if candidates:
+            return candidates[0]
+    return None
 
 
 def _named(bag: Bag, what: str, types: list[str], name: str) -> Topic:
