@@ -48,7 +48,7 @@ DATABASE_PATH = re.compile(r'[\w/. ~+=@,-]*\.db3', re.ASCII)
 # What may mend a file that rosbags cannot open.
 COMMANDS = {'.bag': 'rosbag reindex {0}', '.mcap': 'mcap recover {0} -o mended.mcap',
             '.db3': 'sqlite3 {0} .recover | sqlite3 mended.db3'}
-BLOCK = 2048  # messages yielded at a time
+BLOCK = 4096  # messages yielded at a time
 PIECE_BYTES = 1 << 20  # of a file, unpacked at a time
 INDEX_ENTRY_BYTES = 12  # of a message in the index of a ROS 1 file
 MAX_PASSES = 20  # over a ROS 1 file, parts of which are read again where its chunks overlap
