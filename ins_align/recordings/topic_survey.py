@@ -104,7 +104,7 @@ class Recorded(TopicInfo):
 
     def __init__(self, topic: Topic, kind: str, bag_start_ns: int) -> None:
         super().__init__(topic.name, type_in_words(topic.msgtype), kind)
-        self.topic, self._start_ns = topic, bag_start_ns
+        self.topic, self._start_ns, self._age_ns = topic, bag_start_ns, 0
         self.recorded_ns = self.stamps_ns = np.zeros(0, np.int64)
         self.values: Array = np.zeros((0, 6 if kind == 'imu' else 3))
         self.usable = np.zeros(0, bool)
@@ -167,12 +167,17 @@ class Recorded(TopicInfo):
                 np.concatenate, zip(*self._parts))
             self._parts = []
         count = self.stamps_ns.size
-        self.timing = self._timing()
         if not count:
+            self.timing = Timing(self._undecodable, self._undecodable)
             self.faults += (self._why or 'its messages cannot be decoded' if self._undecodable
                             else 'it has no messages',)
             return
-        self.usable &= ~self._astray()
+        ages_ns = self.recorded_ns - self.stamps_ns
+        # The median: one of the ages, no mean of two clocks.
+        self._age_ns = int(np.sort(ages_ns)[count // 2])
+        astray = np.abs(ages_ns - self._age_ns) > MAX_ASTRAY * 1e9
+        self.timing = self._timing(ages_ns * 1e-9, astray)
+        self.usable &= ~astray
         self.usable_share = float(np.mean(self.usable))
         if self.kind == 'fix':
             self.no_fix_share = self._without_fix / count
@@ -183,20 +188,9 @@ class Recorded(TopicInfo):
             self.sigma = horizontal, vertical
 
     @property
-    def age_ns(self) -> int:
-        """Median of recorded time less stamp: one of the ages, no mean of two clocks."""
-        ages = np.sort(self.recorded_ns - self.stamps_ns)
-        return int(ages[ages.size // 2]) if ages.size else 0
-
-    @property
     def age_s(self) -> float:
         """Usual recorded time less stamp; 0 where there is no message."""
         return self.timing.stamp_age_s or 0.0
-
-    def _astray(self) -> np.ndarray:
-        """Return which stamps are of another time than the others."""
-        ages = self.recorded_ns - self.stamps_ns
-        return np.asarray(np.abs(ages - self.age_ns) > MAX_ASTRAY * 1e9)
 
     def series(self) -> Series:
         """
@@ -205,16 +199,11 @@ class Recorded(TopicInfo):
         Stamps are moved by the median age of the messages: clocks that differ do not matter. Of
         one stamp the first counts.
         """
-        times_ns = self.stamps_ns[self.usable] - self._start_ns + self.age_ns
+        times_ns = self.stamps_ns[self.usable] - self._start_ns + self._age_ns
         return series_of(times_ns.astype(float) * 1e-9, self.values[self.usable])
 
-    def _timing(self) -> Timing:
-        """Return when messages came."""
-        count = self.stamps_ns.size + self._undecodable
-        if not self.stamps_ns.size:
-            return Timing(count, self._undecodable)
-        ages = (self.recorded_ns - self.stamps_ns) * 1e-9
-        astray = self._astray()
+    def _timing(self, ages: Array, astray: np.ndarray) -> Timing:
+        """Return when messages came, whose ages are given in seconds."""
         in_order = self.stamps_ns[~astray]
         stamps_ns = np.unique(in_order)
         intervals = np.diff(stamps_ns) * 1e-9
@@ -223,12 +212,12 @@ class Recorded(TopicInfo):
         longest = None
         if gaps.size:
             place = gaps[np.argmax(intervals[gaps])]
-            start_ns = int(stamps_ns[place]) - self._start_ns + self.age_ns
+            start_ns = int(stamps_ns[place]) - self._start_ns + self._age_ns
             longest = Gap(start_ns * 1e-9, float(intervals[place]))
         first, last = ((self.recorded_ns[[0, -1]] - self._start_ns) * 1e-9).tolist()
         return Timing(
-            count, self._undecodable, 1.0 / usual or None, first, last, float(np.median(ages)),
-            float(np.ptp(np.quantile(ages[~astray], (0.01, 0.99)))),
+            ages.size + self._undecodable, self._undecodable, 1.0 / usual or None, first, last,
+            float(np.median(ages)), float(np.ptp(np.quantile(ages[~astray], (0.01, 0.99)))),
             int(np.count_nonzero(astray)), int(np.count_nonzero(np.diff(in_order) <= 0)),
             gaps.size, longest)
 
