@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array
-from ins_align.gnss.buffer import fault_of_fix, usable_velocity, with_an_altitude
+from ins_align.gnss.buffer import numbers_of
 from ins_align.gnss.drivers import type_in_words
-from ins_align.gnss.messages import Fix, MessageError, Velocity
+from ins_align.gnss.messages import MessageError
 from ins_align.gnss.motion import Series, series_of, VelocityFrame
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.recordings import Topic
@@ -132,7 +132,9 @@ class Recorded(TopicInfo):
                 self._undecodable += 1
                 self._why = self._why or message.why
                 continue
-            rows.append((time_ns, message.stamp_ns, *self._numbers_of(message)))
+            values, fault = numbers_of(message)
+            self._without_fix += fault == 'no_fix'
+            rows.append((time_ns, message.stamp_ns, values, not fault))
             if (covariance := message.covariance) is not None:
                 self._sigmas.append((math.sqrt((covariance[0, 0] + covariance[1, 1]) / 2.0),
                                      math.sqrt(covariance[2, 2])))
@@ -149,16 +151,6 @@ class Recorded(TopicInfo):
                 what = ' and '.join(unmeasured(deserialize(data, self.topic)))
                 self.unmeasured = what and (f'its messages say that it does not measure {what} '
                                             '(covariance -1)')
-
-    def _numbers_of(self, message: Fix | Velocity) -> tuple[list[float], bool]:
-        """Return the values of a message and whether they can be used."""
-        if isinstance(message, Velocity):
-            velocity = usable_velocity(message)
-            return (velocity or message).velocity.tolist(), velocity is not None
-        fix = with_an_altitude(message)
-        fault = fault_of_fix(fix)
-        self._without_fix += fault == 'no_fix'
-        return [fix.latitude_deg, fix.longitude_deg, fix.altitude_m], not fault
 
     def finish(self) -> None:
         """Put together what has been added, and say what it tells of itself."""
