@@ -247,8 +247,7 @@ def test_uav_velocity_integration_formula():
 
 
 def attitudes(angles, stamps):
-    return Orientations(np.array(stamps), quaternion_from_matrix(matrix_from_rpy(angles)),
-                        np.zeros((len(stamps), 9)))
+    return np.array(stamps), quaternion_from_matrix(matrix_from_rpy(angles))
 
 
 def test_reference_is_interpolated():
@@ -268,13 +267,13 @@ def test_reference_has_gaps():
 
 
 def test_attitudes_that_are_not_known_are_left_out():
-    stamps, quaternions, _ = attitudes([[0.0, 0.0, 0.1]] * 5, range(5))
+    stamps, quaternions = attitudes([[0.0, 0.0, 0.1]] * 5, range(5))
     covariances = np.full((5, 9), 0.1)
     covariances[1, 0] = -1.0
     quaternions[2], quaternions[3, 1] = 0.0, np.nan
-    known = Orientations(stamps, quaternions, covariances).known()
-    np.testing.assert_array_equal(known.stamps_ns, [0, 4])
-    np.testing.assert_array_equal(known.quaternions, quaternions[[0, 4]])
+    known_stamps, known = Orientations(stamps, quaternions, covariances).known()
+    np.testing.assert_array_equal(known_stamps, [0, 4])
+    np.testing.assert_array_equal(known, quaternions[[0, 4]])
 
 
 def test_reference_comes_in_parts_in_any_order():

@@ -63,12 +63,12 @@ class Orientations(NamedTuple):
     quaternions: np.ndarray  # (N, 4), (x, y, z, w)
     covariances: np.ndarray  # (N, 9), rad^2
 
-    def known(self) -> Orientations:
-        """Return those without a negative variance ("not known") and with a direction."""
+    def known(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return stamps and quaternions that are no zeros and whose variance is not negative."""
         good = (np.isfinite(self.quaternions).all(axis=1)
                 & (np.abs(self.quaternions).max(axis=1, initial=0.0) > 1e-3)
                 & ~(self.covariances[:, 0] < 0.0))
-        return Orientations(*(column[good] for column in self))
+        return self.stamps_ns[good], self.quaternions[good]
 
 
 class Refused(NamedTuple):
