@@ -359,9 +359,11 @@ def run_replay(arguments: argparse.Namespace) -> int:
     if arguments.plot:
         check_plot(arguments.plot)
     from ins_align.batch import Task
+    from ins_align.recordings.reader import Request
 
-    tasks = [Task(bag, os.path.abspath(bag), config, arguments.imu_topic, arguments.fix_topic,
-                  arguments.velocity_topic, arguments.start, arguments.duration,
+    tasks = [Task(bag, Request(os.path.abspath(bag), config, arguments.imu_topic,
+                               arguments.fix_topic, arguments.velocity_topic, arguments.start,
+                               arguments.duration),
                   absolute(arguments.csv, label), absolute(arguments.plot, label),
                   absolute(arguments.results, label))
              for bag, label in zip(arguments.bags, names)]

@@ -35,7 +35,7 @@ from ins_align.geometry.rotation import Array
 from ins_align.gnss.messages import Velocity
 from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
-from ins_align.recordings.decode import ImuSamples, joined, Orientations, Refused
+from ins_align.recordings.decode import ImuSamples, Orientations, Refused
 from ins_align.recordings.reader import choose_topics, read, Request
 from ins_align.recordings.replay import Reference
 from ins_align.report import new_figure
@@ -116,8 +116,9 @@ def load(path: Path) -> Recording:
     parts = list(read(Request(path)))
     if parts[0].topics.reference is None:
         raise BagError(f'{path} has no reference')
-    imu = joined([part.imu for part in parts])
-    orientations = joined([part.orientations for part in parts])
+    imu = ImuSamples(*map(np.concatenate, zip(*(part.imu for part in parts))))
+    orientations = Orientations(
+        *map(np.concatenate, zip(*(part.orientations for part in parts))))
     gnss = []
     earlier = 0
     for part in parts:

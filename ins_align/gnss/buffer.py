@@ -71,6 +71,15 @@ def usable_velocity(velocity: Velocity) -> Velocity | None:
     return velocity if all(abs(value) < MAX_SPEED for value in (east, north, up)) else None
 
 
+def numbers_of(message: Fix | Velocity) -> tuple[list[float], str]:
+    """Return a position or velocity, its vertical 0 where that is nan, and why it is useless."""
+    if isinstance(message, Velocity):
+        usable = usable_velocity(message)
+        return (usable or message).velocity.tolist(), '' if usable else 'nan'
+    fix = with_an_altitude(message)
+    return [fix.latitude_deg, fix.longitude_deg, fix.altitude_m], fault_of_fix(fix)
+
+
 @dataclass
 class GnssEpoch:
     """What the receiver said at one stamp."""

@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import re
 from typing import Any, NamedTuple
 
@@ -88,9 +89,16 @@ def imu_from_msg(msg: Any) -> tuple[int, np.ndarray, np.ndarray]:
 
 def fix_from_msg(msg: Any) -> Fix:
     """Convert sensor_msgs/NavSatFix; a covariance of unknown type or without sense is None."""
-    return fixes([stamp_from_msg(msg)], [[msg.latitude, msg.longitude, msg.altitude]],
-                 np.array(msg.position_covariance, float).reshape(1, 3, 3),
-                 [msg.position_covariance_type], [msg.status.status])[0]
+    return fixes_from_msgs([msg])[0]
+
+
+def fixes_from_msgs(msgs: Sequence[Any]) -> list[Fix]:
+    """Convert many messages like `fix_from_msg`."""
+    return fixes([stamp_from_msg(msg) for msg in msgs],
+                 [[msg.latitude, msg.longitude, msg.altitude] for msg in msgs],
+                 np.array([msg.position_covariance for msg in msgs], float).reshape(-1, 3, 3),
+                 [msg.position_covariance_type for msg in msgs],
+                 [msg.status.status for msg in msgs])
 
 
 def fixes(stamps_ns: ArrayLike, places: ArrayLike, covariances: np.ndarray,
@@ -125,19 +133,28 @@ def velocity_from_msg(msg: Any, config: Config) -> Velocity:
         If the message says that the velocity is given in a body frame.
 
     """
-    covariance = None
-    frame = msg.header.frame_id
-    if config.velocity_type == 'TwistStamped':
-        linear = msg.twist.linear
-    elif config.velocity_type == 'Vector3Stamped':
-        linear = msg.vector
+    return velocities_from_msgs([msg], config)[0]
+
+
+def velocities_from_msgs(msgs: Sequence[Any], config: Config) -> list[Velocity]:
+    """Convert many messages of the same `frame_of_velocity` like `velocity_from_msg`."""
+    covariances = None
+    if config.velocity_type == 'Vector3Stamped':
+        linear = [msg.vector for msg in msgs]
+    elif config.velocity_type == 'TwistStamped':
+        linear = [msg.twist.linear for msg in msgs]
     else:
-        linear = msg.twist.twist.linear
-        covariance = np.array(msg.twist.covariance, dtype=float).reshape(1, 6, 6)
-        if config.velocity_type == 'Odometry':
-            frame = msg.child_frame_id  # the frame of nav_msgs/Odometry's twist
-    return velocities([stamp_from_msg(msg)], frame, [[linear.x, linear.y, linear.z]], covariance,
-                      config)[0]
+        linear = [msg.twist.twist.linear for msg in msgs]
+        covariances = np.array([msg.twist.covariance for msg in msgs], float).reshape(-1, 6, 6)
+    return velocities([stamp_from_msg(msg) for msg in msgs],
+                      frame_of_velocity(msgs[0], config.velocity_type),
+                      [[each.x, each.y, each.z] for each in linear], covariances, config)
+
+
+def frame_of_velocity(msg: Any, velocity_type: str) -> str:
+    """Return the frame that a message says its velocity is in."""
+    frame: str = msg.child_frame_id if velocity_type == 'Odometry' else msg.header.frame_id
+    return frame
 
 
 def is_body_frame(frame: str) -> bool:
