@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import math
 
 from ins_align.config import Config
-from ins_align.geometry.earth import carried, GRAVITY_EQUATOR, Place, SEMI_MAJOR_AXIS, way
+from ins_align.geometry.earth import (
+    dead_reckon, enu_offset, GRAVITY_EQUATOR, Place, SEMI_MAJOR_AXIS)
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.buffer import GnssEpoch
 from ins_align.gnss.messages import Fix, Velocity
@@ -186,17 +187,17 @@ class Antenna:
             self._place = (*self._place[:2], fix.altitude_m)
         predicted = self._place
         if predicted is not None and v_n is not None and dt < MAX_CARRIED:
-            predicted = carried(predicted, v_n, dt)
+            predicted = dead_reckon(predicted, v_n, dt)
         if fix is not None:
             place = (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg),
                      fix.altitude_m if fix.vertical or predicted is None else predicted[2])
             silent = (stamp_ns - self._fix_ns) * 1e-9
             if (predicted is None
-                    or math.hypot(*way(predicted, place)) <= MAX_FIX_JUMP * (1 + silent)):
+                    or math.hypot(*enu_offset(predicted, place)) <= MAX_FIX_JUMP * (1 + silent)):
                 self._jumps = 0
                 self._altitude_known |= fix.vertical
                 if self._place is not None and v_n is None and dt > 0:
-                    self._speed = math.hypot(*way(self._place, place)) / dt
+                    self._speed = math.hypot(*enu_offset(self._place, place)) / dt
                 self._place, self._place_ns, self._fix_ns = place, stamp_ns, stamp_ns
                 return True
             self._counts['fix_jump'] += 1

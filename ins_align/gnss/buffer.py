@@ -23,7 +23,7 @@ from collections import Counter, deque
 from dataclasses import dataclass
 import math
 
-from ins_align.geometry.earth import carried
+from ins_align.geometry.earth import dead_reckon
 from ins_align.gnss.messages import Fix, Velocity
 import numpy as np
 
@@ -89,7 +89,7 @@ class GnssEpoch:
         fix, velocity = self.fix or other.fix, self.velocity or other.velocity
         if fix is None or velocity is None or not (self.is_half and other.is_half):
             return None
-        latitude, longitude, altitude = carried(
+        latitude, longitude, altitude = dead_reckon(
             (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg), fix.altitude_m),
             velocity.velocity, (velocity.stamp_ns - fix.stamp_ns) * 1e-9)
         return GnssEpoch(velocity.stamp_ns, fix._replace(

@@ -16,7 +16,7 @@
 from collections import deque
 import math
 
-from ins_align.geometry.earth import Place, way
+from ins_align.geometry.earth import enu_offset, Place
 from ins_align.geometry.rotation import Array, Index
 import numpy as np
 
@@ -276,7 +276,7 @@ class VelocityCheck:
         if self._origin is None:
             self._origin, self._path, self._anchor = place, (0.0, 0.0), None
             self._recent.clear()
-        self._recent.append((*way(self._origin, place)[:2], *self._path))
+        self._recent.append((*enu_offset(self._origin, place)[:2], *self._path))
         if len(self._recent) < AGREEING:
             return
         here = self._recent[AGREEING // 2]
