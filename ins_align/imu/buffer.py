@@ -16,7 +16,7 @@
 from collections import Counter
 
 from ins_align.geometry.rotation import Array, Index
-from ins_align.imu.plausibility import IMU_BEFORE, without_spikes
+from ins_align.imu.noise import IMU_BEFORE, without_spikes
 import numpy as np
 
 # Beyond these no sensor measures; such values would overflow the integrals (rad/s, m/s^2).

@@ -22,9 +22,9 @@ from typing import Any, NamedTuple
 
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array
-from ins_align.gnss.buffer import fault_of_fix, usable_velocity, with_an_altitude
 from ins_align.gnss.drivers import INERTIAL_UNITS, RECEIVERS
-from ins_align.gnss.messages import Fix, MessageError, Velocity
+from ins_align.gnss.messages import (
+    fault_of_fix, Fix, MessageError, usable_velocity, Velocity, with_an_altitude)
 from ins_align.gnss.motion import Series, series_of
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.recordings import Topic
