@@ -113,7 +113,7 @@ def test_what_is_wanted_is_waited_for_and_named():
     buffer.translations['base_link'] = 0.0, 0.0, 0.0
     items, mounting = wanted.take([], 101.0)
     assert items == [SAMPLE, FIX] and wanted.waits_for == ''
-    assert np.array_equal(mounting.C_imu_base, np.eye(3))
+    assert np.array_equal(mounting.base.rotation, np.eye(3))
 
 
 @pytest.mark.parametrize('base_frame', [

@@ -249,6 +249,17 @@ def _straight(duration: float) -> Callable[[Array], Motion]:
     return motion
 
 
+def _highway(duration: float) -> Callable[[Array], Motion]:
+    """Drive straight on at a constant 10 m/s; gusts push the nose off the course by a degree."""
+    def motion(time: Array) -> Motion:
+        zero = np.zeros_like(time)
+        roll, pitch = _wave(time, 0.005, 2.3) + _wave(time, 0.01, 17.0), _wave(time, 0.005, 1.7)
+        slip = _wave(time, 0.017, 3.1) + _wave(time, 0.017, 7.3, 1.0)
+        return Motion(_along(zero + 10.0, zero, zero), np.stack([roll, pitch, slip], axis=-1))
+
+    return motion
+
+
 def _static(duration: float) -> Callable[[Array], Motion]:
     """Stand."""
     return lambda time: Motion(np.zeros((len(time), 3)), np.zeros((len(time), 3)))
@@ -274,4 +285,5 @@ SCENARIOS = {
     'launch': Scenario(_launch, 60.0, 2.0),
     'reverse': Scenario(_reverse, 100.0, 1.0),
     'swing': Scenario(_swing, 100.0, 5.0),
+    'highway': Scenario(_highway, 60.0, 5.0),
 }
