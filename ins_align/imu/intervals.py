@@ -101,14 +101,9 @@ class Intervals:
         """
         Return what the intervals would be with the signs of sensors changed, leading axes (K, M).
 
-        To second order in the rotation over an interval, with rate and force steady in it: good
-        for telling the signs apart.
-
-        Parameters
-        ----------
-        signs : ndarray, shape (M, 4)
-            +1 or -1: of the gyros x, y, z and of the accelerometers.
-
+        `signs`, shape (M, 4), are those of the gyros x, y, z and of the accelerometers. To second
+        order in the rotation over an interval, with rate and force steady in it: good for telling
+        the signs apart.
         """
         gyro, accel = signs[:, :3], signs[:, 3:]
         wider = {name: array[:, None] for name, array in vars(self).items()}
