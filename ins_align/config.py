@@ -101,8 +101,8 @@ class Config:
         'm', minimum=0.0, maximum=100.0)
     lever_arm_from_tf: str | bool = _parameter(
         'auto', 'take the lever arm from the transform between the frame_ids of IMU and position '
-        'messages (/tf_static); auto: where there is one and lever_arm is not set; true: wait for '
-        'it', choices=AUTO_OR_BOOL)
+        'messages (/tf_static); auto: where there is one and lever_arm is not set, or zero; true: '
+        'wait for it', choices=AUTO_OR_BOOL)
     base_frame: str = _parameter(
         '', 'frame whose attitude the status and JSON give as well, as TF has it; empty: none')
     vehicle: str = _parameter(

@@ -98,14 +98,11 @@ def test_motion_that_contradicts_the_vehicle_is_found(scenario, options):
 
 def test_backing_out_is_said_to_be_ambiguous_until_it_shows():
     simulation = simulate('reverse', seed=6, duration=30.0)
-    aligner = Aligner(Config(**CAR))
-    reasons = []
-    for epoch in epochs_of(aligner, simulation):
-        reasons.append((epoch.state, aligner.status().reason))
-    assert any('forwards and backwards are both possible' in reason for _, reason in reasons)
-    assert not any('both possible' in reason for state, reason in reasons
-                   if state is State.ALIGNED)
-    assert reasons[-1][0] is State.ALIGNED
+    _, epochs, _ = aligned(simulation)
+    ambiguous = ['forwards and backwards are both possible' in epoch.reason for epoch in epochs]
+    assert any(ambiguous) and epochs[-1].state is State.ALIGNED
+    assert not any(unclear for unclear, epoch in zip(ambiguous, epochs)
+                   if epoch.state is State.ALIGNED)
 
 
 @pytest.mark.parametrize('method', ['vif', 'pif'])
