@@ -26,8 +26,7 @@ from typing import Union
 
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array, Index
-from ins_align.gnss.buffer import numbers_of
-from ins_align.gnss.messages import Fix, Velocity
+from ins_align.gnss.messages import Fix, numbers_of, Velocity
 from ins_align.gnss.motion import (
     EMPTY, GRID, on_grid, Series, series_of, track, velocity_frame, velocity_from_positions,
     VelocityFrame, without_wild_positions)

@@ -23,7 +23,7 @@ from ins_align.config import Config, ImuNoise, PRESETS
 from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.motion import GRID, Series
-from ins_align.imu.plausibility import force_fault, RangeCheck
+from ins_align.imu.noise import force_fault, RangeCheck
 import numpy as np
 
 WINDOW = 2.0  # s in which noise is measured

@@ -23,8 +23,7 @@ from typing import Any
 from ins_align.config import Config
 from ins_align.geometry.rotation import (
     Array, exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw)
-from ins_align.gnss.buffer import fault_of_fix
-from ins_align.gnss.messages import Fix
+from ins_align.gnss.messages import fault_of_fix, Fix
 from ins_align.mounting import base_attitude
 from ins_align.offline import OfflineAligner
 from ins_align.processes import run_ahead

@@ -23,9 +23,8 @@ from typing import Any, NamedTuple
 
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array
-from ins_align.gnss.buffer import numbers_of
 from ins_align.gnss.drivers import type_in_words
-from ins_align.gnss.messages import MessageError
+from ins_align.gnss.messages import MessageError, numbers_of
 from ins_align.gnss.motion import Series, series_of, VelocityFrame
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.recordings import Topic
