@@ -20,6 +20,7 @@ FLU, axes ENU, angles radians, yaw counter-clockwise from east.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 from ins_align.geometry.rotation import Array, matrix_from_rpy
@@ -59,26 +60,10 @@ class Scenario(NamedTuple):
 def motion_function(name: str, duration: float, heading: float = 0.0, crab: float = 0.0,
                     stand_still: float = 0.0) -> Callable[[Array], Motion]:
     """
-    Motion of a scenario as a function of time.
+    Return the motion of one of `SCENARIOS` as a function of times (n,), for so many seconds.
 
-    Parameters
-    ----------
-    name : str
-        One of `SCENARIOS`.
-    duration : float
-        Seconds that the motion is asked for.
-    heading : float
-        Turns the whole trajectory about the vertical.
-    crab : float
-        Angle of the vehicle's nose from where its course would have it.
-    stand_still : float
-        Seconds at rest before the motion begins.
-
-    Returns
-    -------
-    callable
-        Takes times (n,) in seconds, gives a `Motion`.
-
+    Heading turns the whole trajectory about the vertical, crab the nose alone; the motion begins
+    after some seconds at rest.
     """
     scenario = SCENARIOS[name]
     motion = scenario.motion(duration)
@@ -108,15 +93,7 @@ def _step_integral(time: Array, start: float, width: float) -> Array:
 
 
 def _profile(durations: Sequence[float], values: Sequence[float], width: float) -> Any:
-    """
-    Piecewise constant with a smooth step of `width` at the start of every piece.
-
-    Returns
-    -------
-    scipy.interpolate.PPoly
-        Twice continuously differentiable, with exact antiderivatives.
-
-    """
+    """Make a PPoly that steps smoothly, within `width`, to each of the values in turn."""
     from scipy.interpolate import PPoly
 
     ends = np.cumsum(durations)
@@ -173,6 +150,7 @@ def _flight(duration: float) -> Callable[[Array], Motion]:
 
 
 def _road(first: _Rows, duration: float) -> Callable[[Array], Motion]:
+    """Drive through streets, corners, bends and traffic lights, after what comes first."""
     acceleration, rate = _course(first, _CITY, duration, 0.8)
     speed_along, heading = acceleration.antiderivative(), rate.antiderivative()
     distance = speed_along.antiderivative()
@@ -187,16 +165,6 @@ def _road(first: _Rows, duration: float) -> Callable[[Array], Motion]:
         return Motion(_along(speed, yaw, slope), np.stack([roll, pitch, yaw], axis=-1))
 
     return motion
-
-
-def _car(duration: float) -> Callable[[Array], Motion]:
-    """Drive through streets: corners, bends, traffic lights."""
-    return _road((), duration)
-
-
-def _reverse(duration: float) -> Callable[[Array], Motion]:
-    """Back out of a parking space, then drive through streets."""
-    return _road(_BACK_OUT, duration)
 
 
 def _launch(duration: float) -> Callable[[Array], Motion]:
@@ -240,18 +208,12 @@ def _hover(duration: float) -> Callable[[Array], Motion]:
     return motion
 
 
-def _straight(duration: float) -> Callable[[Array], Motion]:
+def _straight(speed: float, duration: float) -> Callable[[Array], Motion]:
     """Hold speed, course and attitude: heading cannot be observed."""
     def motion(time: Array) -> Motion:
-        zero = np.zeros_like(time)
-        return Motion(_along(zero + 30.0, zero, zero), np.zeros((len(time), 3)))
+        return Motion(np.tile([speed, 0.0, 0.0], (len(time), 1)), np.zeros((len(time), 3)))
 
     return motion
-
-
-def _static(duration: float) -> Callable[[Array], Motion]:
-    """Stand."""
-    return lambda time: Motion(np.zeros((len(time), 3)), np.zeros((len(time), 3)))
 
 
 def _swing(duration: float) -> Callable[[Array], Motion]:
@@ -267,11 +229,11 @@ def _swing(duration: float) -> Callable[[Array], Motion]:
 
 SCENARIOS = {
     'flight': Scenario(_flight, 100.0, 40.0),
-    'car': Scenario(_car, 100.0, 1.0),
-    'straight': Scenario(_straight, 100.0, 15.0),
-    'static': Scenario(_static, 60.0, 1.0),
+    'car': Scenario(partial(_road, ()), 100.0, 1.0),
+    'straight': Scenario(partial(_straight, 30.0), 100.0, 15.0),
+    'static': Scenario(partial(_straight, 0.0), 60.0, 1.0),
     'hover': Scenario(_hover, 60.0, 2.0),
     'launch': Scenario(_launch, 60.0, 2.0),
-    'reverse': Scenario(_reverse, 100.0, 1.0),
+    'reverse': Scenario(partial(_road, _BACK_OUT), 100.0, 1.0),
     'swing': Scenario(_swing, 100.0, 5.0),
 }
