@@ -86,7 +86,11 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
         'last columns are what chance alone leaves of ratio and NEES/3 (1 sigma) with so many '
         'runs. The aligner is told the noise and that lever arm and delay are known, but where '
         'they are the unknown.')
-    reached_text(report, summaries)
+    report.table(
+        f'Targets: ratio of error and bound at most {RATIO_LIMIT:g}, NEES/3 within '
+        f'{NEES_RANGE[0]:g} to {NEES_RANGE[1]:g}; beyond chance: by more than two of its sigmas', [
+            reached(title, [result for result in summaries if result['title'] == title])
+            for title in dict.fromkeys(case.title for case in CASES)])
     report.table('Root mean square errors, bounds and their ratios', [
         row(result, time) for result in summaries for time in TABLE_TIMES])
     report.table(
@@ -181,24 +185,22 @@ def chances(runs: int) -> tuple[float, float]:
     return 1 / np.sqrt(2 * runs), np.sqrt(2 / 3 / runs)
 
 
-def reached_text(report: Report, results: list[JsonDict]) -> None:
-    """Say how many of the table's figures meet their targets."""
+def reached(title: str, results: list[JsonDict]) -> JsonDict:
+    """Say how many of the table's figures of like cases meet their targets."""
     places = [TIMES.index(time) for time in TABLE_TIMES]
-    sentences = []
-    for title in dict.fromkeys(result['title'] for result in results):
-        chosen = [result for result in results if result['title'] == title]
-        tilt, heading, nees = (np.array([result[name][places] for result in chosen])
-                               for name in ('tilt_ratio', 'heading_ratio', 'nees'))
-        slack = 2 * chances(chosen[0]['runs'])[0]
-        sentences.append(
-            f'- {title}: ratio at most {RATIO_LIMIT:g} in {np.sum(tilt <= RATIO_LIMIT)} of '
-            f'{tilt.size} figures for tilt (mean {np.mean(tilt):.2f}, largest {np.max(tilt):.2f}) '
-            f'and {np.sum(heading <= RATIO_LIMIT)} for heading (mean {np.mean(heading):.2f}, '
-            f'largest {np.max(heading):.2f}; {np.sum(heading > RATIO_LIMIT + slack)} beyond two '
-            f'sigma of chance above it); NEES/3 within {NEES_RANGE[0]:g} to {NEES_RANGE[1]:g} in '
-            f'{np.sum((nees >= NEES_RANGE[0]) & (nees <= NEES_RANGE[1]))} (mean '
-            f'{np.mean(nees):.2f}, {np.min(nees):.2f} to {np.max(nees):.2f})')
-    report.text('\n'.join(sentences))
+    slack = 2 * chances(results[0]['runs'])[0]
+    nees = np.array([result['nees'][places] for result in results])
+    cells = {'case': title, 'figures': nees.size}
+    for angle in ('tilt', 'heading'):
+        ratio = np.array([result[f'{angle}_ratio'][places] for result in results])
+        cells |= {f'{angle} met': int(np.sum(ratio <= RATIO_LIMIT)),
+                  f'{angle} beyond chance': int(np.sum(ratio > RATIO_LIMIT + slack)),
+                  f'{angle} mean': f'{np.mean(ratio):.2f}',
+                  f'{angle} largest': f'{np.max(ratio):.2f}'}
+    low, high = NEES_RANGE
+    return cells | {'NEES/3 met': int(np.sum((nees >= low) & (nees <= high))),
+                    'mean': f'{np.mean(nees):.2f}',
+                    'range': f'{np.min(nees):.2f} to {np.max(nees):.2f}'}
 
 
 def row(result: JsonDict, time: float) -> JsonDict:

@@ -39,6 +39,7 @@ COLOURS = 64        # of a figure
 BINS = (3.0, 5.0)   # sigmas that are counted
 
 JsonDict = dict[str, Any]
+Groups = list[tuple[str, list[JsonDict]]]      # of trials, with names
 
 
 def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jobs: int | None,
@@ -101,24 +102,12 @@ def exact_config_for(simulation: Simulation, **changes: Any) -> Config:
 # Errors against the truth
 
 class Error(NamedTuple):
-    """
-    Error of an attitude against the truth, about east, north and up.
+    """Error of an attitude against the truth."""
 
-    Attributes
-    ----------
-    angles_deg, sigma_deg : ndarray, shape (3,)
-        The error and what is stated of it.
-    nees : float
-        Normalised squared error of the three angles.
-    tilt_sigmas, heading_sigmas : float
-        The larger one of the two tilts, each in its sigma, and the heading.
-
-    """
-
-    angles_deg: Array
-    sigma_deg: Array
-    nees: float
-    tilt_sigmas: float
+    angles_deg: Array       # (3,), about east, north, up
+    sigma_deg: Array        # (3,), stated
+    nees: float             # normalised squared error of the three angles
+    tilt_sigmas: float      # the larger one of two, each in its sigma
     heading_sigmas: float
 
     @property
@@ -149,8 +138,8 @@ def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Array | None = No
                  float(np.max(sigmas[:2])), float(sigmas[2]))
 
 
-# What is counted of a moment: the worse of the attitude at t0 and the current one.
-ANGLES = {'tilt': 'tilt_sigmas', 'heading': 'heading_sigmas'}
+# What is counted of a moment, and its axes.
+ANGLES = {'tilt': slice(0, 2), 'heading': slice(2, 3)}
 
 
 def judged(epoch: Epoch | None, true: Callable[[Any], Array]) -> JsonDict | None:
@@ -163,22 +152,19 @@ def judged(epoch: Epoch | None, true: Callable[[Any], Array]) -> JsonDict | None
 
 
 def worse(moment: JsonDict | None, *angles: str) -> float:
-    """Error of a judged moment in sigmas, of any of `ANGLES` or of all; -1 if there was none."""
+    """
+    Error of a judged moment in sigmas; -1 if there was none.
+
+    The worse of the attitude at t0 and the current one, of any of `ANGLES` or of all.
+    """
     return -1.0 if moment is None else max(
-        moment[name][ANGLES[angle]] for name in ('initial', 'current')
+        moment[name][f'{angle}_sigmas'] for name in ('initial', 'current')
         for angle in angles or ANGLES)
 
 
 def first_in(epochs: Iterable[Epoch], *states: Any) -> Epoch | None:
     """Return the first epoch in one of the states."""
     return next((epoch for epoch in epochs if epoch.state in states), None)
-
-
-def binned(sigmas: Any) -> JsonDict:
-    """Count errors within the first of `BINS`, between them, and beyond the second; not nan."""
-    low, high = (int(np.sum(np.asarray(sigmas) > limit)) for limit in BINS)
-    return {f'within {BINS[0]:g} sigma': int(np.sum(np.isfinite(sigmas))) - low,
-            f'{BINS[0]:g} to {BINS[1]:g}': low - high, f'beyond {BINS[1]:g}': high}
 
 
 def most(values: Iterable[float], digits: str) -> str | None:
@@ -240,6 +226,49 @@ class Report:
                              ('json', json.dumps(_plain(numbers), indent=1))):
             content = f'{text}\n'.encode()
             write_whole(self._out / f'{self._name}.{suffix}', lambda file: file.write(content))
+
+def groups_of(trials: list[JsonDict], faults: Iterable[str]) -> Groups:
+    """Group trials by fault; the last group is all."""
+    return [*((name, [t for t in trials if t['fault'] == name]) for name in faults),
+            ('all', trials)]
+
+
+def moment_table(report: Report, title: str, groups: Groups, moment: str) -> None:
+    """Print when groups of trials came to a moment, and how many were beyond the limits."""
+    rows = []
+    for name, trials in groups:
+        declared = [t[moment] for t in trials if t[moment] is not None]
+        times = [each['t_s'] for each in declared]
+        row = {'fault': name, 'runs': len(trials), 'declared': len(declared),
+               'median, s': f'{np.median(times):.1f}' if times else None}
+        for angle, axes in ANGLES.items():
+            sigmas = np.array([worse(each, angle) for each in declared])
+            for limit in BINS:
+                share = f'{np.sum(sigmas > limit)} ({100 * np.mean(sigmas > limit):.1f} %)' \
+                    if declared else None
+                row[f'{angle} beyond {limit:g}'] = share
+            row[f'worst {angle}, sigma'] = most(sigmas, '.1f')
+            row[f'{angle}, deg'] = most(
+                (np.max(np.abs(each[which]['error_deg'][axes])) for each in declared
+                 for which in ('initial', 'current')), '.2g')
+        rows.append(row)
+    report.table(title, rows)
+
+
+def whose(trial: JsonDict) -> JsonDict:
+    """Return the columns that say which trial it is."""
+    return {'index': trial['index'], 'fault': trial['fault'], 'scenario': trial['scenario'],
+            'IMU': trial['imu']}
+
+
+def offender_table(report: Report, trials: list[JsonDict], *moments: str) -> list[JsonDict]:
+    """Print and return the trials that are beyond the first of `BINS` at one of the moments."""
+    report.table(f'Beyond {BINS[0]:g} sigma', [
+        {**whose(t), 'moment': moment,
+         **{f'{angle}, sigma': f'{worse(t[moment], angle):.1f}' for angle in ANGLES},
+         'after, s': f"{t[moment]['t_s']:.1f}"}
+        for moment in moments for t in trials if worse(t[moment]) > BINS[0]])
+    return [t for t in trials if max(worse(t[moment]) for moment in moments) > BINS[0]]
 
 
 def draw(width: float, height: float, panels: Sequence[Sequence[JsonDict]], **shared: Any) -> Any:

@@ -29,8 +29,8 @@ from ins_align.aligner import Aligner, State
 from ins_align.config import Config
 from ins_align.experiments.bound import crossing_time
 from ins_align.experiments.common import (
-    ANGLES, binned, BINS, combination, config_for, exact_config_for, first_in, GRADES, JsonDict,
-    judged, most, parallel, Report, without, worse)
+    BINS, combination, config_for, exact_config_for, first_in, GRADES, groups_of, JsonDict, judged,
+    moment_table, most, offender_table, parallel, Report, without, worse)
 from ins_align.simulation.simulate import epochs_of, feed, SCENARIOS, simulate
 import numpy as np
 
@@ -109,7 +109,7 @@ def trial(index: int) -> JsonDict:
         'heading_deg': random.uniform(-180, 180), 'latitude_deg': random.uniform(-75, 75),
         'lever_arm': lever.tolist(), 'mount_rpy_deg': random.uniform(-20, 20, 3).tolist()}
     config = {'lever_arm': (0.0, 0.0, 0.0)} if fault in LEVER_LEFT_OUT else {}
-    return {'index': index, 'fault': fault, 'scenario': scenario,
+    return {'index': index, 'fault': fault, 'scenario': scenario, 'imu': grade,
             'simulate': arguments | FAULTS[fault](random), 'config': config}
 
 
@@ -134,64 +134,18 @@ def run_trial(task: JsonDict) -> JsonDict:
             **{name: judged(epoch, simulation.attitude_at) for name, epoch in moments.items()}}
 
 
-# What is counted of ALIGNED: title, moment, angle.
-COUNTED = (
-    ('Heading when ALIGNED was declared first', 'aligned', 'heading'),
-    ('Tilt when ALIGNED was declared first', 'aligned', 'tilt'),
-    ('Heading at the end, where still ALIGNED', 'final', 'heading'),
-    ('Tilt at the end, where still ALIGNED', 'final', 'tilt'))
-
-
-def row(name: str, trials: list[JsonDict], moment: str, angle: str) -> JsonDict:
-    """Return a row of a table by fault."""
-    declared = [t[moment] for t in trials if t[moment] is not None]
-    sigmas = [worse(judgement, angle) for judgement in declared]
-    axes = slice(0, 2) if angle == 'tilt' else slice(2, 3)
-    degrees = [np.max(np.abs(judgement[which]['error_deg'][axes])) for judgement in declared
-               for which in ('initial', 'current')]
-    return {'fault': name, 'runs': len(trials), **binned(sigmas),
-            'not declared': len(trials) - len(declared), 'worst, sigma': most(sigmas, '.1f'),
-            'worst, deg': most(degrees, '.2g')}
-
-
-def fault_table(report: Report, title: str, trials: list[JsonDict], *counted: str) -> None:
-    """Print a table by fault of a moment and an angle."""
-    report.table(title, [
-        *(row(name, [t for t in trials if t['fault'] == name], *counted) for name in FAULTS),
-        row('all', trials, *counted)])
-
-
 def aligned_tables(report: Report, trials: list[JsonDict]) -> list[JsonDict]:
     """Print what ALIGNED was worth; return what was declared beyond the first bin."""
     report.text(
         f'{len(trials)} runs of {DURATION:g} s over all scenarios ({", ".join(SCENARIOS)}), '
         'grades of IMU and faults, with random heading, latitude, mount and lever arm. Errors '
         'against truth in stated sigmas: of the tilt the worse of two axes, and the worse of the '
-        'attitude at t0 and the current one. None of the faults is told to the aligner.')
-    declared = [t for t in trials if t['aligned'] is not None]
-    worst = [max(worse(t['aligned']), worse(t['final'])) for t in declared]
-    offenders = [t for t, sigmas in zip(declared, worst) if sigmas > BINS[0]]
-    beyond = {angle: sum(worse(t['aligned'], angle) > BINS[0] for t in declared)
-              for angle in ANGLES}
-    share = {angle: 100 * count / max(len(declared), 1) for angle, count in beyond.items()}
-    report.text(
-        f'{len(declared)} of {len(trials)} runs were declared ALIGNED. At the declaration '
-        f"{beyond['heading']} of them were beyond {BINS[0]:g} sigma in heading "
-        f"({share['heading']:.1f} %), {beyond['tilt']} in tilt ({share['tilt']:.1f} %); at "
-        f'declaration or end, in any angle, {len(offenders)} beyond {BINS[0]:g} and '
-        f'{sum(sigmas > BINS[1] for sigmas in worst)} beyond {BINS[1]:g}. Target, with 1000 '
-        'runs: at most 1 % and none.')
-    for title, *counted in COUNTED:
-        fault_table(report, title, trials, *counted)
-    report.table(f'ALIGNED beyond {BINS[0]:g} sigma', [
-        {'index': t['index'], 'fault': t['fault'], 'scenario': t['scenario'],
-         'IMU': t['simulate']['imu_grade'],
-         **{f"{angle}{', end' if moment == 'final' else ''}":
-            None if t[moment] is None else f'{worse(t[moment], angle):.1f}'
-            for _, moment, angle in COUNTED},
-         'after, s': f"{t['aligned']['t_s']:.1f}", 'withdrawn': t['counts'].get('withdrawals', 0)}
-        for t in offenders])
-    return without(offenders, *DRAWN)
+        'attitude at t0 and the current one. None of the faults is told to the aligner. Target, '
+        f'with 1000 runs: at most 1 % beyond {BINS[0]:g} sigma and none beyond {BINS[1]:g}.')
+    groups = groups_of(trials, FAULTS)
+    moment_table(report, 'When ALIGNED was declared first', groups, 'aligned')
+    moment_table(report, 'At the end, where still ALIGNED', groups, 'final')
+    return without(offender_table(report, trials, 'aligned', 'final'), *DRAWN)
 
 
 def levelled_tables(report: Report, trials: list[JsonDict]) -> None:
@@ -201,10 +155,10 @@ def levelled_tables(report: Report, trials: list[JsonDict]) -> None:
         'straight motion, cannot show a wrong sign: the data of an IMU with its z axis or all '
         'accelerations reversed are those of one that is mounted upside down. Such a vehicle is '
         'levelled wrongly until it turns or changes speed.')
-    fault_table(report, 'Tilt when LEVELLED (or ALIGNED at once) was declared first', trials,
-                'levelled', 'tilt')
+    moment_table(report, 'When LEVELLED (or ALIGNED at once) was declared first',
+                 groups_of(trials, FAULTS), 'levelled')
     gross = [t for t in trials if worse(t['levelled'], 'tilt') > BINS[1]]
-    report.table(f'Of those beyond {BINS[1]:g} sigma: what became of them', [
+    report.table(f'Of those with a tilt beyond {BINS[1]:g} sigma: what became of them', [
         {'fault': fault, 'scenario': scenario, 'runs': len(chosen),
          'still levelled at the end': sum(t['state'] == State.LEVELLED.value for t in chosen),
          'aligned at any time': sum(t['aligned'] is not None for t in chosen)}

@@ -26,7 +26,7 @@ from pathlib import Path
 
 from ins_align.config import PRESETS
 from ins_align.experiments.common import (
-    ANGLES, BINS, combination, JsonDict, most, parallel, Report, setup, without, worse)
+    combination, Groups, JsonDict, moment_table, offender_table, parallel, Report, setup, without)
 from ins_align.experiments.declare import DRAWN, run_trial
 from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
@@ -75,8 +75,9 @@ def trial(seed: int, faults: tuple[str, ...] | None = None,
                  'stand_still': STAND_STILL * random.integers(2)}
     for fault in faults:
         arguments |= FAULTS[fault]
-    return {'seed': seed, 'faults': faults, 'scenario': scenario or drawn_scenario,
-            'simulate': arguments, 'config': {'imu_grade': 'mems'}}
+    return {'index': seed, 'fault': ' and '.join(faults) or 'none', 'faults': faults,
+            'scenario': scenario or drawn_scenario, 'imu': 'mems', 'simulate': arguments,
+            'config': {'imu_grade': 'mems'}}
 
 
 def write(out: Path, trials: list[JsonDict]) -> None:
@@ -89,31 +90,11 @@ def write(out: Path, trials: list[JsonDict]) -> None:
         'in stated sigmas: the worse of the attitude at t0 and the current one, and of the two '
         'axes of the tilt. A fault has the runs in which it is alone and those of its pairs. '
         'Target: at most 1 % beyond 3 sigma, none beyond 5.')
-    groups = [('none', [t for t in trials if not t['faults']])]
+    groups: Groups = [('none', [t for t in trials if not t['faults']])]
     for name in FAULTS:
         groups += [(label, [t for t in trials if name in t['faults'] and len(t['faults']) == size])
                    for size, label in ((1, name), (2, f'{name}, in pairs'))]
     for moment, title in MOMENTS.items():
-        report.table(f'First declared {title}', [
-            row(*group, moment) for group in (*groups, ('all', trials))])
-    report.table(f'Beyond {BINS[0]:g} sigma', [
-        {'seed': t['seed'], 'faults': ' and '.join(t['faults']) or 'none',
-         'scenario': t['scenario'], 'declared': moment,
-         **{f'{angle}, sigma': f'{worse(t[moment], angle):.1f}' for angle in ANGLES},
-         'after, s': f"{t[moment]['t_s']:.1f}"}
-        for moment in MOMENTS for t in trials if worse(t[moment]) > BINS[0]])
+        moment_table(report, f'First declared {title}', [*groups, ('all', trials)], moment)
+    offender_table(report, trials, *MOMENTS)
     report.write({'runs': without(trials, *DRAWN)})
-
-
-def row(name: str, trials: list[JsonDict], moment: str) -> JsonDict:
-    """Share of the declared runs beyond the limits."""
-    declared = [t[moment] for t in trials if t[moment] is not None]
-    cells: JsonDict = {
-        'fault': name, 'runs': len(trials), 'declared': len(declared),
-        'median, s': f"{np.median([each['t_s'] for each in declared]):.1f}" if declared else None}
-    sigmas = {angle: np.array([worse(each, angle) for each in declared]) for angle in ANGLES}
-    cells |= {f'{angle} beyond {limit:g}':
-              f'{100 * np.mean(values > limit):.1f} %' if declared else None
-              for angle, values in sigmas.items() for limit in BINS}
-    return cells | {f'worst {angle}, sigma': most(values, '.1f')
-                    for angle, values in sigmas.items()}

@@ -50,20 +50,10 @@ SWING_STEP = 0.1        # s, of the differences that give the angular accelerati
 
 @dataclass(frozen=True)
 class Bound:
-    """
-    Cramer-Rao bound of the initial attitude after each GNSS epoch.
+    """Cramer-Rao bound of the initial attitude after each GNSS epoch."""
 
-    Attributes
-    ----------
-    time : ndarray, shape (K,)
-        Seconds since t0, the first epoch.
-    covariance : ndarray, shape (K, 3, 3)
-        Of the small rotation about the axes of ENU, rad^2.
-
-    """
-
-    time: Array
-    covariance: Array
+    time: Array         # (K,), s since t0, the first epoch
+    covariance: Array   # (K, 3, 3), of the small rotation about the axes of ENU, rad^2
 
     def at(self, seconds: float) -> Array:
         """Return the bound after the last epoch up to `seconds` after t0."""
@@ -73,24 +63,13 @@ class Bound:
 def bound(simulation: Simulation, *, use_velocity: bool = True, use_position: bool = False,
           lever_arm_std: float = 0.0, delay_std: float = 0.0) -> Bound:
     """
-    Cramer-Rao bound on the true motion of a simulation.
+    Cramer-Rao bound on the true motion of a simulation: its noise is not used, what it states is.
 
-    Parameters
-    ----------
-    simulation : Simulation
-        Its truth, epochs and stated covariances are used; its noise is not.
-    use_velocity, use_position : bool
-        Which measurements count.
-    lever_arm_std, delay_std : float
-        Metres per axis and seconds; above 0 they are unknowns too.
-
-    Returns
-    -------
-    Bound
-
+    Lever arm (m per axis) and delay (s) are unknowns too where their sigma is above 0.
     """
     noise = simulation.imu_noise
-    epochs = _true_epochs_ns(simulation)
+    # Measurements may be older than their stamps.
+    epochs = simulation.gnss_stamps_ns - round(simulation.meta['gnss_delay'] * 1e9)
     path = _true_path(simulation, epochs)
     H = design_of(path, simulation.lever_arm)
     walk = bias_walk(path, noise, simulation.lever_arm)
@@ -187,11 +166,6 @@ def interpolated(stamps_ns: np.ndarray, values: Array, wanted_ns: np.ndarray) ->
     return CubicSpline((stamps_ns - origin) * 1e-9, values)((wanted_ns - origin) * 1e-9)
 
 
-def _true_epochs_ns(simulation: Simulation) -> np.ndarray:
-    """Instants of the measurements, which may be before their stamps."""
-    return simulation.gnss_stamps_ns - round(simulation.meta['gnss_delay'] * 1e9)
-
-
 def _true_path(simulation: Simulation, epochs_ns: np.ndarray) -> Path:
     grid, at = grid_of(simulation.imu_stamps_ns, epochs_ns)
     time = (grid - grid[0]) * 1e-9
@@ -274,13 +248,7 @@ def _turned_by_noise(path: Path) -> tuple[Array, Array]:
     How an angle error at s turns a row: ``-[x x]`` with ``x = B z(s)``.
 
     Velocity: ``x = U(t) - U(s)``; position: ``x = P(t) - P(s) - (t - s) U(s)``. The lever arm,
-    centimetres of motion per rad, is left out of the noise.
-
-    Returns
-    -------
-    B : ndarray, shape (2 K, 3, 7)
-    M : ndarray, shape (2 K, 7, 7)
-
+    centimetres of motion per rad, is left out of the noise. B (2 K, 3, 7) and M (2 K, 7, 7).
     """
     B = np.zeros((len(path.time), 2, 3, 7))
     B[:, 0, :, 0], B[:, 1, :, 0] = path.U, path.P

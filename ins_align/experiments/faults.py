@@ -32,8 +32,8 @@ import warnings
 from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
 from ins_align.experiments.common import (
-    binned, BINS, combination, config_for, error_of, GRADES, JsonDict, judged, most, parallel,
-    Report, setup, without, worse)
+    BINS, combination, config_for, error_of, GRADES, groups_of, JsonDict, judged, most, parallel,
+    Report, setup, whose, without, worse)
 from ins_align.experiments.spoilt import FAULTS
 from ins_align.experiments.stream import payloads, Random, SECOND, Stream, stream_of
 from ins_align.gnss.messages import MessageError
@@ -66,8 +66,8 @@ def trial(index: int) -> JsonDict:
     arguments = {'imu_grade': grade, 'seed': index, 'duration': DURATION, **setup(random)}
     config = {'gnss_lateness': Config().gnss_lateness, 'velocity_type': str(random.choice(
         ['TwistWithCovarianceStamped', 'TwistStamped', 'Odometry']))}
-    return {'index': index, 'fault': fault, 'scenario': scenario, 'simulate': arguments,
-            'config': config, 'frame': str(random.choice(['enu', 'ned']))}
+    return {'index': index, 'fault': fault, 'scenario': scenario, 'imu': grade,
+            'simulate': arguments, 'config': config, 'frame': str(random.choice(['enu', 'ned']))}
 
 
 def run_trial(task: JsonDict) -> JsonDict:
@@ -221,15 +221,9 @@ def miscounted(counts: dict[str, int], stream: Stream) -> list[str]:
 
 def declarations(epochs: list[Epoch], stream: Stream, simulation: Simulation) -> JsonDict:
     """
-    Compare with the truth what was declared.
+    Judge each declaration and the last epoch if it is aligned.
 
-    Returns
-    -------
-    dict
-        ``declared``: each declaration as `judged`, ``final``: the last epoch if it is aligned,
-        and ``wrong_s``, for how long the current attitude was beyond the last of `BINS` while it
-        was called aligned.
-
+    ``wrong_s`` is how long the current attitude was beyond the last of `BINS` and called aligned.
     """
     def true(stamps: Any) -> Any:
         return simulation.attitude_at(stream.true_stamps(stamps))
@@ -257,12 +251,13 @@ def worst(result: JsonDict) -> float:
 def row(name: str, trials: list[JsonDict]) -> JsonDict:
     """Return a row of the table."""
     sigmas = [worst(t) for t in trials]
-    declared = [value for value in sigmas if math.isfinite(value)]
+    declared = np.array([value for value in sigmas if math.isfinite(value)])
+    bins = {f'beyond {limit:g}': int(np.sum(declared > limit)) for limit in BINS}
     return {'fault': name, 'runs': len(trials),
             'exceptions': sum(bool(t['exception']) for t in trials),
             'non-finite': sum(bool(t['non_finite']) for t in trials),
             'miscounted': sum(bool(t.get('miscounted')) for t in trials),
-            'declared': len(declared), **binned(declared), 'worst, sigma': most(declared, '.1f'),
+            'declared': len(declared), **bins, 'worst, sigma': most(declared, '.1f'),
             'aligned beyond 5, s': most((t.get('wrong_s', 0.0) for t in trials), '.1f'),
             'held, MB': f"{np.median([t['held'] for t in trials]) * 1e-6:.2f}"}
 
@@ -285,7 +280,7 @@ def write(out: Path, trials: list[JsonDict]) -> None:
         f"never held more than {max(t['held'] for t in trials) * 1e-6:.2f} MB (pickled, every "
         f'{WEIGH_EVERY} updates; limit {MAX_HELD * 1e-6:g}); the processes that ran them grew to '
         f"{max(t['resident_kb'] for t in trials) / 1024:.0f} MB.")
-    share = total['3 to 5'] + total['beyond 5']
+    share = total['beyond 3']
     report.text(
         f"{total['declared']} runs were declared ALIGNED at some time, {share} of them "
         f"({share / max(total['declared'], 1):.1%}) beyond {BINS[0]:g} sigma, "
@@ -295,8 +290,7 @@ def write(out: Path, trials: list[JsonDict]) -> None:
         f'is that during which, within a run, the current attitude was beyond {BINS[1]:g} sigma '
         'and still called aligned, the longest.')
     report.table('What became of it, by fault', [
-        *(row(name, chosen) for name in FAULTS
-          if (chosen := [t for t in trials if t['fault'] == name])), total])
+        row(*group) for group in groups_of(trials, FAULTS) if group[1]])
     report.table(f'Declared and beyond {BINS[0]:g} sigma', [
         {**whose(t), 'sigma': f'{worst(t):.1f}',
          'declared, sigma': most(map(worse, t['declared']), '.1f'),
@@ -308,9 +302,3 @@ def write(out: Path, trials: list[JsonDict]) -> None:
     if broken:
         report.table('What broke', broken)
     report.write({'runs': len(trials), 'trials': without(trials, *OMITTED)})
-
-
-def whose(result: JsonDict) -> JsonDict:
-    """Return the columns that say which run it is."""
-    return {'index': result['index'], 'fault': result['fault'], 'scenario': result['scenario'],
-            'IMU': result['simulate']['imu_grade']}

@@ -223,24 +223,8 @@ def exact_lever_remainder(time: Array, C_b0b: Array, omega_eb_b: Array, omega_ie
     """
     Difference of the exact form of (9) from the short one: the oracle of Remark 2.1.
 
-    Parameters
-    ----------
-    time : ndarray, shape (N,)
-        Seconds, starting at t0.
-    C_b0b : ndarray, shape (N, 3, 3)
-        Attitude relative to t0.
-    omega_eb_b : ndarray, shape (N, 3)
-        Angular rate to the Earth.
-    omega_ie_b0 : ndarray, shape (3,)
-        Earth rate in b0.
-    lever_b : ndarray, shape (3,)
-        Lever arm, metres.
-
-    Returns
-    -------
-    ndarray, shape (N, 3)
-        m/s; at most ``W^2 t |lever|``.
-
+    For times (N,) from t0 on, attitudes to t0 (N, 3, 3), rates to the Earth (N, 3), the Earth rate
+    in b0 and the lever arm (3,) in SI units; (N, 3), m/s, at most ``W^2 t |lever|``.
     """
     rate = skew(omega_eb_b)
     omega_ie_b = C_b0b.transpose(0, 2, 1) @ omega_ie_b0

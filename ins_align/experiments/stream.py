@@ -41,37 +41,21 @@ _VELOCITY = np.dtype([('arrival', 'i8'), ('stamp', 'i8'), ('velocity', 'f8', 3),
 @dataclass
 class Stream:
     """
-    What the drivers send: a row a message.
+    What the drivers send: a row a message, with ``arrival`` and ``stamp`` in ns.
 
-    Attributes
-    ----------
-    imu, fix, velocity : ndarray
-        Structured, with ``arrival`` and ``stamp`` in ns; everything else as in the ROS messages,
-        in the frame that the configuration names.
-    first, last : int
-        Stamps between which the vehicle is simulated.
-    config : dict
-        What else the aligner is told.
-    resets : list of int
-        When somebody asks for a new start.
-    update_every : float
-        Mean time between two updates of the aligner, s; 0: regularly, once a second.
-    expected : dict
-        Counters of the aligner that are known beforehand.
-    shift : tuple of three ints
-        Stamps from the first on and before the second are off by the third.
-
+    Everything else is as in the ROS messages, in the frame that the configuration names.
     """
 
     imu: np.ndarray
     fix: np.ndarray
     velocity: np.ndarray
-    first: int
+    first: int              # stamps between which the vehicle is simulated
     last: int
-    config: dict[str, Any] = field(default_factory=dict)
-    resets: list[int] = field(default_factory=list)
-    update_every: float = 0.0
-    expected: dict[str, int] = field(default_factory=dict)
+    config: dict[str, Any] = field(default_factory=dict)        # what else the aligner is told
+    resets: list[int] = field(default_factory=list)     # when somebody asks for a new start
+    update_every: float = 0.0       # s, in the mean; 0: regularly, once a second
+    expected: dict[str, int] = field(default_factory=dict)      # counters known beforehand
+    # Stamps from the first on and before the second are off by the third.
     shift: tuple[int, int, int] = 0, 0, 0
 
     def true_stamps(self, stamps: Any) -> Any:
@@ -132,15 +116,7 @@ class Stream:
 
 
 def payloads(config: Config, kind: str, rows: np.ndarray) -> list[Any]:
-    """
-    Return what `give` takes of messages of a kind, made as the node makes it.
-
-    Raises
-    ------
-    MessageError
-        If the velocities cannot be used.
-
-    """
+    """Return what `give` takes, made as the node does; MessageError: unusable velocities."""
     if kind == 'imu':
         return [(rows['stamp'], rows['gyro'], rows['accel'])]
     if kind == 'fix':

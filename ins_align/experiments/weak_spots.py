@@ -106,16 +106,6 @@ def _positions(stream: Stream, random: Random, offsets: float = 0.0, stated: flo
         _multipath(stream, random, offsets, 'fix')
 
 
-def _velocities(stream: Stream, random: Random, first_s: float = 0.0,
-                last_s: float = math.inf) -> None:
-    time = stream.seconds('velocity')
-    stream.keep('velocity', (time >= first_s) & (time < last_s))
-
-
-def _no_vertical(stream: Stream, random: Random) -> None:
-    stream.velocity['velocity'][:, 2] = np.nan
-
-
 def _resent(stream: Stream, random: Random) -> None:
     slow = np.arange(len(stream.fix)) // 5 * 5
     stream.fix['lla'] = stream.fix['lla'][slow]
@@ -174,10 +164,6 @@ def _parked(stream: Stream, random: Random, at_s: float, hours: float) -> None:
     stream.imu['gyro'][stream.seconds('imu') >= at_s] += walked * random.standard_normal(3)
 
 
-def _no_numbers(stream: Stream, random: Random, at_s: float) -> None:
-    stream.imu['gyro'][stream.seconds('imu') >= at_s, 1] = np.nan
-
-
 def _gaps(stream: Stream, random: Random, length: tuple[float, float]) -> None:
     lost = _spells(random, stream.seconds('imu'), length, (10.0, 10.0))
     stream.imu = np.delete(stream.imu, np.concatenate([np.zeros(0, np.intp), *lost]))
@@ -204,14 +190,6 @@ def _bias_jump(stream: Stream, random: Random, sensor: str, size: float, at_s: f
     later = np.flatnonzero(stream.seconds('imu') >= at_s)
     chosen = random.permutation(3)[:axes]
     stream.imu[sensor][np.ix_(later, chosen)] += size * random.choice([-1.0, 1.0], axes)
-
-
-def _late_gyros(stream: Stream, random: Random) -> None:
-    stream.imu['gyro'][2:] = stream.imu['gyro'][:-2].copy()
-
-
-def _half_rates(stream: Stream, random: Random) -> None:
-    stream.imu['gyro'] *= 0.5
 
 
 class Case(NamedTuple):
@@ -279,11 +257,12 @@ CASES = (
          {'duration': 600.0}, part=4),
     Case('no fix at 0, 0 for 20 s', CAR + FLIGHT, _looking),
     Case('three epochs, then 33 min in a garage', CAR, None, GARAGE, part=12),
-    Case('velocities stop after 30 s, positions 1 m', CAR, partial(_velocities, last_s=30.0),
-         {**LATER, 'position_std': 1.0}),
-    Case('velocities from 5 s on, positions wander', HOVER, partial(_velocities, first_s=5.0),
-         WANDERING),
-    Case('vertical velocity is no number', CAR + FLIGHT, _no_vertical),
+    Case('velocities stop after 30 s, positions 1 m', CAR, lambda stream, random: stream.keep(
+        'velocity', stream.seconds('velocity') < 30.0), {**LATER, 'position_std': 1.0}),
+    Case('velocities from 5 s on, positions wander', HOVER, lambda stream, random: stream.keep(
+        'velocity', stream.seconds('velocity') >= 5.0), WANDERING),
+    Case('vertical velocity is no number', CAR + FLIGHT, lambda stream, random: np.copyto(
+        stream.velocity['velocity'][:, 2], np.nan)),
     # Clocks
     Case('IMU stamped in bunches of 2 to 5', CAR + FLIGHT, _bunches),
     Case('IMU stamped late by 4 ms, exponential', CAR + FLIGHT,
@@ -295,7 +274,8 @@ CASES = (
     Case('clocks drift apart by 100 ppm', CAR + FLIGHT, partial(_gnss_clock, part=1e-4),
          HOURS, part=4),
     # The IMU
-    Case('IMU sends no numbers after 60 s', CAR + FLIGHT, partial(_no_numbers, at_s=60.0)),
+    Case('IMU sends no numbers after 60 s', CAR + FLIGHT, lambda stream, random: np.copyto(
+        stream.imu['gyro'][:, 1], np.nan, where=stream.seconds('imu') >= 60.0)),
     Case('parked for 3 h, IMU silent, biases walked', FLIGHT,
          partial(_parked, at_s=60.0, hours=3.0), LONG),
     Case('IMU losses of 50 to 450 ms every 10 s', CAR, partial(_gaps, length=(0.05, 0.45)),
@@ -313,8 +293,10 @@ CASES = (
          partial(_vibration, force=0.2, rate_deg=0.3), BUMPY, part=4),
     *(Case(f'gyro {axis} alone reversed, {motions[0][0]}', motions, None, {'flip_gyro': axis})
       for axis, motions in (('x', LAUNCH), ('z', LAUNCH), ('z', CAR))),
-    Case('gyros with half their rates', CAR, _half_rates),
-    Case('gyros 20 ms later than accelerometers', LAUNCH, _late_gyros),
+    Case('gyros with half their rates', CAR, lambda stream, random: np.multiply(
+        stream.imu['gyro'], 0.5, out=stream.imu['gyro'])),
+    Case('gyros 20 ms later than accelerometers', LAUNCH, lambda stream, random: np.copyto(
+        stream.imu['gyro'][2:], stream.imu['gyro'][:-2].copy())),
     *(Case(f'gyro bias jumps by 0.1 deg/s at {at_s:g} s, {axes} of 3', CAR, partial(
         _bias_jump, sensor='gyro', size=np.radians(0.1), at_s=at_s, axes=axes), LONG)
       for axes, at_s in ((1, 60.0), (3, 30.0))),
@@ -405,21 +387,10 @@ def follow(aligner: Aligner, sent: Iterator[Message],
            true: Callable[[list[int]], list[Array | None]], between: bool = False,
            std_deg: Array | None = None) -> JsonDict:
     """
-    Feed an aligner and judge what it declares.
+    Feed messages, in the order of arrival, to a new aligner and judge what it declares.
 
-    Parameters
-    ----------
-    aligner : Aligner
-        One that has seen nothing.
-    sent : iterator
-        Messages in the order of arrival.
-    true : callable
-        Gives the true attitudes at stamps, None where they are not known.
-    between : bool
-        Ask for the attitude after every message instead of looking at the epochs.
-    std_deg : ndarray, shape (3,), optional
-        Of the truth.
-
+    `true` gives the attitudes at stamps, None where they are not known, `std_deg` (3,) how well;
+    `between` asks for the attitude after every message instead of looking at the epochs.
     """
     seen: list[tuple[int, Attitude | None]] = []    # when, and what is called aligned then
     start = due = 0
