@@ -31,6 +31,7 @@ from ins_align.estimation.bank import Bank, Learnt
 from ins_align.estimation.declaration import Declaration, Fit
 from ins_align.estimation.formula import NoteMethod
 from ins_align.geometry.rotation import Array
+from ins_align.geometry.transform import Transform
 from ins_align.gnss.antenna import Antenna, AntennaEpoch
 from ins_align.gnss.buffer import GnssBuffer, GnssEpoch, PAIR_NS
 from ins_align.gnss.messages import Fix, Velocity
@@ -59,6 +60,9 @@ class Aligner:
     ----------
     config : Config, optional
         By default all parameters at their defaults.
+    base : Transform, optional
+        From the vehicle's frame to that of the IMU, of use with ``vehicle``; by default they are
+        the same.
 
     Attributes
     ----------
@@ -68,14 +72,16 @@ class Aligner:
 
     """
 
-    def __init__(self, config: Config | None = None) -> None:
+    def __init__(self, config: Config | None = None, base: Transform | None = None) -> None:
         """Wait for the first messages."""
         self.config = Config() if config is None else config
+        self._base = base
         self._counts: Counter[str] = Counter()      # of messages, by what became of them
         self._events: list[Event] = []
         self._warned: set[str] = set()
         self._done: list[Epoch] = []                # not returned yet
         self._delay_ns = round(self.config.gnss_delay * 1e9)
+        self._started_over = ''                     # why, until the next epoch
         self._method: Bank | NoteMethod | None = None
         self._forget_all()
 
@@ -161,17 +167,21 @@ class Aligner:
     def reset(self, reason: str = 'on request') -> None:
         """Start over, with nothing known; the reason in words."""
         self._counts['resets'] += 1
-        self._start_over(f'alignment starts over: {reason}')
+        self._start_over(reason)
 
     def _clock_jumped(self) -> None:
         self._process()                             # what could have been asked for before
         self._counts['clock_jumps'] += 1
         # A recording that is played again says nothing new: what it said before is no prior.
-        self._start_over('the clock of the IMU jumped back: alignment starts over')
+        self._start_over('the clock of the IMU jumped back')
 
-    def _start_over(self, event: str) -> None:
-        self._events.append(Event(Severity.WARNING, event))
+    def _start_over(self, why: str) -> None:
+        self._say_start_over(why)
         self._forget_all()
+
+    def _say_start_over(self, why: str) -> None:
+        self._started_over = f'alignment starts over: {why}'
+        self._events.append(Event(Severity.WARNING, self._started_over))
 
     def reconfigure(self, config: Config) -> None:
         """
@@ -310,7 +320,8 @@ class Aligner:
         self._done.append(Epoch(
             epoch.stamp_ns, (epoch.stamp_ns - (self._first_t0_ns or 0)) * 1e-9, verdict.state,
             self._initial, self._current, fit.innovation, sensors.gyro_bias, sensors.accel_bias,
-            epoch.dry))
+            epoch.dry, verdict.reason, self._started_over))
+        self._started_over = ''
 
     def _decide(self, epoch: AntennaEpoch, method: Bank | NoteMethod, fit: Fit) -> Verdict:
         """Take over the attitudes after an epoch; return the verdict of the declaration."""
@@ -371,7 +382,8 @@ class Aligner:
         self._without_velocity = no_velocity if wanted and epoch.v_n is None else ''
         imu = self._cutter.start(epoch.stamp_ns).integrated()
         if config.method == 'bank':
-            self._method = Bank(config, epoch, imu, bool(use_position), self._learnt)
+            self._method = Bank(config, epoch, imu, bool(use_position), self._learnt,
+                                self._base)
         else:
             self._method = NoteMethod(config, epoch, imu, epoch.v_n is None)
         self._judge(epoch, self._method)
@@ -387,7 +399,7 @@ class Aligner:
         learnt = self._learnt
         if self._method is not None:
             self._counts['restarts'] += 1
-            self._events.append(Event(Severity.WARNING, f'alignment starts over: {why}'))
+            self._say_start_over(why)
             learnt = self._method.learnt()
         self._forget(learnt)
 

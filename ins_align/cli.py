@@ -43,7 +43,7 @@ ALIGNED, NOT_ALIGNED, UNUSABLE, INTERRUPTED, NO_READER = 0, 1, 2, 130, 141
 PACKAGES = {'backports': 'backports.zstd', 'PIL': 'pillow', 'pyins': 'python-ins',
             'yaml': 'pyyaml'}
 
-SCENARIOS = 'flight, car, straight, static, hover, launch, reverse, swing'
+SCENARIOS = 'flight, car, straight, static, hover, launch, reverse, swing, highway'
 
 DESCRIPTION = """\
 Finds roll, pitch and true heading of a moving IMU with a GNSS receiver.

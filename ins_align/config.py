@@ -101,10 +101,22 @@ class Config:
         'm', minimum=0.0, maximum=100.0)
     lever_arm_from_tf: str | bool = _parameter(
         'auto', 'take the lever arm from the transform between the frame_ids of IMU and position '
-        'messages (/tf_static); auto: where there is one and lever_arm is not set; true: wait for '
-        'it', choices=AUTO_OR_BOOL)
+        'messages (/tf_static); auto: where there is one and lever_arm is not set, or zero; true: '
+        'wait for it', choices=AUTO_OR_BOOL)
     base_frame: str = _parameter(
         '', 'frame whose attitude the status and JSON give as well, as TF has it; empty: none')
+    vehicle: str = _parameter(
+        'none', 'what is known of the motion: base_frame (the IMU, where that is empty) has x '
+        'forward and z up, and its origin moves along x, that of a car at the rear axle. Gives a '
+        'heading on a straight road; a car that is faster than a few m/s is taken to go forwards. '
+        'Where the motion contradicts it, it is not used, with a remark',
+        choices=('none', 'car', 'boat', 'aeroplane'))
+    vehicle_velocity_std: float = _parameter(
+        0.0, 'velocity sideways and upwards that lasts (slip, leeway, wind), 1 sigma; 0: of a car '
+        '0.1, of a boat 1, of an aeroplane 10', 'm/s', minimum=0.0, maximum=100.0)
+    mount_yaw_std: float = _parameter(
+        1.0, 'how well the x axis is known to point along the motion, sideways and upwards, 1 '
+        'sigma; no heading from it is better', 'deg', minimum=0.0, maximum=30.0)
     use_velocity: str | bool = _parameter(
         'auto', 'align with GNSS velocities; auto: when they arrive', choices=AUTO_OR_BOOL)
     use_position: str | bool = _parameter(
@@ -207,6 +219,10 @@ class Config:
                 'use_position is true: set it to auto, '
                 + ('' if self.method == 'vif' else 'or use_velocity to false, ')
                 + 'or use the method bank')
+        if self.vehicle != 'none' and self.method != 'bank':
+            raise ConfigError(f'method {self.method} uses nothing of what a vehicle knows, but '
+                              f'vehicle is {self.vehicle}: set it to none, or use the method '
+                              'bank')
         if self.imu_grade == 'custom':
             missing = [name for name in ImuNoise._fields[:4] if getattr(self, name) == 0.0]
             if missing:

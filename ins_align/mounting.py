@@ -21,26 +21,11 @@ from typing import Any, NamedTuple
 
 from ins_align.config import Config, ConfigError
 from ins_align.geometry.rotation import Array, matrix_from_quaternion
+from ins_align.geometry.transform import Transform
 from ins_align.results import Attitude, Event, Severity
 import numpy as np
 
 ROUNDING = 1e-6  # m: numbers of a robot's model that differ less are the same
-
-
-class Transform(NamedTuple):
-    """Takes vectors of a source frame to a target frame: rotate, then add."""
-
-    rotation: Array  # (3, 3)
-    translation: Array  # (3,), m
-
-    def after(self, other: Transform) -> Transform:
-        """Return the transform that does the other one first."""
-        return Transform(self.rotation @ other.rotation,
-                         self.rotation @ other.translation + self.translation)
-
-    def inverse(self) -> Transform:
-        """Return the transform from target to source."""
-        return Transform(self.rotation.T, -self.rotation.T @ self.translation)
 
 
 # Target and source frame to the transform between them, None where there is none.
@@ -86,16 +71,16 @@ class Mounting(NamedTuple):
     """What TF says, and what follows from it."""
 
     config: Config  # with the lever arm to align with
-    C_imu_base: Array | None  # takes vectors of the base to the IMU
+    base: Transform | None  # from the configured base to the IMU
     words: Sequence[Event] = ()  # what was taken from TF, what contradicts it
     missing: Sequence[str] = ()  # transforms that are wanted and not there, in words
 
 
-def base_attitude(attitude: Attitude | None, C_imu_base: Array | None) -> Attitude | None:
+def base_attitude(attitude: Attitude | None, base: Transform | None) -> Attitude | None:
     """Return the attitude of the base; None where it or that of the IMU is not known."""
-    if attitude is None or C_imu_base is None:
+    if attitude is None or base is None:
         return None
-    return dataclasses.replace(attitude, C_nb=attitude.C_nb @ C_imu_base)
+    return dataclasses.replace(attitude, C_nb=attitude.C_nb @ base.rotation)
 
 
 def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Config) -> Mounting:
@@ -114,7 +99,7 @@ def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Co
     """
     words: list[Event] = []
     missing: list[str] = []
-    C_imu_base = None
+    base = None
     if config.lever_arm_from_tf is not False:
         to_antenna = lookup(imu_frame, antenna_frame) if imu_frame and antenna_frame else None
         if to_antenna is None:
@@ -123,12 +108,10 @@ def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Co
             config = _with_lever_arm(config, to_antenna.translation, (imu_frame, antenna_frame),
                                      words)
     if config.base_frame:
-        to_base = lookup(imu_frame, config.base_frame) if imu_frame else None
-        if to_base is None:
+        base = lookup(imu_frame, config.base_frame) if imu_frame else None
+        if base is None:
             missing.append(f'from {config.base_frame!r} (base) to {imu_frame!r} (IMU)')
-        else:
-            C_imu_base = to_base.rotation
-    return Mounting(config, C_imu_base, words, missing)
+    return Mounting(config, base, words, missing)
 
 
 def _with_lever_arm(config: Config, found: Array, frames: tuple[str, str],

@@ -23,6 +23,7 @@ from ins_align.aligner import Aligner
 from ins_align.checks import InputChecks
 from ins_align.config import Config, config_from_mapping
 from ins_align.geometry.rotation import Array, Index
+from ins_align.geometry.transform import Transform
 from ins_align.gnss import messages
 from ins_align.gnss.messages import Fix, Velocity
 from ins_align.results import Epoch, Result, State, Status
@@ -46,13 +47,15 @@ class OfflineAligner:
     Parameters
     ----------
     config : Config
+    base : Transform, optional
+        As for `Aligner`.
 
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, base: Transform | None = None) -> None:
         """Start with no data."""
         self.config = config
-        self._aligner = Aligner(config)
+        self._aligner = Aligner(config, base)
         self._checks = InputChecks(config)
         self._epochs: list[Epoch] = []
         self._waiting = 0

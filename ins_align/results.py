@@ -137,6 +137,10 @@ class Epoch:
         rad/s, m/s^2.
     dry : bool
         Whether it is without GNSS, on the way through an outage.
+    reason : str
+        For the state.
+    started_over : str
+        Why the alignment started over since the epoch before; empty where it did not.
 
     """
 
@@ -149,6 +153,17 @@ class Epoch:
     gyro_bias: Array
     accel_bias: Array
     dry: bool = False
+    reason: str = ''
+    started_over: str = ''
+
+
+class Change(NamedTuple):
+    """An epoch with another state than the one before, or of an alignment that started over."""
+
+    stamp_ns: int
+    t_s: float
+    state: State
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -252,6 +267,17 @@ class Result:
         return declared
 
     @property
+    def changes(self) -> list[Change]:
+        """Return the changes of the state, from the first epoch on, with their reasons."""
+        changes, before = [], None
+        for epoch in self.epochs:
+            if epoch.state is not before or epoch.started_over:
+                reason = '; '.join(filter(None, [epoch.started_over, epoch.reason]))
+                changes.append(Change(epoch.stamp_ns, epoch.t_s, epoch.state, reason))
+            before = epoch.state
+        return changes
+
+    @property
     def first_t0_ns(self) -> int | None:
         """Return the stamp from which `Epoch.t_s` is counted; None: there is no epoch."""
         if not self.epochs:
@@ -265,6 +291,8 @@ class Result:
             'aligned': self.aligned,
             'state': status.state.value,
             'reason': status.reason,
+            'changes': [{'stamp': change.stamp_ns, 't_s': change.t_s, 'state': change.state.value,
+                         'reason': change.reason} for change in self.changes],
             't0': status.t0_ns,
             'time_to_align_s': status.time_to_align_s,
             'initial_attitude': attitude_json(status.initial),

@@ -62,7 +62,7 @@ def base_values(status: Status, mounting: Mounting | None) -> Iterator[tuple[str
         return
     yield 'base_frame', mounting.config.base_frame
     for name, attitude in (('initial', status.initial), ('current', status.current)):
-        base = base_attitude(attitude, mounting.C_imu_base)
+        base = base_attitude(attitude, mounting.base)
         yield f'base_{name}_roll_pitch_yaw_deg', _text(
             None if base is None else (base.roll_deg, base.pitch_deg, base.yaw_deg))
 

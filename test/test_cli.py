@@ -70,9 +70,9 @@ def test_aligned(flight, tmp_path, capsys):
     assert 'ALIGNED after' in captured.out
     result = json.loads(outputs['json'].read_text())
     assert list(result) == [
-        'bag', 'aligned', 'state', 'reason', 't0', 'time_to_align_s', 'initial_attitude',
-        'declared_attitude', 'final_attitude', 'gyro_bias_rad_s', 'accel_bias_m_s2', 'lever_arm_m',
-        'gnss_delay_s', 'counts']
+        'bag', 'aligned', 'state', 'reason', 'changes', 't0', 'time_to_align_s',
+        'initial_attitude', 'declared_attitude', 'final_attitude', 'gyro_bias_rad_s',
+        'accel_bias_m_s2', 'lever_arm_m', 'gnss_delay_s', 'counts']
     assert result['aligned'] is True and result['state'] == 'ALIGNED'
     assert type(result['t0']) is int and type(result['final_attitude']['stamp']) is int
     assert list(result['initial_attitude']) == [
@@ -422,7 +422,7 @@ def test_simulate_passes_its_options_on(tmp_path, capsys):
 
 
 def test_help_names_the_scenarios():
-    from ins_align.simulation.simulate import SCENARIOS as simulated
+    from ins_align.simulation.scenarios import SCENARIOS as simulated
     assert SCENARIOS.split(', ') == list(simulated)
 
 

@@ -87,7 +87,7 @@ def test_what_tf_has_may_be_missing_or_senseless(frames):
     found = find_mounting(frames.lookup, 'imu_link', 'map', Config(base_frame='base'))
     assert found.missing == ["from 'map' (antenna) to 'imu_link' (IMU)",
                              "from 'base' (base) to 'imu_link' (IMU)"]
-    assert found.config.lever_arm == (0.0, 0.0, 0.0) and found.C_imu_base is None
+    assert found.config.lever_arm == (0.0, 0.0, 0.0) and found.base is None
     frames.add(transform('base_link', 'far', (5000.0, 0.0, 0.0)))
     frames.add(transform('base_link', 'bad', (np.nan, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
     for frame in ('far', 'bad'):

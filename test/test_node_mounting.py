@@ -113,12 +113,14 @@ def test_what_is_wanted_is_waited_for_and_named():
     buffer.translations['base_link'] = 0.0, 0.0, 0.0
     items, mounting = wanted.take([], 101.0)
     assert items == [SAMPLE, FIX] and wanted.waits_for == ''
-    assert np.array_equal(mounting.C_imu_base, np.eye(3))
+    assert np.array_equal(mounting.base.rotation, np.eye(3))
 
 
-@pytest.mark.parametrize('base_frame', [
-    '', pytest.param('base_link', marks=pytest.mark.campaign)])
-def test_node_with_tf_gives_the_numbers_of_the_parameter(tmp_path, monkeypatch, base_frame):
+@pytest.mark.parametrize('base_frame, vehicle', [
+    ('', 'none'), *(pytest.param('base_link', vehicle, marks=pytest.mark.campaign)
+                    for vehicle in ('none', 'car'))])
+def test_node_with_tf_gives_the_numbers_of_the_parameter(tmp_path, monkeypatch, base_frame,
+                                                         vehicle):
     package = tmp_path / 'path' / 'tf2_ros'
     package.mkdir(parents=True)
     (package / '__init__.py').write_text(STAND_IN)
@@ -127,12 +129,15 @@ def test_node_with_tf_gives_the_numbers_of_the_parameter(tmp_path, monkeypatch, 
     drive = simulate('car', seed=2, duration=40.0, imu_grade='tactical',
                      lever_arm=(1.5, -0.4, 0.8), mount_rpy_deg=(0.0, 0.0, 90.0))
     write_bag(drive, tmp_path / 'drive')
+    write_bag(drive, tmp_path / 'with_tf', tf=True)
     parameters = {'imu_grade': 'tactical', 'gnss_lateness': 4.0}
-    rows = replayed(tmp_path / 'drive', {**parameters, 'lever_arm': '[1.5, -0.4, 0.8]'},
-                    tmp_path / 'rows.csv')
+    if vehicle != 'none':
+        parameters.update(vehicle=vehicle, base_frame=base_frame)
+    rows = replayed(tmp_path / ('drive' if vehicle == 'none' else 'with_tf'),
+                    {**parameters, 'lever_arm': '[1.5, -0.4, 0.8]'}, tmp_path / 'rows.csv')
     declared = next(row for row in rows if row['state'] == 'ALIGNED')
     given = [f'{name}:={value}' for name, value in parameters.items()]
-    if base_frame:
+    if base_frame and vehicle == 'none':
         given.append(f'base_frame:={base_frame}')
     with Listener() as listener, running_node([*given, *RELIABLE]) as node:
         listener.wait_for(lambda: listener.statuses)

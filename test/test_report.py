@@ -21,14 +21,16 @@ from types import SimpleNamespace
 
 from ins_align.config import Config
 from ins_align.outputs import write_whole
+from ins_align.panels import declared_spans, STATE_COLOURS
 from ins_align.recordings.replay import replay
-from ins_align.report import (
-    DECLARED_GREEN, declared_spans, format_table, plot, save_figure, STATE_COLOURS, summary)
+from ins_align.report import format_table, plot, save_figure, summary
 from ins_align.results import State
 from ins_align.simulation.simulate import simulate, write_bag
 from matplotlib.colors import to_rgb
 import numpy as np
 import pytest
+
+DECLARED_GREEN = STATE_COLOURS[State.ALIGNED]
 
 
 @pytest.fixture(scope='module')
@@ -95,9 +97,43 @@ def test_times_that_were_declared(result):
                   'ALIGNING', 'ALIGNED', 'ALIGNED', 'LEVELLED', 'ALIGNED', 'FAULT')))]
     assert declared_spans(epochs) == [(1.0, 2.0), (4.0, 4.0)]
     assert declared_spans(epochs[:1]) == [] and declared_spans(epochs[:3]) == [(1.0, 2.0)]
-    assert 'it was ALIGNED' not in summary(result)
-    before = dataclasses.replace(result, epochs=tuple(epochs))
-    assert 'it was ALIGNED from 1.0 to 2.0 s, 4.0 to 4.0 s' in summary(before)
+
+
+def with_states(result, *epochs):
+    """Return a result with epochs 1 s apart, of states with reasons and why it started over."""
+    return dataclasses.replace(result, epochs=tuple(
+        dataclasses.replace(result.epochs[0], t_s=float(k), state=State(state), reason=reason,
+                            started_over=why)
+        for k, (state, reason, why) in enumerate(epochs)))
+
+
+def changes_in(text):
+    """Return the lines of a summary that tell the changes of the state."""
+    return [' '.join(line.split()) for line in text.splitlines()
+            if re.match(r' +[\d.]+ s  [A-Z]| +\.\.\. ', line)]
+
+
+def test_changes_of_the_state_are_told_with_their_reasons(result):
+    assert changes_in(summary(with_states(
+        result, ('ALIGNING', 'few epochs', ''), ('ALIGNING', 'fewer', ''), ('ALIGNED', 'sure', ''),
+        ('ALIGNED', 'very sure', ''), ('ALIGNING', 'residuals', ''),
+        ('ALIGNING', 'few epochs', 'alignment starts over: a jump')))) == [
+            '0.0 s ALIGNING: few epochs', '2.0 s ALIGNED: sure', '4.0 s ALIGNING: residuals',
+            '5.0 s ALIGNING: alignment starts over: a jump; few epochs']
+    assert changes_in(summary(with_states(result, ('ALIGNING', 'few epochs', '')))) == []
+    assert changes_in(summary(dataclasses.replace(result, epochs=()))) == []
+
+
+@pytest.mark.parametrize('count, left_out', [(6, 0), (7, 0), (8, 2), (500, 494)])
+def test_many_changes_are_cut_in_the_table_and_whole_in_json(result, count, left_out):
+    many = with_states(result, *((('ALIGNED', 'ALIGNING')[k % 2], f'reason {k}', '')
+                                 for k in range(count)))
+    lines = changes_in(summary(many))
+    assert len(lines) == (7 if left_out else count)
+    assert lines[2].endswith('reason 2') and lines[-3].endswith(f'reason {count - 3}')
+    assert (lines[3] == f'... {left_out} more, all of them in --json') == bool(left_out)
+    assert [change['reason'] for change in many.to_json()['changes']] == [
+        f'reason {k}' for k in range(count)]
 
 
 def test_summary_says_what_matters(result):
@@ -246,11 +282,26 @@ def dry(tmp_path_factory):
 def test_what_is_declared_lasts_into_an_outage(dry):
     (start, end), = declared_spans(dry.epochs)
     assert start < 20.0 and 42.0 < end < 98.0 and dry.status.state is not State.ALIGNED
-    assert f'it was ALIGNED from {start:.1f} to {end:.1f} s' in summary(dry)
+    told = changes_in(summary(dry))
+    assert f'{start:.1f} s ALIGNED: ' in ' '.join(told)
+    withdrawn = next(change for change in dry.changes if change.t_s > end)
+    assert withdrawn.state is not State.ALIGNED and 'no GNSS for' in withdrawn.reason
+    assert f'{withdrawn.t_s:.1f} s {withdrawn.state.value}: {withdrawn.reason}' in told
     bands = [patch.get_extents().transformed(axes.transData.inverted())
              for axes in drawn(plot(dry))[:1] for patch in axes.patches
              if patch.get_facecolor()[:3] == to_rgb(DECLARED_GREEN)]
     assert [(band.x0, band.x1) for band in bands] == [pytest.approx((start, end))]
+
+
+def test_why_it_started_over_is_told(restarted):
+    again, = [change for change in restarted.changes if 'starts over' in change.reason]
+    assert again.state is State.ALIGNING and 20.0 < again.t_s < 23.0
+    assert 'starts over: no IMU sample' in again.reason and again.reason in summary(restarted)
+    changes = restarted.to_json()['changes']
+    assert [change['state'] for change in changes].count('ALIGNED') == 2
+    assert [change['stamp'] for change in changes] == sorted(
+        epoch.stamp_ns for epoch in restarted.epochs
+        if epoch.t_s in {change.t_s for change in restarted.changes})
 
 
 def test_the_table_has_no_row_without_gnss(dry):
@@ -316,7 +367,7 @@ def test_figure_shows_innovations_and_biases(result):
     assert np.clip(tested, -5.0, 5.0) == pytest.approx(np.clip(up.get_ydata(), -5.0, 5.0))
     z = lines_of(axes['gyro bias (deg/s)'])['z']
     assert z.get_ydata() == pytest.approx(np.degrees([epoch.gyro_bias[2] for epoch in shown]))
-    x = lines_of(axes['accelerometer bias (m/s$^2$)'])['x']
+    x = lines_of(axes['accelerometer bias (m/s\u00b2)'])['x']
     assert x.get_ydata() == pytest.approx([epoch.accel_bias[0] for epoch in shown])
 
 

@@ -19,6 +19,7 @@ gives the attitude as a mixture (docs, "Theory").
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 import math
 from typing import NamedTuple
 
@@ -29,23 +30,17 @@ from ins_align.estimation.linearised import (
     DELAY, FIRST, GYRO, Linearised, linearised, MAX_DELAY, MIN_DELAY, PHI, PHI0, triads)
 from ins_align.estimation.receiver import ReceiverNoise
 from ins_align.estimation.rivals import (
-    in_words, level_in_words, log_sum, Parameters, rivals_of, SHARE)
+    level_in_words, Parameters, Rivals, SHARE)
 from ins_align.estimation.start import all_headings, HEADINGS, OPEN_POSITION, RoughAttitude, Start
 from ins_align.estimation.track import InertialTrack
+from ins_align.estimation.vehicle import NOT_USED
 from ins_align.geometry.rotation import Array, exp_so3, log_so3
+from ins_align.geometry.transform import Transform
 from ins_align.gnss.antenna import AntennaEpoch, velocities_of
 from ins_align.imu.intervals import Intervals, SensorErrors
 from ins_align.results import Nuisance
 import numpy as np
 
-# Means whose log weight is so much below the likeliest's are dropped, and so are rivals that are
-# wrong; levels stay, for what they assume may become true.
-UNLIKELY, HOPELESS, LEAST = 14.0, 25.0, 13.0
-# Means of a rival that agree to so many sigmas are merged.
-ALIKE = 2.0
-# A wrong rival has to be less likely by this (log likelihood) or to give the same attitude, to so
-# many sigmas.
-MARGIN, HARMLESS = 6.0, 1.0
 # Parameters are linearised anew when the likeliest mean has gone so far from the point: lever arm
 # (m), delay (s), bias and matrix of the gyros (rad/s, 1) and of the accelerometers (m/s^2, 1).
 _REACH = np.array([0.2] * 3 + [0.01] + [3e-3] * 3 + [0.02] * 9 + [0.1] * 3 + [0.02] * 9)
@@ -87,17 +82,15 @@ class Bank:
     """
 
     def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals, use_position: bool,
-                 prior: Learnt | None = None) -> None:
+                 prior: Learnt | None = None, base: Transform | None = None) -> None:
         """Start at t0."""
+        self._base = base or Transform(np.eye(3), np.zeros(3))
+        self._not_used = ''
         self._config = config
         self._use_position = use_position
         self._velocity_ns = epoch.stamp_ns          # the last one
         self._velocities_since_ns: int | None = None
         self.moved = 0
-        self._rivals = rivals_of(config)
-        self._signs = np.array([rival.signs for rival in self._rivals])
-        self._prior = np.array([rival.prior for rival in self._rivals])
-        self._wrong = np.array([rival.wrong for rival in self._rivals])
         self._offered = 0
         self._rejected = [0, 0, 0]
         self._begin(epoch, imu, prior)
@@ -107,12 +100,14 @@ class Bank:
         self.t0_ns = epoch.stamp_ns
         force = imu.gained[0, -1]
         force = STANDARD_GRAVITY * force / max(float(np.linalg.norm(force)), 1e-3)
-        self._known = [Parameters.of(self._config, rival, force) for rival in self._rivals]
+        self._rivals = Rivals(self._config, self._base)
+        self._known = [Parameters.of(self._config, rival, force) for rival in self._rivals.table]
         if prior is not None:
             self._remember(prior)
         gyro, accel = triads(self._known[0].x.size)
         errors = gyro.stop - gyro.start
-        self._reach = np.concatenate([_REACH[:gyro.stop], _REACH[16:16 + errors]])
+        self._reach = np.full(self._known[0].x.size, np.inf)      # of a vehicle: linear
+        self._reach[:accel.stop] = np.concatenate([_REACH[:gyro.stop], _REACH[16:16 + errors]])
         self._filters: Filters | None = None
         self._mixed: tuple[Array, Array] | None = None      # the attitudes, once asked for
         self._start = Start(self._config)
@@ -129,12 +124,15 @@ class Bank:
     def _remember(self, learnt: Learnt) -> None:
         """Start with what was learnt before, as old as it is."""
         age = (self.t0_ns - learnt.stamp_ns) * 1e-9
-        for rival, known in zip(self._rivals, self._known):
+        for rival, known in zip(self._rivals.table, self._known):
             if rival.wrong:
                 continue
-            known.x[:] = learnt.x
-            grown = np.minimum(learnt.P.diagonal() + age * known.walk[FIRST:], known.P.diagonal())
-            known.P = learnt.P + np.diag(np.maximum(grown - learnt.P.diagonal(), 0.0))
+            body = slice(learnt.x.size)             # it may be without what is of the vehicle
+            known.x[body] = learnt.x
+            walk, most = known.walk[FIRST:][body], known.P.diagonal()[body]
+            grown = np.minimum(learnt.P.diagonal() + age * walk, most)
+            known.P[body, body] = learnt.P + np.diag(
+                np.maximum(grown - learnt.P.diagonal(), 0.0))
 
     # Input
 
@@ -171,7 +169,7 @@ class Bank:
             self._C_nn0 = track.C_n0n[k].T
             self._last = epoch
             self._left -= 1
-            if self._in_a_row >= ASTRAY:
+            if self._in_a_row >= ASTRAY or self._drop_vehicle(filters):
                 self._begin(epoch, imu.take(slice(k, k + 1)).end())
                 yield epoch
                 return
@@ -220,18 +218,20 @@ class Bank:
             np.stack([track.s_v(velocities_of(epochs)), track.s_p], axis=1),
             C_n0n @ covariance @ C_n0n.swapaxes(-1, -2),
             [(epoch.v_n is not None, epoch.position_measured and self._use_position)
-             for epoch in epochs], [epoch.stated for epoch in epochs], track.C_n0n)
+             for epoch in epochs], [epoch.stated for epoch in epochs], track.C_n0n,
+            track.still_v)
 
     def _point_of(self, filters: Filters) -> Array:
         """Return the parameters of the likeliest mean of each rival, with one delay for all."""
         point = filters.x[filters.lead]
-        point[:, DELAY] = np.clip(point[self._best(filters), DELAY], MIN_DELAY, MAX_DELAY)
+        point[:, DELAY] = np.clip(point[self._rivals.best(filters), DELAY], MIN_DELAY, MAX_DELAY)
         return point
 
     def _model(self, filters: Filters, point: Array, imu: Intervals) -> Linearised:
         """Linearise epochs."""
-        return linearised(point, imu.mirrored(self._signs[filters.ids]),
-                          (imu.Q + SHARE * imu.Q_excess)[:, None], self._use_position)
+        return linearised(point, imu.mirrored(self._rivals.signs[filters.ids]),
+                          (imu.Q + SHARE * imu.Q_excess)[:, None], self._use_position,
+                          self._rivals.base_position)
 
     def _anchor(self, filters: Filters, track: InertialTrack) -> None:
         """Freeze n0 at the last epoch that was processed; the track is there."""
@@ -242,6 +242,8 @@ class Bank:
     def _step(self, filters: Filters, model: Linearised, k: int, track: Track) -> None:
         self._mixed = None
         filters.propagate(model, k)
+        vehicle = self._rivals.vehicle
+        look = vehicle is not None and vehicle.is_due(model.duration[k])
         self._nis, self._innovation = math.nan, NOTHING_NEW
         if not any(track.present[k]):
             return
@@ -252,7 +254,7 @@ class Bank:
             if not present:
                 continue
             new = filters.update(model, k, kind, track, self._receiver.factors(kind))
-            best = self._best(filters)
+            best = self._rivals.best(filters)
             square = float(new.nis[best]) / 3
             normalised = new.residual[best] / np.sqrt(np.diagonal(new.covariance[best]))
             self._receiver.hear(kind, square, normalised, track.stated[k][kind])
@@ -266,38 +268,17 @@ class Bank:
         self._rejected[2] += bad
         self._in_a_row = self._in_a_row + 1 if astray else 0
         self._nis, self._innovation = sum(nis) / len(nis), first
-        self._select(filters)
+        if vehicle is not None and look:
+            filters.hold(vehicle.look(filters, model, k, track))
+        self._rivals.select(filters)
 
-    def _best(self, filters: Filters) -> int:
-        """Return the place of the likeliest level."""
-        return int(np.argmax(self._of_levels(filters)))
-
-    def _posterior(self, filters: Filters) -> Array:
-        """Return the log of how likely each rival is, but for a constant, shape (M,)."""
-        return filters.evidence + self._prior[filters.ids]
-
-    def _of_levels(self, filters: Filters) -> Array:
-        """Return the same where those that are wrong are out of the question."""
-        return np.where(self._wrong[filters.ids], -np.inf, self._posterior(filters))
-
-    def _select(self, filters: Filters) -> None:
-        """Drop means and rivals that are unlikely, merge means that agree."""
-        ids = filters.ids
-        if len(filters.C) == 1:
-            return
-        wrong = self._wrong[ids]
-        level = self._posterior(filters)
-        best = np.max(level[~wrong])
-        filters.evidence = np.where(wrong, filters.evidence,
-                                    np.maximum(level, best - LEAST) - self._prior[ids])
-        filters.evidence = filters.evidence - best
-        if len(filters.C) == len(ids) and not wrong.any():
-            return
-        keep = filters.weight > filters.weight[filters.lead][filters.place] - UNLIKELY
-        keep &= (~wrong | (filters.evidence > -HOPELESS))[filters.place]
-        if not keep.all():
-            filters.keep(keep)
-        filters.merge(ALIKE)
+    def _drop_vehicle(self, filters: Filters) -> bool:
+        """Assume nothing of the vehicle any more where the motion contradicts it."""
+        if not self._rivals.vehicle_contradicted(filters):
+            return False
+        self._not_used = NOT_USED.format(vehicle=self._config.vehicle)
+        self._config = replace(self._config, vehicle='none')
+        return True
 
     # Start
 
@@ -321,8 +302,8 @@ class Bank:
     def _begin_with(self, rough: RoughAttitude) -> None:
         """Start filters for all headings and rivals at t0, and feed them what has come since."""
         epochs, imu = self._start.epochs, self._start.imu
-        C = np.concatenate([all_headings(rough, sign) for sign in self._signs[:, 3]])
-        rival = np.repeat(np.arange(len(self._rivals)), HEADINGS)
+        C = np.concatenate([all_headings(rough, sign) for sign in self._rivals.signs[:, 3]])
+        rival = np.repeat(np.arange(len(self._rivals.table)), HEADINGS)
         P = self._start.covariance(rough, np.array([known.P for known in self._known]))
         v_n = next((epoch.v_n for epoch in epochs if epoch.v_n is not None), np.zeros(3))
         self._freeze(epochs[0])
@@ -334,7 +315,7 @@ class Bank:
             model = self._model(filters, self._point_of(filters), imu.take(one))
             self._step(filters, model, 0, Track(track.s[one], track.covariance[one],
                                                 track.present[one], track.stated[one],
-                                                track.C_n0n[one]))
+                                                track.C_n0n[one], track.still[one]))
         self._start = Start(self._config)
         self._last = epochs[-1]
         self._anchor(filters, inertial.at(len(epochs) - 1))
@@ -343,7 +324,7 @@ class Bank:
 
     def _shares_of(self, filters: Filters) -> Array:
         """Return the weight of each mean in the mixture."""
-        level = self._of_levels(filters)
+        level = self._rivals.of_levels(filters)
         share = np.exp(level - level.max())
         return (share / share.sum())[filters.place] * np.exp(filters.weight)
 
@@ -401,13 +382,14 @@ class Bank:
             return Fit(self._offered, delay=self._config.gnss_delay)
         words, contradicted = self._doubt()
         velocity, position, either = self._rejected
-        level = self._rivals[filters.ids[self._best(filters)]]
+        level = self._rivals.table[filters.ids[self._rivals.best(filters)]]
         return Fit(self._offered, 3 * (self._offered - either), self._receiver.misfit,
                    self._nis, self._innovation, velocity, position, either,
                    delay=self._config.gnss_delay + float(self._body()[0][DELAY]),
                    objection=words if contradicted else '',
-                   remarks=(self._receiver.in_words()
-                            + level_in_words(level, self._config.imu_noise)))
+                   remarks=(self._receiver.in_words() + self._not_used
+                            + level_in_words(level, self._config.imu_noise)
+                            + self._rivals.vehicle_in_words(filters)))
 
     def move_t0(self) -> None:
         """Move t0 to the last epoch."""
@@ -422,43 +404,17 @@ class Bank:
         return self._doubt()[0]
 
     def _doubt(self) -> tuple[str, bool]:
-        """
-        Hear the rivals that are wrong.
-
-        Returns
-        -------
-        words : str
-            Why a heading is not to be declared, or ''.
-        contradicted : bool
-            Whether the data fit better with one of them.
-
-        """
+        """Return why a heading is not to be declared, and whether the data contradict it."""
         filters = self._filters
-        if filters is None or not self._wrong[filters.ids].any():
+        if filters is None or not self._rivals.any_wrong(filters):
             return '', False
-        # How much likelier each of them is than all levels.
-        wrong, level = self._wrong[filters.ids], self._posterior(filters)
-        ahead = np.where(wrong, level - log_sum(level[~wrong]), -np.inf)
-        ahead = ahead / max(self._receiver.misfit, 1.0)
-        if not np.any(ahead > -MARGIN):
-            return '', False
-        mean, P = self._attitudes()
-        C = np.stack([filters.C0[filters.lead], filters.C[filters.lead]], axis=1)
-        away = log_so3(C @ mean.swapaxes(-1, -2)) / np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-        harm = np.abs(away).max(axis=(1, 2))
-        worst = int(np.argmax(np.where(harm > HARMLESS, ahead, -np.inf)))
-        if harm[worst] <= HARMLESS or ahead[worst] <= -MARGIN:
-            return '', False
-        if ahead[worst] > MARGIN:
-            return in_words(self._rivals[filters.ids[worst]], filters.x[filters.lead[worst]],
-                            self._config.gnss_delay), True
-        return 'the signs of the IMU axes are not confirmed by the motion yet: turn', False
+        return self._rivals.doubt(filters, *self._attitudes(), self._receiver.misfit)
 
     def _body(self) -> tuple[Array, Array]:
         filters = self._filters
         if filters is None:
             return self._known[0].x, self._known[0].P
-        best = self._best(filters)
+        best = self._rivals.best(filters)
         return filters.x[filters.lead[best]], filters.P[best, FIRST:, FIRST:]
 
     def nuisance(self) -> Nuisance:

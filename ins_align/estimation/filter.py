@@ -28,6 +28,7 @@ differ in their heading share one covariance (docs, "Theory").
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from ins_align.estimation.linearised import FIRST, GYRO, Linearised, PHI, PHI0, RHO, XI
 from ins_align.geometry.rotation import apply, Array, exp_so3, Index, log_so3
@@ -37,6 +38,9 @@ import numpy as np
 # one in 60 000 is (chi-square with three degrees of freedom). To the weights it counts as this
 # much, so whatever else rejects a measurement must not leave its value below.
 GATE = 25.0
+# Log likelihood ratio of a motion that fits a vehicle, to one whose slips are so much larger that
+# a normalised innovation squared of twice this, of two rows, is as likely.
+FITS = 3.0
 _EYE = np.eye(3)
 
 
@@ -55,6 +59,8 @@ class Track:
     stated : list of (bool, bool)
         Whether the receiver states its noise.
     C_n0n : ndarray, shape (K, 3, 3)
+    still : ndarray, shape (K, 3)
+        s_v of what rests.
 
     """
 
@@ -63,6 +69,36 @@ class Track:
     present: list[tuple[bool, bool]]
     stated: list[tuple[bool, bool]]
     C_n0n: Array
+    still: Array
+
+
+class Look(NamedTuple):
+    """
+    How well B means of M rivals move along x of the vehicle's base; see `vehicle`.
+
+    Attributes
+    ----------
+    held : ndarray of bool, shape (M,)
+        Which of the rivals have to.
+    H : ndarray, shape (M, 2, n)
+        Derivatives of the innovation, sideways and upwards, to the errors.
+    variance : ndarray, shape (M,)
+        Of its noise, (m/s)^2.
+    innovation : ndarray, shape (B, 2)
+        m/s.
+    backwards : ndarray, shape (B,)
+        Speed the wrong way, m/s.
+    tumbled : ndarray of bool, shape (B,)
+        Whether z of the base points down.
+
+    """
+
+    held: np.ndarray
+    H: Array
+    variance: Array
+    innovation: Array
+    backwards: Array
+    tumbled: np.ndarray
 
 
 @dataclass
@@ -222,6 +258,27 @@ class Filters:
             self._forget_feigned(gain, inverse, C_lead[:, 2])
         self._move(apply(PH[q], weighted) * (good & taken[q])[:, None])
         return result
+
+    def hold(self, look: Look) -> None:
+        """Hold the rivals that assume it to a motion along x of the vehicle's base."""
+        q, held = self.place, look.held
+        PH = self.P @ look.H.swapaxes(1, 2)
+        S = look.H @ PH + look.variance[:, None, None] * np.eye(2)
+        inverse = np.linalg.inv(S)
+        weighted = apply(np.asarray(inverse[q], float), look.innovation)
+        nis = (np.sum(look.innovation * weighted, axis=1)
+               + look.backwards ** 2 / S[q, 0, 0])
+        nis = held[q] * np.where(look.tumbled, GATE, np.minimum(nis, GATE))
+        self.weight = self.weight - 0.5 * nis
+        self._weigh_evenly()
+        self._find_leads()
+        # How headings were spread before says nothing about the assumption.
+        self.evidence = self.evidence + held * (FITS - 0.5 * nis[self.lead])
+        good = nis < GATE
+        taken = held & (np.bincount(q, np.exp(self.weight) * good, len(self.ids)) > 0.5)
+        gain = PH @ inverse * taken[:, None, None]
+        self.P = self.P - gain @ PH.swapaxes(1, 2)
+        self._move(apply(PH[q], weighted) * (good & taken[q])[:, None])
 
     def _weigh(self, log_likelihood: Array) -> None:
         """Weigh means within rivals, and rivals."""

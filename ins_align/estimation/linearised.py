@@ -29,6 +29,8 @@ import numpy as np
 # gyros (bias, then matrix), errors of the accelerometers.
 PHI, XI, RHO, PHI0, FIRST = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12
 LEVER_ARM, DELAY, GYRO = slice(0, 3), 3, 4          # in the parameters
+# At their end, where a vehicle is known: mounting and drift, each sideways and upwards.
+MOUNT, DRIFT, OF_VEHICLE = slice(-4, -2), slice(-2, None), 4
 # A delay within these (s) is followed along the recent motion; from there it goes straight on.
 MIN_DELAY, MAX_DELAY = -0.1, AGES[-1]
 _EYE = np.eye(3)
@@ -36,8 +38,8 @@ _EYE = np.eye(3)
 
 def triads(m: int) -> tuple[slice, slice]:
     """Return the places of the errors of gyros and accelerometers among m parameters."""
-    middle = (GYRO + m) // 2
-    return slice(GYRO, middle), slice(middle, m)
+    size = (m - GYRO) // 6 * 3                  # a bias, or a bias and a matrix
+    return slice(GYRO, GYRO + size), slice(GYRO + size, GYRO + 2 * size)
 
 
 @dataclass
@@ -65,6 +67,10 @@ class Linearised:
         Derivatives of velocity and position, in the body frame, to the errors.
     expected : ndarray, shape (K, 2, M, 3)
         What C u and C w lack, in the body frame, of the measurements.
+    base : tuple of ndarray or None
+        Of the velocity of the vehicle's base: derivatives, shape (K, M, 3, n); what C u lacks of
+        it, (K, M, 3); rotation to the body frame from that at the moment of the measurement,
+        (K, M, 3, 3).
 
     """
 
@@ -77,9 +83,11 @@ class Linearised:
     Q: Array
     H: Array
     expected: Array
+    base: tuple[Array, Array, Array] | None = None
 
 
-def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool) -> Linearised:
+def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool,
+               base: Array | None = None) -> Linearised:
     """
     Linearise K epochs.
 
@@ -94,12 +102,14 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool) 
         Covariance of (rotation, velocity, position), in the frame at the start.
     use_position : bool
         Whether positions are measurements.
+    base : ndarray, shape (3,), or None
+        Position of the vehicle's base in the frame of the IMU, m.
 
     """
     M, m = point.shape
     K = interval.duration.size
     gyro, accel = triads(m)
-    size = m - accel.start                      # errors of a triad: its bias, or its matrix too
+    size = accel.stop - accel.start             # errors of a triad: its bias, or its matrix too
     J = np.zeros((K, M, 9, m))
     J[:, :, PHI, gyro], J[:, :, XI, gyro] = interval.J_Rg[..., :size], interval.J_vg[..., :size]
     J[:, :, RHO, gyro], J[:, :, XI, accel] = interval.J_pg[..., :size], interval.J_va[..., :size]
@@ -128,7 +138,18 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool) 
     if use_position:
         H[:, 1], expected[:, 1] = seen.position()
     return Linearised(point.copy(), interval.duration.tolist(), R, moved, J, F,
-                      turn @ Q @ turn.swapaxes(-1, -2), H, expected)
+                      turn @ Q @ turn.swapaxes(-1, -2), H, expected,
+                      None if base is None else _seen_of_base(point, interval, base))
+
+
+def _seen_of_base(point: Array, interval: Intervals, base: Array) -> tuple[Array, Array, Array]:
+    """See the base as a receiver whose antenna is there would."""
+    point = point.copy()
+    point[:, LEVER_ARM] = base
+    seen = _Seen(point, interval)
+    H, expected = seen.velocity()
+    H[..., FIRST:][..., LEVER_ARM] = 0.0
+    return H, expected, seen.back
 
 
 class _Seen:

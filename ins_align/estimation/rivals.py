@@ -19,12 +19,16 @@ it is as likely as the configuration and would give another attitude, no heading
 others are levels of the same configuration: what they say counts by their likelihood.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 from ins_align.config import Config, ImuNoise, PRESETS
-from ins_align.estimation.linearised import DELAY, FIRST, GYRO, LEVER_ARM, triads
-from ins_align.geometry.rotation import Array
+from ins_align.estimation.filter import Filters
+from ins_align.estimation.linearised import (
+    DELAY, FIRST, GYRO, LEVER_ARM, OF_VEHICLE, triads)
+from ins_align.estimation.vehicle import AMBIGUOUS, known_of_vehicle, Vehicle
+from ins_align.geometry.rotation import Array, log_so3
+from ins_align.geometry.transform import Transform
 import numpy as np
 
 # Over the error of the gyros' scale factors: their misalignment; scale factors and misalignment of
@@ -33,6 +37,14 @@ GYRO_MISALIGNMENT, ACCEL_ERRORS = 0.3, 0.3
 # In this time (s) the biases of the accelerometers change by the first share of their sigma, as
 # temperatures do, and the delay by the second: clocks of IMU and GNSS that nothing keeps together.
 WANDER_TIME, ACCEL_WANDER, DELAY_WANDER = 100.0, 0.1, 0.1
+# Means whose log weight is so much below the likeliest's are dropped, and so are rivals that are
+# wrong; levels stay, for what they assume may become true.
+UNLIKELY, HOPELESS, LEAST = 14.0, 25.0, 13.0
+# Means of a rival that agree to so many sigmas are merged.
+ALIKE = 2.0
+# A wrong rival has to be less likely by this (log likelihood) or to give the same attitude, to so
+# many sigmas.
+MARGIN, HARMLESS = 6.0, 1.0
 # Share of the IMU's measured noise beyond the stated one that is believed at first: vibration
 # looks white from sample to sample and is less than that over seconds.
 SHARE = 1 / 27
@@ -58,6 +70,8 @@ class Rival:
         Factor on the accelerometers' bias.
     lever_arm_std, gnss_delay_std, gyro_bias_std, accel_bias_std : float
         At least so much (SI).
+    along : int
+        Of a vehicle: 1 forwards, -1 backwards along its x axis; 0: it moves as it likes.
     prior : float
         Log of how likely it is before the data, over the configuration.
 
@@ -72,6 +86,7 @@ class Rival:
     gnss_delay_std: float = 0.0
     gyro_bias_std: float = 0.0
     accel_bias_std: float = 0.0
+    along: int = 0
     prior: float = 0.0
 
     @property
@@ -116,7 +131,145 @@ def rivals_of(config: Config) -> tuple[Rival, ...]:
     """Return the rivals of a configuration, which itself comes first."""
     stated = vars(config) | config.imu_noise._asdict()
     told = tuple(rival for name, std, rival in TOLD if stated[name] < std)
-    return (*LEVELS, *(() if config.trust_imu_axes else SIGNS), *told)
+    rivals = (*LEVELS, *(() if config.trust_imu_axes else SIGNS), *told)
+    if config.vehicle == 'none':
+        return rivals
+    return (*(replace(rival, along=1) for rival in rivals),
+            *(replace(level, along=-1) for level in LEVELS), *LEVELS)
+
+
+class Rivals:
+    """
+    The table of a configuration, and how likely each of its lines is.
+
+    Parameters
+    ----------
+    config : Config
+    base : Transform
+        From the vehicle's base to the IMU.
+
+    Attributes
+    ----------
+    table : tuple of Rival
+    signs : ndarray, shape (R, 4)
+        Of each line.
+    vehicle : Vehicle or None
+
+    """
+
+    def __init__(self, config: Config, base: Transform) -> None:
+        """Know nothing of the data."""
+        self._gnss_delay = config.gnss_delay
+        self.table = rivals_of(config)
+        self.signs = np.array([rival.signs for rival in self.table])
+        self._prior = np.array([rival.prior for rival in self.table])
+        self._wrong = np.array([rival.wrong for rival in self.table])
+        self._along = along = np.array([rival.along for rival in self.table])
+        self.vehicle = None if config.vehicle == 'none' else Vehicle(config, base, along)
+        # Levels that are no vehicle are there to contradict it; they are no part of a result.
+        self._free = ~self._wrong & (along == 0) & (self.vehicle is not None)
+        self._aside = self._wrong | self._free
+
+    @property
+    def base_position(self) -> Array | None:
+        """Return where the base of the vehicle is in the frame of the IMU, m."""
+        return None if self.vehicle is None else self.vehicle.position
+
+    def best(self, filters: Filters) -> int:
+        """Return the place of the likeliest level."""
+        return int(np.argmax(self.of_levels(filters)))
+
+    def of_levels(self, filters: Filters) -> Array:
+        """Return the log of how likely each rival is, -inf of those that are no levels in use."""
+        return np.where(self._aside[filters.ids], -np.inf, self._posterior(filters))
+
+    def any_wrong(self, filters: Filters) -> bool:
+        """Return whether any is left that must not be aligned with."""
+        return bool(self._wrong[filters.ids].any())
+
+    def _posterior(self, filters: Filters) -> Array:
+        """Return the log of how likely each rival is, but for a constant, shape (M,)."""
+        return filters.evidence + self._before(filters)
+
+    def _before(self, filters: Filters) -> Array:
+        """Return the log of how likely each was before the data, for the speed of a vehicle."""
+        prior: Array = self._prior[filters.ids]
+        return prior if self.vehicle is None else prior - self.vehicle.against[filters.ids]
+
+    def select(self, filters: Filters) -> None:
+        """Drop means and rivals that are unlikely, merge means that agree."""
+        ids = filters.ids
+        if len(filters.C) == 1:
+            return
+        wrong = self._wrong[ids]
+        level = self._posterior(filters)
+        best = np.max(level[~self._aside[ids]])
+        filters.evidence = np.where(wrong, filters.evidence,
+                                    np.maximum(level, best - LEAST) - self._before(filters))
+        filters.evidence = filters.evidence - best
+        if len(filters.C) == len(ids) and not wrong.any() and self.vehicle is None:
+            return
+        keep = filters.weight > filters.weight[filters.lead][filters.place] - UNLIKELY
+        keep &= (~wrong | (filters.evidence > -HOPELESS))[filters.place]
+        # A direction in which the vehicle did not set out is none for good.
+        for direction in {1, -1} & set(self._along[ids].tolist()):
+            there = self._along[ids] == direction
+            if np.max(level[there]) < best - LEAST:
+                keep &= ~there[filters.place]
+        if not keep.all():
+            filters.keep(keep)
+        filters.merge(ALIKE)
+
+    def vehicle_contradicted(self, filters: Filters) -> bool:
+        """Return whether the motion contradicts what is assumed of the vehicle."""
+        if self.vehicle is None:
+            return False
+        free, level = self._free[filters.ids], self._posterior(filters)
+        return (self.vehicle.contradicts(filters.x[filters.lead[self.best(filters)]])
+                or log_sum(level[free]) >= log_sum(level[~free]) + MARGIN)
+
+    def vehicle_in_words(self, filters: Filters) -> str:
+        """Return what is not known of the vehicle's motion, as the end of a sentence, or ''."""
+        level = self.of_levels(filters)
+        likely = self._along[filters.ids[level > np.max(level) - MARGIN]]
+        return AMBIGUOUS if len(set(likely.tolist())) > 1 else ''
+
+    def doubt(self, filters: Filters, mean: Array, P: Array, misfit: float) -> tuple[str, bool]:
+        """
+        Hear the rivals that are wrong.
+
+        Parameters
+        ----------
+        filters : Filters
+            Of the same table.
+        mean, P : ndarray, shape (2, 3, 3)
+            Attitudes at t0 and now, and their covariances, of the mixture.
+        misfit : float
+            Mean square of normalised innovations.
+
+        Returns
+        -------
+        words : str
+            Why a heading is not to be declared, or ''.
+        contradicted : bool
+            Whether the data fit better with one of them.
+
+        """
+        # How much likelier each of them is than all levels.
+        ahead = np.where(self._wrong[filters.ids], self._posterior(filters), -np.inf)
+        ahead = (ahead - log_sum(self.of_levels(filters))) / max(misfit, 1.0)
+        if not np.any(ahead > -MARGIN):
+            return '', False
+        C = np.stack([filters.C0[filters.lead], filters.C[filters.lead]], axis=1)
+        away = log_so3(C @ mean.swapaxes(-1, -2)) / np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        harm = np.abs(away).max(axis=(1, 2))
+        worst = int(np.argmax(np.where(harm > HARMLESS, ahead, -np.inf)))
+        if harm[worst] <= HARMLESS or ahead[worst] <= -MARGIN:
+            return '', False
+        if ahead[worst] > MARGIN:
+            return in_words(self.table[filters.ids[worst]], filters.x[filters.lead[worst]],
+                            self._gnss_delay), True
+        return 'the signs of the IMU axes are not confirmed by the motion yet: turn', False
 
 
 @dataclass
@@ -155,8 +308,11 @@ class Parameters:
         """
         noise = config.imu_noise
         matrices = noise.gyro_scale_std > 0
-        x, std, walk = np.zeros((3, GYRO + (24 if matrices else 6)))
+        vehicle = OF_VEHICLE if config.vehicle != 'none' else 0
+        x, std, walk = np.zeros((3, GYRO + (24 if matrices else 6) + vehicle))
         accel = triads(x.size)[1].start
+        if vehicle:
+            std[-vehicle:], walk[-vehicle:] = known_of_vehicle(config)
         x[LEVER_ARM] = config.lever_arm
         std[LEVER_ARM] = max(config.lever_arm_std, rival.lever_arm_std)
         std[DELAY] = max(config.gnss_delay_std, rival.gnss_delay_std)
@@ -175,7 +331,7 @@ class Parameters:
             told = np.eye(12)
             told[:3, 3:] = -np.kron(np.eye(3), force)
             sigmas = np.repeat([accel_std, scale], [3, 9])
-            P[accel:, accel:] = told @ np.diag(sigmas ** 2) @ told.T
+            P[accel:accel + 12, accel:accel + 12] = told @ np.diag(sigmas ** 2) @ told.T
         return Parameters(x, P, np.concatenate([np.zeros(FIRST), walk]))
 
 

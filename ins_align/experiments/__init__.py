@@ -23,7 +23,8 @@ import importlib
 from pathlib import Path
 
 # In the order in which `all` runs them.
-NAMES = ('note', 'bound', 'declare', 'declare-worse', 'faults', 'weak-spots', 'recordings')
+NAMES = ('note', 'bound', 'declare', 'declare-worse', 'faults', 'weak-spots', 'vehicle',
+         'recordings')
 NEED_DATA = ('recordings',)
 # Only by name: it measures the machine too, and needs ROS.
 MEASUREMENTS = ('bench',)

@@ -24,6 +24,7 @@ import os
 from typing import NamedTuple
 
 from ins_align.config import Config
+from ins_align.geometry.transform import Transform
 from ins_align.gnss.drivers import (
     DRIVER_TYPES, imu_from_driver, INERTIAL_UNITS, LIVE_TYPES, NoTimeError, receiver_from_msg,
     RECEIVERS, type_in_words)
@@ -57,7 +58,7 @@ class Topics(NamedTuple):
     velocity: Topic | None
     velocity_type: str | None  # as the parameter of that name has it
     reference: Topic | None
-    C_imu_base: np.ndarray | None = None  # takes vectors of the configured base to the IMU
+    base: Transform | None = None  # from the configured base to the IMU
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ def read(request: Request) -> Iterator[Part]:
         if topics.velocity_type is not None:
             config = dataclasses.replace(config, velocity_type=topics.velocity_type)
         mounting = _mounting(bag, topics, config)
-        config, topics = mounting.config, topics._replace(C_imu_base=mounting.C_imu_base)
+        config, topics = mounting.config, topics._replace(base=mounting.base)
         start_ns = (bag.start_ns or 0) + round((request.start or 0.0) * 1e9)
         stop_ns = (None if request.duration is None
                    else start_ns + round(request.duration * 1e9))

@@ -121,7 +121,7 @@ class ReplayResult(Result):
         if not self.config.base_frame:
             return {}
         attitudes = {f'base_{name}_attitude': attitude_json(
-            base_attitude(attitude, self.topics.C_imu_base)) for name, attitude in (
+            base_attitude(attitude, self.topics.base)) for name, attitude in (
                 ('initial', self.status.initial), ('final', self.status.current))}
         return {'base_frame': self.config.base_frame, **attitudes}
 
@@ -168,7 +168,7 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
     fixes: list[tuple[int, float, float]] = []
     attitudes: list[Attitudes] = []
     for part in run_ahead(read, request) if read_ahead else read(request):
-        run = run or OfflineAligner(part.config)
+        run = run or OfflineAligner(part.config, part.topics.base)
         run.reject('imu_undecodable', np.count_nonzero(~part.imu.decoded))
         run.add(part.imu.stamps_ns, part.imu.gyro, part.imu.accel, part.gnss)
         fixes += [(message.stamp_ns, message.latitude_deg, message.longitude_deg)

@@ -89,7 +89,7 @@ class _Results:
 
     def __init__(self, result: ReplayResult, types: Any) -> None:
         self._result, self._types = result, types
-        self._mounting = Mounting(result.config, result.topics.C_imu_base)
+        self._mounting = Mounting(result.config, result.topics.base)
         self._state: State | None = None  # of the epoch before
         self._status_ns = -STATUS_PERIOD_NS
 
@@ -193,9 +193,10 @@ class _Results:
 
 
 def _status_of(epoch: Epoch) -> Status:
-    """Return what an epoch knows of a status: neither reason nor counts."""
+    """Return what an epoch knows of a status: no counts."""
     unknown = np.full(3, math.nan)
     return Status(
-        epoch.state, '', epoch.stamp_ns, None if epoch.initial is None else epoch.initial.stamp_ns,
-        None, epoch.initial, epoch.current, epoch.gyro_bias, unknown, epoch.accel_bias, unknown,
-        unknown, unknown, math.nan, math.nan, {})
+        epoch.state, epoch.reason, epoch.stamp_ns,
+        None if epoch.initial is None else epoch.initial.stamp_ns, None, epoch.initial,
+        epoch.current, epoch.gyro_bias, unknown, epoch.accel_bias, unknown, unknown, unknown,
+        math.nan, math.nan, {})

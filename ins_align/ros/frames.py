@@ -20,8 +20,9 @@ from importlib import import_module
 from typing import Any
 
 from ins_align.config import Config, ConfigError
+from ins_align.geometry.transform import Transform
 from ins_align.gnss.messages import Fix, Velocity
-from ins_align.mounting import find_mounting, Mounting, Transform, transform_from_msg
+from ins_align.mounting import find_mounting, Mounting, transform_from_msg
 from ins_align.ros.imu_bytes import ImuSample
 from rclpy.node import Node
 from rclpy.time import Time

@@ -242,9 +242,11 @@ class AlignmentNode(Node):
         """Take over what TF says."""
         for severity, text in mounting.words:
             self._log(severity, text)
-        if mounting.config.lever_arm != self._config.lever_arm:
+        if (mounting.config.lever_arm != self._config.lever_arm
+                or (mounting.base is not None and self._config.vehicle != 'none')):
             self._config = dataclasses.replace(self._config, lever_arm=mounting.config.lever_arm)
-            self._aligner, self._checks = Aligner(self._config), InputChecks(self._config)
+            self._aligner = Aligner(self._config, mounting.base)
+            self._checks = InputChecks(self._config)
             self._imu_frame = None
 
     def _log(self, severity: Severity, text: str) -> None:

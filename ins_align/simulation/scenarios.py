@@ -208,32 +208,31 @@ def _hover(duration: float) -> Callable[[Array], Motion]:
     return motion
 
 
-def _straight(speed: float, duration: float) -> Callable[[Array], Motion]:
-    """Hold speed, course and attitude: heading cannot be observed."""
+def _steady(speed: float, waves: Sequence[tuple[int, float, float, float]],
+            duration: float) -> Callable[[Array], Motion]:
+    """Hold speed and course; waves (axis, amplitude, period, phase) swing the attitude alone."""
     def motion(time: Array) -> Motion:
-        return Motion(np.tile([speed, 0.0, 0.0], (len(time), 1)), np.zeros((len(time), 3)))
+        rpy = np.zeros((len(time), 3))
+        for axis, *wave in waves:
+            rpy[:, axis] += _wave(time, *wave)
+        return Motion(np.tile([speed, 0.0, 0.0], (len(time), 1)), rpy)
 
     return motion
 
 
-def _swing(duration: float) -> Callable[[Array], Motion]:
-    """Hold a course as a boat does in waves, the heading swinging about it."""
-    def motion(time: Array) -> Motion:
-        zero = np.zeros_like(time)
-        rpy = np.stack([_wave(time, 0.05, 4.7), _wave(time, 0.03, 6.1),
-                        _wave(time, np.radians(20.0), 11.0)], axis=-1)
-        return Motion(_along(zero + 5.0, zero, zero), rpy)
-
-    return motion
-
-
+# Gusts push the nose of a car on a highway off its course, by a degree.
+_GUSTS = ((0, 0.005, 2.3, 0.0), (0, 0.01, 17.0, 0.0), (1, 0.005, 1.7, 0.0), (2, 0.017, 3.1, 0.0),
+          (2, 0.017, 7.3, 1.0))
+# A boat in waves.
+_SEA = ((0, 0.05, 4.7, 0.0), (1, 0.03, 6.1, 0.0), (2, np.radians(20.0), 11.0, 0.0))
 SCENARIOS = {
     'flight': Scenario(_flight, 100.0, 40.0),
     'car': Scenario(partial(_road, ()), 100.0, 1.0),
-    'straight': Scenario(partial(_straight, 30.0), 100.0, 15.0),
-    'static': Scenario(partial(_straight, 0.0), 60.0, 1.0),
+    'straight': Scenario(partial(_steady, 30.0, ()), 100.0, 15.0),
+    'static': Scenario(partial(_steady, 0.0, ()), 60.0, 1.0),
     'hover': Scenario(_hover, 60.0, 2.0),
     'launch': Scenario(_launch, 60.0, 2.0),
     'reverse': Scenario(partial(_road, _BACK_OUT), 100.0, 1.0),
-    'swing': Scenario(_swing, 100.0, 5.0),
+    'swing': Scenario(partial(_steady, 5.0, _SEA), 100.0, 5.0),
+    'highway': Scenario(partial(_steady, 10.0, _GUSTS), 60.0, 5.0),
 }
