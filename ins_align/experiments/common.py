@@ -227,6 +227,7 @@ class Report:
             content = f'{text}\n'.encode()
             write_whole(self._out / f'{self._name}.{suffix}', lambda file: file.write(content))
 
+
 def groups_of(trials: list[JsonDict], faults: Iterable[str]) -> Groups:
     """Group trials by fault; the last group is all."""
     return [*((name, [t for t in trials if t['fault'] == name]) for name in faults),
