@@ -336,7 +336,7 @@ class Aligner:
             return declaration.update_without_attitude(silent_s, fit)
         if measured:
             verdict = declaration.update((stamp_ns - self._start_ns) * 1e-9, initial[1],
-                                         current[1], fit, method.unconfirmed)
+                                         current[1], fit)
             if declaration.move_t0:
                 method.move_t0()
                 initial = method.initial() or initial

@@ -380,13 +380,13 @@ class Bank:
         filters = self._filters
         if filters is None:
             return Fit(self._offered, delay=self._config.gnss_delay)
-        words, contradicted = self._doubt()
+        doubt, contradicted = self._rivals.doubt(filters, self._attitudes, self._receiver.misfit)
         velocity, position, either = self._rejected
         level = self._rivals.table[filters.ids[self._rivals.best(filters)]]
         return Fit(self._offered, 3 * (self._offered - either), self._receiver.misfit,
                    self._nis, self._innovation, velocity, position, either,
                    delay=self._config.gnss_delay + float(self._body()[0][DELAY]),
-                   objection=words if contradicted else '',
+                   objection=doubt if contradicted else '', doubt=doubt,
                    remarks=(self._receiver.in_words() + self._not_used
                             + level_in_words(level, self._config.imu_noise)
                             + self._rivals.vehicle_in_words(filters)))
@@ -398,17 +398,6 @@ class Bank:
         self._mixed = None
         self.moved += 1
         self.t0_ns = self._last.stamp_ns
-
-    def unconfirmed(self) -> str:
-        """Return what speaks against declaring a heading, or ''."""
-        return self._doubt()[0]
-
-    def _doubt(self) -> tuple[str, bool]:
-        """Return why a heading is not to be declared, and whether the data contradict it."""
-        filters = self._filters
-        if filters is None or not self._rivals.any_wrong(filters):
-            return '', False
-        return self._rivals.doubt(filters, *self._attitudes(), self._receiver.misfit)
 
     def _body(self) -> tuple[Array, Array]:
         filters = self._filters

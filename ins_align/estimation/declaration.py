@@ -18,7 +18,6 @@ A declared attitude must be right: the stated sigma, inflated by how badly the d
 under its threshold; the residuals must pass; both must have held for a while.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 import math
 
@@ -66,6 +65,8 @@ class Fit:
         Of the GNSS, seconds; the configured one where none is estimated.
     objection : str
         What the data say against the configuration, in words.
+    doubt : str
+        What speaks against declaring a heading, in words.
     remarks : str
         How the sensors are others than configured, as the end of a sentence.
 
@@ -81,6 +82,7 @@ class Fit:
     rejected: int = 0
     delay: float = 0.0
     objection: str = ''
+    doubt: str = ''
     remarks: str = ''
 
 
@@ -116,8 +118,7 @@ class Declaration:
         self._recent_nis = 1.0
         self._rejected = 0
 
-    def update(self, time_s: float, initial: Array, current: Array, fit: Fit,
-               unconfirmed: Callable[[], str]) -> Verdict:
+    def update(self, time_s: float, initial: Array, current: Array, fit: Fit) -> Verdict:
         """
         Judge an epoch.
 
@@ -130,8 +131,6 @@ class Declaration:
             where only the present one is, `move_t0` says that t0 had better move.
         fit : Fit
             How well the data fit the model.
-        unconfirmed : callable
-            Asked before a heading is declared: a reason against it in words, or ''.
 
         Returns
         -------
@@ -160,7 +159,7 @@ class Declaration:
         self.levelled = self.levelled or self._held(self._level_since_s, time_s)
         doubt = ''
         if not self.aligned and self._held(self._heading_since_s, time_s):
-            self._against = doubt = unconfirmed()
+            self._against = doubt = fit.doubt
             self.aligned = not doubt and tilt <= max_tilt and heading <= max_heading
             self.move_t0 = not doubt and not self.aligned
         self._withdraw_lost(tilt, heading)

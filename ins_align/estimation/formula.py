@@ -399,10 +399,6 @@ class NoteMethod:
     def move_t0(self) -> None:
         """Leave t0 where it is."""
 
-    def unconfirmed(self) -> str:
-        """Return nothing: there is no test of the signs."""
-        return ''
-
     def nuisance(self) -> Nuisance:
         """Return what is assumed: no biases, lever arm and delay as configured."""
         zero = np.zeros(3)

@@ -19,6 +19,7 @@ it is as likely as the configuration and would give another attitude, no heading
 others are levels of the same configuration: what they say counts by their likelihood.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 import math
 
@@ -183,10 +184,6 @@ class Rivals:
         """Return the log of how likely each rival is, -inf of those that are no levels in use."""
         return np.where(self._aside[filters.ids], -np.inf, self._posterior(filters))
 
-    def any_wrong(self, filters: Filters) -> bool:
-        """Return whether any is left that must not be aligned with."""
-        return bool(self._wrong[filters.ids].any())
-
     def _posterior(self, filters: Filters) -> Array:
         """Return the log of how likely each rival is, but for a constant, shape (M,)."""
         return filters.evidence + self._before(filters)
@@ -234,7 +231,8 @@ class Rivals:
         likely = self._along[filters.ids[level > np.max(level) - MARGIN]]
         return AMBIGUOUS if len(set(likely.tolist())) > 1 else ''
 
-    def doubt(self, filters: Filters, mean: Array, P: Array, misfit: float) -> tuple[str, bool]:
+    def doubt(self, filters: Filters, attitudes: Callable[[], tuple[Array, Array]],
+              misfit: float) -> tuple[str, bool]:
         """
         Hear the rivals that are wrong.
 
@@ -242,8 +240,8 @@ class Rivals:
         ----------
         filters : Filters
             Of the same table.
-        mean, P : ndarray, shape (2, 3, 3)
-            Attitudes at t0 and now, and their covariances, of the mixture.
+        attitudes : callable
+            Returns those of the mixture at t0 and now and their covariances, shape (2, 3, 3).
         misfit : float
             Mean square of normalised innovations.
 
@@ -255,11 +253,15 @@ class Rivals:
             Whether the data fit better with one of them.
 
         """
+        wrong = self._wrong[filters.ids]
+        if not wrong.any():
+            return '', False
         # How much likelier each of them is than all levels.
-        ahead = np.where(self._wrong[filters.ids], self._posterior(filters), -np.inf)
+        ahead = np.where(wrong, self._posterior(filters), -np.inf)
         ahead = (ahead - log_sum(self.of_levels(filters))) / max(misfit, 1.0)
         if not np.any(ahead > -MARGIN):
             return '', False
+        mean, P = attitudes()
         C = np.stack([filters.C0[filters.lead], filters.C[filters.lead]], axis=1)
         away = log_so3(C @ mean.swapaxes(-1, -2)) / np.sqrt(np.diagonal(P, axis1=1, axis2=2))
         harm = np.abs(away).max(axis=(1, 2))
