@@ -32,12 +32,12 @@ from ins_align.estimation.declaration import Declaration, Fit
 from ins_align.estimation.formula import NoteMethod
 from ins_align.geometry.rotation import Array
 from ins_align.geometry.transform import Transform
-from ins_align.gnss.antenna import Antenna, AntennaEpoch
+from ins_align.gnss.antenna import Antenna
 from ins_align.gnss.buffer import GnssBuffer, GnssEpoch, PAIR_NS
-from ins_align.gnss.messages import Fix, Velocity
+from ins_align.gnss.messages import AntennaEpoch, Fix, Velocity
 from ins_align.imu.buffer import ImuBuffer
 from ins_align.imu.cutter import ImuCutter, NO_SAMPLE
-from ins_align.imu.plausibility import ForceCheck
+from ins_align.imu.noise import ForceCheck
 from ins_align.imu.prediction import Prediction
 from ins_align.results import Attitude, Epoch, Event, Nuisance, Severity, State, Status, Verdict
 import numpy as np
@@ -286,11 +286,11 @@ class Aligner:
             return
         for part in self._cutter.parts([epoch.stamp_ns for epoch in epochs]):
             # 4. Preintegration gives the IMU's interval before each.
-            imu, forces = self._cutter.cut([epoch.stamp_ns for epoch in epochs[part]],
-                                           [epoch.gravity_drift for epoch in epochs[part]])
+            imu = self._cutter.cut([epoch.stamp_ns for epoch in epochs[part]],
+                                   [epoch.gravity_drift for epoch in epochs[part]])
             # 5. The bank propagates and updates; each epoch comes when the estimates are its.
             taken = method.advance(epochs[part], imu.integrated())
-            for epoch, force in zip(taken, forces):
+            for epoch, force in zip(taken, imu.forces):
                 self._force_check.add(*force)
                 self._judge(epoch, method)
 

@@ -29,11 +29,12 @@ import multiprocessing
 from pathlib import Path
 from typing import Any
 
-from ins_align.config import Config
-from ins_align.outputs import write_whole
+from ins_align.outputs import PAGE_SUFFIX, write_whole
+from ins_align.page import page
 from ins_align.processes import pool
 from ins_align.recordings import BagError
-from ins_align.recordings.replay import replay
+from ins_align.recordings.reader import Request
+from ins_align.recordings.replay import replay, ReplayResult
 from ins_align.recordings.results_bag import write_results
 from ins_align.report import plot, save_figure, summary
 
@@ -49,13 +50,7 @@ class Task:
     """One recording, how to read it and what to write; paths that hold on every machine."""
 
     name: str  # of the recording, as it was given
-    bag: str
-    config: Config
-    imu_topic: str | None = None
-    fix_topic: str | None = None
-    velocity_topic: str | None = None
-    start: float | None = None
-    duration: float | None = None
+    request: Request
     csv: str | None = None
     plot: str | None = None
     results: str | None = None
@@ -74,12 +69,11 @@ class Outcome:
 def process(task: Task, read_ahead: bool = False,
             progress: Callable[[float], None] | None = None) -> Outcome:
     """Replay one recording and write its files; whatever the user can put right is an error."""
+    bag = str(task.request.path)
     try:
-        result = replay(task.bag, task.config, imu_topic=task.imu_topic, fix_topic=task.fix_topic,
-                        velocity_topic=task.velocity_topic, start=task.start,
-                        duration=task.duration, progress=progress, read_ahead=read_ahead)
+        result = replay(**vars(task.request), progress=progress, read_ahead=read_ahead)
     except BagError as error:
-        return _failed(task, str(error).replace(task.bag, task.name))
+        return _failed(task, str(error).replace(bag, task.name))
     except BrokenProcessPool as error:
         return _lost(task, error)
     result = dataclasses.replace(result, bag=task.name)
@@ -90,14 +84,23 @@ def process(task: Task, read_ahead: bool = False,
         if task.results:
             write_results(result, task.results)
         if task.plot:
-            figure, suffix = plot(result), Path(task.plot).suffix
-            write_whole(task.plot, lambda file: save_figure(figure, file, suffix))
+            _write_picture(result, task.plot)
     except BagError as error:
         return _failed(task, str(error))
     except OSError as error:
         return _failed(task, f'cannot write {error.filename}: {error.strerror}')
-    warnings = tuple(text.replace(task.bag, task.name) for text in result.warnings)
+    warnings = tuple(text.replace(bag, task.name) for text in result.warnings)
     return Outcome(result.to_json(), summary(result), warnings)
+
+
+def _write_picture(result: ReplayResult, path: str) -> None:
+    suffix = Path(path).suffix
+    if suffix.lower() == PAGE_SUFFIX:
+        html = page(result).encode()
+        write_whole(path, lambda file: file.write(html))
+    else:
+        figure = plot(result)
+        write_whole(path, lambda file: save_figure(figure, file, suffix))
 
 
 def _lost(task: Task, error: Exception) -> Outcome:
@@ -112,18 +115,10 @@ def _failed(task: Task, error: str) -> Outcome:
 def process_all(tasks: Sequence[Task], jobs: int, progress: Callable[[float], None],
                 ) -> Iterator[Outcome]:
     """
-    Process tasks, several at a time, and yield their outcomes in the order of the tasks.
+    Process tasks in so many processes, and yield their outcomes in the order of the tasks.
 
-    Parameters
-    ----------
-    tasks : sequence of Task
-        One a recording.
-    jobs : int
-        Processes at a time; 1: this one. Where there are two for each recording, one reads
-        ahead.
-    progress : callable
-        Called with the number of recordings done, whole ones and parts.
-
+    One job is this process; where there are two for each recording, one of them reads ahead.
+    `progress` is called with the number of recordings done, whole ones and parts.
     """
     if jobs == 1 or len(tasks) == 1:
         for index, task in enumerate(tasks):
@@ -149,15 +144,7 @@ def process_on_cluster(tasks: Sequence[Task], address: str, progress: Callable[[
 
     The workers read and write the files: they need the same folders as this machine. What a
     worker that dies had in hand, another one does again; files are replaced as a whole.
-
-    Parameters
-    ----------
-    tasks : sequence of Task
-        One a recording.
-    address : str
-        Of the scheduler, ``tcp://host:8786``.
-    progress : callable
-        Called with the number of recordings done.
+    `progress` is called with the number of recordings done.
 
     Raises
     ------

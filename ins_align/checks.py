@@ -26,8 +26,7 @@ from typing import Union
 
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array, Index
-from ins_align.gnss.buffer import fault_of_fix, usable_velocity, with_an_altitude
-from ins_align.gnss.messages import Fix, Velocity
+from ins_align.gnss.messages import Fix, numbers_of, Velocity
 from ins_align.gnss.motion import (
     EMPTY, GRID, on_grid, Series, series_of, track, velocity_frame, velocity_from_positions,
     VelocityFrame, without_wild_positions)
@@ -177,15 +176,11 @@ class InputChecks:
             self._add_imu(stamps_ns, gyro, accel)
 
     def _add_gnss(self, message: Fix | Velocity) -> None:
-        time = message.stamp_ns * 1e-9
-        if isinstance(message, Velocity):
-            usable = usable_velocity(message)
-            if usable is not None:
-                self._velocities.append((time, *usable.velocity.tolist()))
-        elif not fault_of_fix(message):
-            fix = with_an_altitude(message)
-            self._fixes.append((time, fix.latitude_deg, fix.longitude_deg, fix.altitude_m))
-        elif beyond_the_poles(message.latitude_deg, message.longitude_deg):
+        numbers, fault = numbers_of(message)
+        if not fault:
+            rows = self._velocities if isinstance(message, Velocity) else self._fixes
+            rows.append((message.stamp_ns * 1e-9, *numbers))
+        elif isinstance(message, Fix) and beyond_the_poles(*numbers[:2]):
             self._beyond_the_poles += 1
 
     def _add_imu(self, stamps_ns: Index, gyro: Array, accel: Array) -> None:

@@ -244,7 +244,7 @@ def _add_replay(commands: Any) -> None:
     group.add_argument('--csv', metavar='FILE', help='write a row for every GNSS epoch')
     group.add_argument('--plot', metavar='FILE',
                        help='draw attitude, sigma, innovations, biases, error and track '
-                            '(.png, .pdf, .svg)')
+                            '(.png, .pdf, .svg; .html: a page to zoom, with the states)')
     group.add_argument('--bag', metavar='OUT', dest='results',
                        help='write a recording (mcap) with the topics of the node, to play and to '
                             'plot beside the original; a directory to make')
@@ -359,9 +359,11 @@ def run_replay(arguments: argparse.Namespace) -> int:
     if arguments.plot:
         check_plot(arguments.plot)
     from ins_align.batch import Task
+    from ins_align.recordings.reader import Request
 
-    tasks = [Task(bag, os.path.abspath(bag), config, arguments.imu_topic, arguments.fix_topic,
-                  arguments.velocity_topic, arguments.start, arguments.duration,
+    tasks = [Task(bag, Request(os.path.abspath(bag), config, arguments.imu_topic,
+                               arguments.fix_topic, arguments.velocity_topic, arguments.start,
+                               arguments.duration),
                   absolute(arguments.csv, label), absolute(arguments.plot, label),
                   absolute(arguments.results, label))
              for bag, label in zip(arguments.bags, names)]

@@ -22,7 +22,9 @@ from pathlib import Path
 from typing import Any, IO
 
 STANDARD_OUTPUT = '-'
-PLOT_SUFFIXES = ('.png', '.pdf', '.svg', '.jpg', '.jpeg', '.webp', '.eps', '.tif', '.tiff')
+PAGE_SUFFIX = '.html'
+PLOT_SUFFIXES = (PAGE_SUFFIX, '.png', '.pdf', '.svg', '.jpg', '.jpeg', '.webp', '.eps', '.tif',
+                 '.tiff')
 
 
 class UsageError(Exception):
@@ -128,9 +130,11 @@ def check_plot(path: str) -> None:
     """Find out before the work whether a figure can be drawn in the format that is asked for."""
     from importlib.util import find_spec
 
-    if Path(path).suffix.lower() not in PLOT_SUFFIXES:
+    suffix = Path(path).suffix.lower()
+    if suffix not in PLOT_SUFFIXES:
         raise UsageError(f'cannot draw {path}: its name must end with one of '
                          f'{", ".join(PLOT_SUFFIXES)}')
-    if find_spec('matplotlib') is None:
-        raise UsageError('--plot needs matplotlib, which is not installed: '
-                         'pip install matplotlib')
+    library = 'plotly' if suffix == PAGE_SUFFIX else 'matplotlib'
+    if find_spec(library) is None:
+        raise UsageError(f'--plot {path} needs {library}, which is not installed: '
+                         f'pip install {library}')

@@ -53,7 +53,7 @@ class Curve:
     Attributes
     ----------
     name : str
-        In the legend; empty: not in it.
+        In the legend, once for all of a panel that have it; empty: not in it.
     colour : str
     x, y : ndarray, shape (N,)
         A line ends at nan.
@@ -231,19 +231,18 @@ def _angles(label: str, series: _Series, result: ReplayResult,
         time, angle, sigma = _broken_at_wraps(angle, series.time, angle, sigma)
         curves.append(Curve(name, colour, time, angle, size=2.0, sigma=sigma))
     if series.reference is not None:
-        for number, (column, _, _) in enumerate(lines):
+        for column, _, _ in lines:
             angle = series.reference[:, column]
-            curves.append(Curve('' if number else 'reference', 'black',
-                                *_broken_at_wraps(angle, series.time, angle), '--', 0.8))
+            curves.append(Curve('reference', 'black', *_broken_at_wraps(angle, series.time, angle),
+                                '--', 0.8))
     declared, start_ns = result.declared, result.first_t0_ns
     if declared is not None and start_ns is not None:
         time = np.array([(declared.stamp_ns - start_ns) * 1e-9])
         angles = declared.roll_deg, declared.pitch_deg, declared.yaw_deg
         level, up = max(declared.sigma_deg[:2]), declared.sigma_deg[2]
-        for number, (column, _, _) in enumerate(lines):
-            curves.append(Curve('' if number else 'declared, at its t0', 'black', time,
-                                np.array([angles[column]]), 'D', 4.0,
-                                np.array([up if column == 2 else level])))
+        for column, _, _ in lines:
+            curves.append(Curve('declared, at its t0', 'black', time, np.array([angles[column]]),
+                                'D', 4.0, np.array([up if column == 2 else level])))
     # The first sigmas would make flat lines of the angles.
     return Panel(label, curves, _around(np.concatenate([curve.y for curve in curves])))
 
@@ -273,23 +272,21 @@ def _sigmas(series: _Series, result: ReplayResult) -> Panel:
             curves += [
                 Curve(f'{name}, current', colour, series.time, series.angle_sigma[:, column]),
                 Curve(f'{name}, at t0', colour, series.time, at_t0, ':', 1.0),
-                _level('threshold' if column else '', colour, series.time, threshold, '--')]
+                _level('threshold', colour, series.time, threshold, '--')]
     return Panel('1 sigma (deg)', curves, log=True)
 
 
 def _innovations(series: _Series, result: ReplayResult) -> Panel:
     kind = 'velocity' if result.topics.velocity is not None else 'position'
     label = f'innovation of the\n{kind} (sigma)'
-    tested = np.isfinite(series.innovations).any(axis=1)
-    if not tested.any():
+    if not np.isfinite(series.innovations).any():
         return Panel(label, [])
     # Outliers may be anything: they are drawn at the edge.
     limit = max(INNOVATION_LIMIT, 1.5 * float(np.nanquantile(np.abs(series.innovations), 0.99)))
-    time, values = series.time[tested], series.innovations[tested].clip(-limit, limit)
-    curves = [Curve(name, colour, time, values[:, column], '.', 3.0)
+    values = series.innovations.clip(-limit, limit)
+    curves = [Curve(name, colour, series.time, values[:, column], '.', 3.0)
               for column, (name, colour) in enumerate(AXES_OF_ENU)]
-    curves += [_level(name, 'black', time, level, ':')
-               for name, level in (('3 sigma', 3.0), ('', -3.0))]
+    curves += [_level('3 sigma', 'black', series.time, level, ':') for level in (3.0, -3.0)]
     return Panel(label, curves, (-1.05 * limit, 1.05 * limit))
 
 
@@ -299,8 +296,8 @@ def _biases(label: str, time: Array, biases: Array, std: Array) -> Panel:
         return Panel(label, [])
     curves = [Curve(name, colour, time, biases[:, column])
               for column, (name, colour) in enumerate(AXES_OF_IMU)]
-    curves += [Curve('1 sigma at the end' if column == 2 else '', colour, time[-1:],
-                     biases[-1:, column], '', sigma=std[column:column + 1])
+    curves += [Curve('1 sigma at the end', colour, time[-1:], biases[-1:, column], '',
+                     sigma=std[column:column + 1])
                for column, (_, colour) in enumerate(AXES_OF_IMU)]
     # The first seconds tell nothing yet.
     settled = biases[len(biases) // 10:]
@@ -316,8 +313,8 @@ def _errors(series: _Series, errors: Array) -> Panel:
         return Panel(label, [], note='the reference does not cover these epochs')
     curves = [Curve(name, colour, series.time, errors[:, column], size=1.0)
               for column, (name, colour) in enumerate(ANGLES)]
-    curves += [Curve(name, HEADING, series.time, sign * 3.0 * series.sigma[:, 2], ':', 0.8)
-               for name, sign in (('heading, 3 sigma', 1.0), ('', -1.0))]
+    curves += [Curve('heading, 3 sigma', HEADING, series.time, level * series.sigma[:, 2], ':',
+                     0.8) for level in (3.0, -3.0)]
     # What is seen of an error is its end: its first seconds, of every start, are as large as an
     # angle can be.
     settled = finite & (series.aligned if series.aligned.any()
@@ -340,11 +337,12 @@ def _track(result: ReplayResult) -> Panel:
     index = np.searchsorted(stamps, track[:, 0], side='right') - 1
     states = [result.epochs[i].state if i >= 0 else State.WAITING_FOR_GNSS for i in index]
     since = track[:, 0] + (result.first_fix_ns - (result.first_t0_ns or result.first_fix_ns))
+    times = [f'{seconds:.1f} s' for seconds in (since * 1e-9).tolist()]
     curves = [Curve('', '#cccccc', east, north, size=0.8)]
     for state, colour in STATE_COLOURS.items():
-        chosen = np.flatnonzero([s is state for s in states])
-        if chosen.size:
-            curves.append(Curve(state.value, colour, east[chosen], north[chosen], '.', 5.0, notes=[
-                f'{seconds:.1f} s' for seconds in (since[chosen] * 1e-9).tolist()]))
+        if state in states:
+            there = np.where([s is state for s in states], 1.0, np.nan)
+            curves.append(Curve(state.value, colour, there * east, there * north, '.', 5.0,
+                                notes=times))
     curves.append(Curve('start', 'black', east[:1], north[:1], '^', 8.0))
     return Panel('north (m)', curves, x_label='east (m)')

@@ -184,9 +184,11 @@ def plot(result: ReplayResult) -> Figure:
 def _draw(axes: Axes, panel: Panel) -> None:
     axes.set_ylabel(panel.label)
     axes.text(0.5, 0.5, panel.note, transform=axes.transAxes, ha='center')
+    names = set()
     for curve in panel.curves:
         x, y, sigma, colour = curve.x, curve.y, curve.sigma, curve.colour
-        name = curve.name or None
+        name = None if curve.name in names else curve.name or None
+        names.add(curve.name)
         marks = {'marker': curve.style, 'markersize': curve.size, 'linestyle': 'none'}
         if curve.is_line:
             axes.plot(x, y, color=colour, linewidth=curve.size, linestyle=curve.style, label=name)

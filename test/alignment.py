@@ -11,13 +11,15 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What the tests of the core share: simulated recordings through the aligner, their errors."""
+"""What the tests of the core share: recordings through the aligner, their errors, IMU steps."""
 
 from functools import lru_cache
 
 from ins_align.aligner import Aligner
 from ins_align.experiments.common import exact_config_for
 from ins_align.geometry.rotation import log_so3, matrix_from_quaternion
+from ins_align.imu.preintegration import Noise, preintegrate, split_at_epochs
+from ins_align.imu.recent import AGES, Recent
 from ins_align.simulation.simulate import feed, simulate
 import numpy as np
 
@@ -40,6 +42,22 @@ def aligned(simulation, *, fix=True, velocity=True, **changes):
     """Feed a simulation to an aligner; return it and its epochs."""
     aligner = Aligner(config_for(simulation, **changes))
     return aligner, feed(aligner, simulation, fix=fix, velocity=velocity)
+
+
+def nanoseconds(times):
+    """Return times in seconds as stamps."""
+    return np.rint(np.multiply(times, 1e9)).astype(np.int64)
+
+
+def cut_at(times, gyro, accel, epochs):
+    """Return IMU steps between epochs; samples and epochs in seconds."""
+    return split_at_epochs(nanoseconds(times), np.hstack([gyro, accel]), nanoseconds(epochs))
+
+
+def integrate(steps, noise=Noise(), recent=None):
+    """Integrate IMU steps; force and rate at the end have lasted, unless told otherwise."""
+    lasting = Recent(*(AGES[:, None] * values[:, -1:] for values in (steps.f, steps.omega)))
+    return preintegrate(steps, noise, recent or lasting)
 
 
 def error_of(attitude, simulation):

@@ -18,8 +18,8 @@ import math
 
 from ins_align.config import Config
 from ins_align.gnss.antenna import Antenna, StatedNoise
-from ins_align.gnss.buffer import GnssEpoch, with_an_altitude
-from ins_align.gnss.messages import Fix, Velocity
+from ins_align.gnss.buffer import GnssEpoch
+from ins_align.gnss.messages import Fix, Velocity, with_an_altitude
 import numpy as np
 import pytest
 
@@ -108,7 +108,8 @@ def test_altitude_that_comes_and_goes(velocity):
     epochs = []
     for k, altitude in enumerate(altitudes):
         message = told(k * SECOND, 0.0, velocity)
-        message.fix = with_an_altitude(message.fix._replace(altitude_m=altitude))
+        message = message._replace(fix=with_an_altitude(
+            message.fix._replace(altitude_m=altitude)))
         epochs.append(antenna.epoch(message))
     assert [epoch.altitude for epoch in epochs] == [0.0] * 3 + [2500.0] * 6 + [2501.0] * 2
     assert counts['fix_jump'] == 1 and not epochs[-1].position_measured
@@ -178,8 +179,7 @@ def test_how_good_fixes_are_decides_what_they_say_about_velocities(std, fault):
     antenna = Antenna(Config(), Counter())
     for k in range(400):
         epoch = told(k * SECOND // 5, -0.4 * k, (0.0, 2.0, 0.1))
-        epoch.fix = epoch.fix._replace(covariance=std ** 2 * np.eye(3))
-        antenna.epoch(epoch)
+        antenna.epoch(epoch._replace(fix=epoch.fix._replace(covariance=std ** 2 * np.eye(3))))
     assert bool(antenna.fault) == fault
 
 

@@ -14,6 +14,7 @@
 """The Earth against python-ins, closed forms and finite differences."""
 
 from ins_align.geometry import earth
+from ins_align.geometry.rotation import apply
 from ins_align.gnss.messages import ENU_FROM_NED
 import numpy as np
 from pyins import earth as reference
@@ -62,9 +63,14 @@ def test_gravity_vector_points_down():
     assert np.all(g[:, :2] == 0) and np.all(g[:, 2] < -9.7)
 
 
+def ecef(latitude, longitude, altitude):
+    """Return a position in the Earth-fixed frame."""
+    return apply(earth.matrix_en(latitude, longitude), earth.position_n(latitude, altitude))
+
+
 def test_positions_are_those_of_python_ins():
-    assert np.allclose(earth.ecef_from_lla(*RADIANS.T), transform.lla_to_ecef(PLACES), atol=1e-8)
-    assert np.allclose(earth.ecef_from_lla(*RADIANS[1]), transform.lla_to_ecef(PLACES[1]),
+    assert np.allclose(ecef(*RADIANS.T), transform.lla_to_ecef(PLACES), atol=1e-8)
+    assert np.allclose(ecef(*RADIANS[1]), transform.lla_to_ecef(PLACES[1]),
                        atol=1e-8)
 
 
@@ -79,8 +85,8 @@ def test_local_level_axes_are_the_directions_in_which_positions_change():
     step = 1e-6
     for place, C_en in zip(RADIANS[:-1], earth.matrix_en(RADIANS[:-1, 0], RADIANS[:-1, 1])):
         for axis, change in enumerate(np.array([[0, step, 0], [step, 0, 0], [0, 0, 1.0]])):
-            moved = (earth.ecef_from_lla(*(place + change))
-                     - earth.ecef_from_lla(*(place - change)))
+            moved = (ecef(*(place + change))
+                     - ecef(*(place - change)))
             assert np.allclose(moved / np.linalg.norm(moved), C_en[:, axis], atol=1e-8)
 
 
@@ -116,13 +122,20 @@ def test_frozen_level_is_smooth_across_the_antimeridian():
 
 def test_inertial_velocity_is_the_derivative_of_inertial_position():
     level = earth.LocalLevel(*RADIANS[1, :2])
+
+    def position(time, latitude, longitude, altitude):
+        return level.matrix(time, latitude, longitude) @ earth.position_n(latitude, altitude)
+
     v_n = np.array([120.0, -80.0, 5.0])
     rn, _, rp = reference.principal_radii(PLACES[2, 0], PLACES[2, 2])
     rate = np.array([v_n[1] / rn, v_n[0] / rp, v_n[2]])
     time, h = 400.0, 0.01
-    ahead, behind = (level.position(time + d, *(RADIANS[2] + d * rate)) for d in (h, -h))
+    ahead, behind = (position(time + d, *(RADIANS[2] + d * rate)) for d in (h, -h))
     numeric = (ahead - behind) / (2 * h)
-    assert np.allclose(level.velocity(time, *RADIANS[2], v_n), numeric, atol=1e-6)
+    latitude, longitude, altitude = RADIANS[2]
+    velocity = level.matrix(time, latitude, longitude) @ (
+        v_n + earth.ground_velocity_n(latitude, altitude))
+    assert np.allclose(velocity, numeric, atol=1e-6)
 
 
 def test_gravitation_is_that_of_python_ins_and_turned_with_the_earth():
@@ -133,16 +146,17 @@ def test_gravitation_is_that_of_python_ins_and_turned_with_the_earth():
         C_n0e = earth.matrix_en(*RADIANS[1, :2]).T
         expected = C_n0e @ Rotation.from_euler('z', earth.EARTH_RATE * 50.0).apply(
             reference.gravitation_ecef(degrees))
-        assert np.allclose(level.gravitation(50.0, *place), expected, atol=2e-5)
+        found = level.matrix(50.0, *place[:2]) @ earth.gravitation_n(place[0], place[2])
+        assert np.allclose(found, expected, atol=2e-5)
 
 
 @pytest.mark.parametrize('place', ((0.8, 0.2, 100.0), (-0.3, np.pi - 1e-6, 0.0), (1.4, -2.0, 9e3)))
 def test_the_way_between_places_is_what_carried_goes_and_what_the_ellipsoid_has(place):
     step = np.array([300.0, -200.0, 50.0])
-    there = earth.carried(place, step, 1.0)
-    assert np.allclose(earth.way(place, there), step, rtol=1e-9, atol=1e-6)
+    there = earth.dead_reckon(place, step, 1.0)
+    assert np.allclose(earth.enu_offset(place, there), step, rtol=1e-9, atol=1e-6)
     turned = (there[0], there[1] - 2 * np.pi, there[2])
-    assert np.allclose(earth.way(place, turned), step, rtol=1e-9, atol=1e-6)
+    assert np.allclose(earth.enu_offset(place, turned), step, rtol=1e-9, atol=1e-6)
     moved = earth.matrix_en(*place[:2]).T @ (
-        earth.ecef_from_lla(*there) - earth.ecef_from_lla(*place))
+        ecef(*there) - ecef(*place))
     assert np.allclose(moved, step, rtol=0.012, atol=0.1)

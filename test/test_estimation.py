@@ -16,7 +16,8 @@
 from collections import Counter
 from dataclasses import replace
 
-from alignment import aligned, config_for, normalised_error, simulated
+from alignment import (
+    aligned, config_for, cut_at, integrate, nanoseconds, normalised_error, simulated)
 from dense_solution import dense_solution
 from ins_align.aligner import State
 from ins_align.config import Config
@@ -31,7 +32,7 @@ from ins_align.gnss.buffer import GnssBuffer
 from ins_align.imu.buffer import ImuBuffer
 from ins_align.imu.cutter import ImuCutter
 from ins_align.imu.intervals import SensorErrors
-from ins_align.imu.preintegration import Noise, preintegrate, split_at_epochs
+from ins_align.imu.preintegration import Noise
 from ins_align.imu.recent import recent_motion
 from ins_align.results import Attitude
 import numpy as np
@@ -56,12 +57,14 @@ def force_of(t):
 
 
 MEASURED = STAMPS, rate_of(STAMPS), force_of(STAMPS)
-STEPS = split_at_epochs(*MEASURED, EPOCHS)
 
 
 def exact_motion(C, u, w, x):
     """Integrate the interval anew, without the errors in x."""
-    imu = preintegrate(STEPS, SensorErrors.of(x[GYRO:]), Noise())
+    errors = SensorErrors.of(x[GYRO:])
+    stamps, gyro, accel = MEASURED
+    imu = integrate(cut_at(stamps, gyro - gyro @ errors.gyro_matrix.T - errors.gyro_bias,
+                           accel - accel @ errors.accel_matrix.T - errors.accel_bias, EPOCHS))
     v, p = imu.v[0], imu.p[0]
     return C @ imu.R[0], u + C @ v, w + imu.duration[0] * u + C @ (p - x[DELAY] * v)
 
@@ -94,8 +97,8 @@ def derivatives(request):
     sizes = np.repeat([0.005, 0.01, 0.1, 0.005], [3, 9, 3, 9])
     x = np.concatenate([[1.0, -0.6, 0.8, request.param], sizes * random.standard_normal(24)])
     mean = exp_so3(np.array([0.3, -0.5, 2.0])), np.array([3.0, -7.0, 1.0]), np.array([5., 8., -2.])
-    recent = recent_motion(*MEASURED, EPOCHS[1:])
-    imu = preintegrate(STEPS, SensorErrors.none(), Noise(1e-3, 1e-2), recent)
+    recent = recent_motion(nanoseconds(STAMPS), np.hstack(MEASURED[1:]), nanoseconds(EPOCHS[1:]))
+    imu = integrate(cut_at(*MEASURED, EPOCHS), Noise(1e-3, 1e-2), recent)
     model = linearised(x[None], imu.mirrored(np.ones((1, 4))), imu.Q[:, None], True)
 
     def perturbed(k, by):
@@ -201,7 +204,7 @@ def prepared(s, *, velocity=True, **changes):
     first, *epochs = map(antenna.epoch, messages.release(samples.settled_ns(True), True))
     cutter = ImuCutter(config.imu_noise, samples, counts)
     bank = Bank(config, first, cutter.start(first.stamp_ns).integrated(), not velocity)
-    steps, _ = cutter.cut([epoch.stamp_ns for epoch in epochs], [0.0] * len(epochs))
+    steps = cutter.cut([epoch.stamp_ns for epoch in epochs], [0.0] * len(epochs))
     return bank, epochs, steps.integrated()
 
 

@@ -15,13 +15,12 @@
 
 from functools import lru_cache
 
+from alignment import cut_at, integrate
 from ins_align.estimation import formula
 from ins_align.estimation.track import InertialTrack
 from ins_align.experiments.dense import bound
 from ins_align.experiments.note import exact_lever_remainder
 from ins_align.geometry.earth import EARTH_RATE, earth_rate_n
-from ins_align.imu.intervals import SensorErrors
-from ins_align.imu.preintegration import Noise, preintegrate, split_at_epochs
 from ins_align.simulation.simulate import simulate
 import numpy as np
 import pytest
@@ -52,10 +51,9 @@ def run(simulation, lever=LEVER):
     stamps = (simulation.imu_stamps_ns - simulation.gnss_stamps_ns[0]) * 1e-9
     epochs = (simulation.gnss_stamps_ns - simulation.gnss_stamps_ns[0]) * 1e-9
     lla = np.column_stack([np.radians(simulation.lla_deg[:, :2]), simulation.lla_deg[:, 2]])
-    intervals = preintegrate(split_at_epochs(stamps, simulation.gyro, simulation.accel, epochs),
-                             SensorErrors.none(), Noise())
-    first = preintegrate(split_at_epochs(stamps, simulation.gyro, simulation.accel,
-                                         epochs[[0, 0]]), SensorErrors.none(), Noise())
+    intervals, first = (
+        integrate(cut_at(stamps, simulation.gyro, simulation.accel, ends))
+        for ends in (epochs, epochs[[0, 0]]))
     body = formula.BodyIntegrals(lever, first.omega[0])
     navigation = formula.NavigationIntegrals(*lla[0], simulation.velocity[0])
     track = InertialTrack.start(*lla[0])

@@ -17,7 +17,8 @@ from collections import Counter
 
 from ins_align.config import ImuNoise
 from ins_align.imu.buffer import ImuBuffer
-from ins_align.imu.cutter import GAP_ANGULAR_ACCELERATION, GAP_JERK, ImuCutter
+from ins_align.imu.cutter import ImuCutter
+from ins_align.imu.noise import GAP_ANGULAR_ACCELERATION, GAP_JERK
 import numpy as np
 import pytest
 
@@ -36,8 +37,7 @@ def cut(stamps_ns, samples, epochs=EPOCHS, drift=0.0):
     buffer.consolidate()
     cutter.check(int(epochs[-1]))
     cutter.start(epochs[0])
-    imu, forces = cutter.cut(epochs[1:], [drift] * (len(epochs) - 1))
-    return imu, forces, counts
+    return cutter.cut(epochs[1:], [drift] * (len(epochs) - 1)), counts
 
 
 def steady(step=STEP, seconds=5.0):
@@ -46,7 +46,7 @@ def steady(step=STEP, seconds=5.0):
 
 
 def test_noise_is_the_stated_one_where_nothing_is_wrong():
-    imu, _, counts = cut(*steady())
+    imu, counts = cut(*steady())
     assert np.allclose(imu.noise.angle_random_walk, STATED[0])
     assert np.allclose(imu.noise.velocity_random_walk, STATED[1])
     assert not np.any(imu.noise.gyro_excess) and not np.any(imu.noise.accel_excess)
@@ -56,9 +56,9 @@ def test_noise_is_the_stated_one_where_nothing_is_wrong():
 def test_every_sample_counts_once_in_the_magnitude_of_the_force():
     stamps, samples = steady()
     samples[:, 3:] *= np.random.default_rng(0).uniform(0.9, 1.1, (stamps.size, 1))
-    _, forces, _ = cut(stamps, samples)
+    imu, _ = cut(stamps, samples)
     magnitudes = np.linalg.norm(samples[:, 3:], axis=1)
-    for (total, count, seconds), start, end in zip(forces, EPOCHS[:-1], EPOCHS[1:]):
+    for (total, count, seconds), start, end in zip(imu.forces, EPOCHS[:-1], EPOCHS[1:]):
         inside = (stamps >= start) & (stamps < end)
         assert count == np.count_nonzero(inside) and seconds == pytest.approx((end - start) * 1e-9)
         assert total == pytest.approx(np.sum(magnitudes[inside]))
@@ -68,7 +68,7 @@ def test_a_gap_has_the_noise_of_what_the_motion_may_do_in_it():
     """An angular acceleration a in it is worth a h^2 of angle: that squared over h, the root."""
     stamps, samples = steady()
     kept = (stamps <= 2.5 * SECOND) | (stamps >= 2.6 * SECOND)
-    imu, _, counts = cut(stamps[kept], samples[kept])
+    imu, counts = cut(stamps[kept], samples[kept])
     gap = np.isclose(imu.steps.dt, 0.1)
     assert np.count_nonzero(gap) == counts['imu_gap'] == 1
     for density, stated, most in (
@@ -86,7 +86,7 @@ def test_stamps_that_jitter_have_the_noise_of_what_changes_meanwhile():
     samples[:, 2] = 0.8 * stamps * 1e-9                      # rad/s, 0.8 rad/s^2
     sigma = 2e-4
     late = np.rint(sigma * SECOND * np.random.default_rng(1).standard_normal(stamps.size))
-    imu, _, _ = cut(stamps + late.astype(np.int64), samples, [2 * SECOND, 11 * SECOND])
+    imu, _ = cut(stamps + late.astype(np.int64), samples, [2 * SECOND, 11 * SECOND])
     inner = imu.noise.angle_random_walk[0, 5:-5]
     expected = 0.8 / np.sqrt(3) * sigma * np.sqrt(STEP)      # mean over the axes
     assert np.median(np.sqrt(inner ** 2 - STATED[0] ** 2)) == pytest.approx(expected, rel=0.2)
@@ -99,7 +99,7 @@ def test_noise_beyond_the_stated_one_is_measured(sensor, times, found):
     columns = slice(3 * sensor, 3 * sensor + 3)
     samples[:, columns] += times * STATED[sensor] / np.sqrt(STEP) * np.random.default_rng(
         2).standard_normal((stamps.size, 3))
-    imu, _, _ = cut(stamps, samples, [2 * SECOND, 41 * SECOND])
+    imu, _ = cut(stamps, samples, [2 * SECOND, 41 * SECOND])
     excess = (imu.noise.accel_excess if sensor else imu.noise.gyro_excess).item()
     expected = STATED[sensor] * np.sqrt(times ** 2 - 1) if found else 0.0
     assert excess == pytest.approx(expected, rel=0.05)
@@ -111,13 +111,13 @@ def test_noise_is_measured_over_short_intervals_too():
     stamps, samples = steady(seconds=42.0)
     samples[:, :3] += 3.0 * STATED[0] / np.sqrt(STEP) * np.random.default_rng(2).standard_normal(
         (stamps.size, 3))
-    imu, _, _ = cut(stamps, samples, list(range(2 * SECOND, 41 * SECOND, SECOND // 20)))
+    imu, _ = cut(stamps, samples, list(range(2 * SECOND, 41 * SECOND, SECOND // 20)))
     assert np.all(imu.noise.gyro_excess > STATED[0])
     assert np.mean(imu.noise.gyro_excess ** 2) == pytest.approx(8.0 * STATED[0] ** 2, rel=0.1)
 
 
 def test_gravity_at_an_unknown_place_is_noise_of_the_force():
-    imu, _, _ = cut(*steady(), drift=0.03)
+    imu, _ = cut(*steady(), drift=0.03)
     assert np.allclose(imu.noise.velocity_random_walk, np.hypot(STATED[1], 0.03))
     assert np.allclose(imu.noise.angle_random_walk, STATED[0])
 
@@ -127,7 +127,7 @@ def test_spikes_are_counted_once_and_replaced():
     spoilt = samples.copy()
     for place in (230, 310, 380, 401):                       # the last one is still to come
         spoilt[place, :3] += 5.0
-    imu, _, counts = cut(stamps, spoilt)
+    imu, counts = cut(stamps, spoilt)
     assert counts['imu_spike'] == 3
     assert np.allclose(imu.steps.omega, samples[0, :3]) and np.allclose(imu.steps.f,
                                                                         samples[0, 3:])
@@ -139,7 +139,7 @@ def test_the_end_of_the_range_is_noise_of_the_steps_before():
     random = np.random.default_rng(3)
     samples += 1e-4 * random.standard_normal(samples.shape)
     samples[:, 2] = np.minimum(4.0 * np.sin(2 * np.pi * stamps * 1e-9), 2.0)
-    imu, _, counts = cut(stamps, samples, [3 * SECOND + 3_000_000, 4 * SECOND])
+    imu, counts = cut(stamps, samples, [3 * SECOND + 3_000_000, 4 * SECOND])
     at_end = np.flatnonzero((samples[:, 2] == 2.0) & (stamps > EPOCHS[0] + SECOND)
                             & (stamps < 4 * SECOND))
     assert counts['imu_saturated'] > at_end.size

@@ -13,9 +13,10 @@
 # limitations under the License.
 """Checks on units and frames that need no alignment."""
 
-from ins_align.imu.plausibility import (
+from ins_align.gnss.antenna import VelocityCheck
+from ins_align.imu.noise import (
     BEYOND_END, BLIND_ANGLE, END_TIMES, FORCE_SAMPLES, FORCE_TIME, ForceCheck, RangeCheck, stuck,
-    VelocityCheck, without_spikes)
+    without_spikes)
 import numpy as np
 import pytest
 

@@ -24,7 +24,7 @@ from ins_align.aligner import Aligner, Attitude
 from ins_align.config import Config
 from ins_align.geometry.rotation import exp_so3, matrix_from_rpy, quaternion_from_matrix
 from ins_align.recordings import bag, BagError
-from ins_align.recordings.decode import Attitudes, Orientations
+from ins_align.recordings.decode import Orientations
 from ins_align.recordings.replay import Reference, replay
 from ins_align.results import CSV_HEADER
 from ins_align.simulation.simulate import feed, simulate, write_bag
@@ -247,7 +247,7 @@ def test_uav_velocity_integration_formula():
 
 
 def attitudes(angles, stamps):
-    return Attitudes(np.array(stamps), quaternion_from_matrix(matrix_from_rpy(angles)))
+    return np.array(stamps), quaternion_from_matrix(matrix_from_rpy(angles))
 
 
 def test_reference_is_interpolated():
@@ -271,9 +271,9 @@ def test_attitudes_that_are_not_known_are_left_out():
     covariances = np.full((5, 9), 0.1)
     covariances[1, 0] = -1.0
     quaternions[2], quaternions[3, 1] = 0.0, np.nan
-    known = Orientations(stamps, quaternions, covariances).known()
-    np.testing.assert_array_equal(known.stamps_ns, [0, 4])
-    np.testing.assert_array_equal(known.quaternions, quaternions[[0, 4]])
+    known_stamps, known = Orientations(stamps, quaternions, covariances).known()
+    np.testing.assert_array_equal(known_stamps, [0, 4])
+    np.testing.assert_array_equal(known, quaternions[[0, 4]])
 
 
 def test_reference_comes_in_parts_in_any_order():

@@ -19,6 +19,7 @@ from ins_align.geometry.rotation import matrix_from_rpy
 from ins_align.geometry.transform import Transform
 from ins_align.recordings.replay import replay
 from ins_align.results import State
+from ins_align.simulation.scenarios import Motion, Scenario, SCENARIOS
 from ins_align.simulation.simulate import epochs_of, simulate, write_bag
 import numpy as np
 import pytest
@@ -96,13 +97,22 @@ def test_motion_that_contradicts_the_vehicle_is_found(scenario, options):
     assert max(late, default=0.0) < 3.5
 
 
-def test_backing_out_is_said_to_be_ambiguous_until_it_shows():
-    simulation = simulate('reverse', seed=6, duration=30.0)
-    _, epochs, _ = aligned(simulation)
+def test_direction_of_a_slow_car_is_said_to_be_ambiguous_until_its_speed_changes(monkeypatch):
+    """At a constant 2 m/s nothing tells whether it goes backwards; it does, then it stops."""
+    def motion(time):
+        speed = -2.0 + 2.0 * np.clip((time - 20.0) / 3.0, 0.0, 1.0)
+        zero = np.zeros_like(time)
+        return Motion(np.stack([speed, zero, zero], axis=-1), np.zeros((len(time), 3)))
+
+    monkeypatch.setitem(SCENARIOS, 'slow', Scenario(lambda duration: motion, 40.0, 1.0))
+    _, epochs, _ = aligned(simulate('slow', seed=6, duration=40.0))
     ambiguous = ['forwards and backwards are both possible' in epoch.reason for epoch in epochs]
-    assert any(ambiguous) and epochs[-1].state is State.ALIGNED
-    assert not any(unclear for unclear, epoch in zip(ambiguous, epochs)
-                   if epoch.state is State.ALIGNED)
+    times = np.array([epoch.stamp_ns - epochs[0].stamp_ns for epoch in epochs]) * 1e-9
+    assert all(unclear for unclear, t in zip(ambiguous, times) if 8.0 < t < 19.0)
+    assert not any(unclear for unclear, t in zip(ambiguous, times) if t > 25.0)
+    assert all(epoch.state is not State.ALIGNED for epoch, t in zip(epochs, times) if t < 19.0)
+    error = epochs[-1].current.heading_deg - 90.0
+    assert abs(np.remainder(error + 180.0, 360.0) - 180.0) < 3 * epochs[-1].current.sigma_deg[2]
 
 
 @pytest.mark.parametrize('method', ['vif', 'pif'])

@@ -227,9 +227,12 @@ class Rivals:
 
     def vehicle_in_words(self, filters: Filters) -> str:
         """Return what is not known of the vehicle's motion, as the end of a sentence, or ''."""
+        if self.vehicle is None:
+            return ''
         level = self.of_levels(filters)
-        likely = self._along[filters.ids[level > np.max(level) - MARGIN]]
-        return AMBIGUOUS if len(set(likely.tolist())) > 1 else ''
+        likely = filters.lead[level > np.max(level) - MARGIN]
+        x_n0 = self.vehicle.forward(filters.C[likely])
+        return AMBIGUOUS if np.any(x_n0 @ x_n0.T < 0) else ''
 
     def doubt(self, filters: Filters, attitudes: Callable[[], tuple[Array, Array]],
               misfit: float) -> tuple[str, bool]:

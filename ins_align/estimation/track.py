@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from ins_align.geometry.earth import (
     earth_rate_n, gravitation_n, gravity_n, ground_velocity_n, LocalLevel, position_n)
 from ins_align.geometry.rotation import Array, cross, running_sum
-from ins_align.gnss.antenna import AntennaEpoch
+from ins_align.gnss.messages import AntennaEpoch
 import numpy as np
 
 

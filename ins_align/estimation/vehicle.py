@@ -29,7 +29,7 @@ import math
 from ins_align.config import Config
 from ins_align.estimation.filter import Filters, Look, Track
 from ins_align.estimation.linearised import (
-    DRIFT, FIRST, Linearised, MOUNT, OF_VEHICLE, PHI)
+    DRIFT, FIRST, Linearised, MOUNT, OF_VEHICLE, PHI, XI)
 from ins_align.geometry.rotation import apply, Array, Index, skew
 from ins_align.geometry.transform import Transform
 import numpy as np
@@ -44,6 +44,9 @@ INTERVAL, NOISE = 1.0, 0.05
 LASTING = 30.0
 # Backwards a vehicle goes as fast as this (m/s, 1 sigma).
 BACKWARDS_SPEED = 2.0
+# A speed of so many of its sigmas has a direction; that of a vehicle at rest would be noise, which
+# feigns a heading.
+MOVES = 5.0
 # Mounting and drift that are so many of their sigmas are none.
 MOST = 4.0
 NOT_USED = ('; the motion contradicts vehicle: {vehicle}, which is not used (a drift, a tow, a '
@@ -101,7 +104,9 @@ class Vehicle:
         # A rival whose heading is open sets out in its direction; later it may turn back. The
         # derivatives are those at motion along x.
         open_ = np.bincount(q) > 1
-        speed = np.where(open_, np.linalg.norm(v_n0[lead], axis=1), np.abs(v[lead, 0]))
+        fast = np.linalg.norm(v_n0[lead], axis=1)
+        moves = fast > MOVES * np.sqrt(np.trace(filters.P[:, XI, XI], axis1=1, axis2=2) / 3)
+        speed = np.where(open_, fast, np.abs(v[lead, 0]))
         direction = np.where(open_, along, np.sign(v[lead, 0]) * (along != 0))
         speed = direction * speed
         self.against[filters.ids] = np.maximum(
@@ -111,9 +116,13 @@ class Vehicle:
         x = H[..., FIRST:]
         x[..., MOUNT], x[..., DRIFT] = -speed[:, None, None] * np.eye(2), -np.eye(2)
         sideways = v[:, 1:] - v[:, :1] * filters.x[:, MOUNT] - filters.x[:, DRIFT]
-        return Look(along != 0, H, NOISE ** 2 + (self._slip * speed) ** 2, -sideways,
+        return Look(moves & (along != 0), H, NOISE ** 2 + (self._slip * speed) ** 2, -sideways,
                     np.maximum(-direction[q] * v[:, 0], 0.0),
                     apply(filters.C, self._axes[:, 2])[:, 2] < 0)
+
+    def forward(self, C: Array) -> Array:
+        """Return x of the base for attitudes C of the IMU, shape (N, 3, 3)."""
+        return apply(C, self._axes[:, 0])
 
     def contradicts(self, x: Array) -> bool:
         """Return whether the parameters x, shape (m,), can be those of the vehicle no more."""

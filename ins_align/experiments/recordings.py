@@ -30,12 +30,12 @@ from ins_align.aligner import Aligner
 from ins_align.config import Config
 from ins_align.experiments import ExperimentError
 from ins_align.experiments.common import draw, Error, error_of, JsonDict, most, parallel, Report
-from ins_align.geometry.earth import ecef_from_lla, matrix_en
-from ins_align.geometry.rotation import Array
+from ins_align.geometry.earth import matrix_en, position_n
+from ins_align.geometry.rotation import apply, Array
 from ins_align.gnss.messages import Velocity
 from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
-from ins_align.recordings.decode import ImuSamples, joined, Orientations, Refused
+from ins_align.recordings.decode import ImuSamples, Orientations, Refused
 from ins_align.recordings.reader import choose_topics, read, Request
 from ins_align.recordings.replay import Reference
 from ins_align.results import Epoch, State
@@ -114,8 +114,9 @@ def load(path: Path) -> Recording:
     parts = list(read(Request(path)))
     if parts[0].topics.reference is None:
         raise BagError(f'{path} has no reference')
-    imu = joined([part.imu for part in parts])
-    orientations = joined([part.orientations for part in parts])
+    imu = ImuSamples(*map(np.concatenate, zip(*(part.imu for part in parts))))
+    orientations = Orientations(
+        *map(np.concatenate, zip(*(part.orientations for part in parts))))
     gnss = []
     earlier = 0
     for part in parts:
@@ -203,7 +204,7 @@ def _velocities(messages: list[Any]) -> tuple[np.ndarray, Array]:
         return np.zeros(0, np.int64), np.zeros((0, 2))
     stamps = np.array([m.stamp_ns for m in fixes])
     place = np.radians([[m.latitude_deg, m.longitude_deg] for m in fixes])
-    r_e = ecef_from_lla(*place.T, [m.altitude_m for m in fixes])
+    r_e = apply(matrix_en(*place.T), position_n(place[:, 0], [m.altitude_m for m in fixes]))
     moved = (r_e - r_e[0]) @ matrix_en(*place[0])
     # Over half a second, against the noise of a fix.
     step = max(1, int(round(0.25e9 / np.median(np.diff(stamps)))))

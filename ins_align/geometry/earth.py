@@ -15,7 +15,7 @@
 The Earth: WGS-84 ellipsoid, normal gravity, and how the local level turns (C_n0n).
 
 Latitude and longitude are radians, altitude is metres above the ellipsoid; every function but
-`carried` and `way` works over leading axes.
+`dead_reckon` and `enu_offset` works over leading axes.
 """
 
 import math
@@ -39,7 +39,7 @@ Place = tuple[float, float, float]     # latitude, longitude (radians), altitude
 
 def normal_gravity(latitude: ArrayLike, altitude: ArrayLike) -> Array:
     """
-    Magnitude of normal gravity, m/s^2 (Somigliana, second order in altitude).
+    Return the magnitude of normal gravity, m/s^2 (Somigliana, second order in altitude).
 
     Source: WGS 84 standard, equations 4-1 and 4-3. The direction is taken along -up; below 20 km
     the deflection with altitude is under 2e-5 rad at 45 degrees and is left out.
@@ -53,30 +53,11 @@ def normal_gravity(latitude: ArrayLike, altitude: ArrayLike) -> Array:
                       + 3 * ratio ** 2)
 
 
-def ecef_from_lla(latitude: ArrayLike, longitude: ArrayLike, altitude: ArrayLike) -> Array:
-    """Position ``r_e``, shape (..., 3), metres."""
-    sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
-    prime_vertical = SEMI_MAJOR_AXIS / np.sqrt(1 - ECCENTRICITY2 * sin_lat ** 2)
-    height = np.asarray(altitude, dtype=float)
-    equatorial = (prime_vertical + height) * cos_lat
-    return np.stack(np.broadcast_arrays(
-        equatorial * np.cos(longitude), equatorial * np.sin(longitude),
-        (prime_vertical * (1 - ECCENTRICITY2) + height) * sin_lat), axis=-1)
-
-
-def carried(place: Place, v_n: Array, dt: float) -> Place:
+def dead_reckon(place: Place, v_n: Array, dt: float) -> Place:
     """
-    Carry a place on with a velocity, on a sphere: good to 1 % of the way.
+    Return where a velocity (ENU, m/s) leads in `dt` seconds, of either sign.
 
-    Parameters
-    ----------
-    place : (latitude, longitude, altitude)
-        Radians, metres.
-    v_n : ndarray, shape (3,)
-        ENU, m/s.
-    dt : float
-        Seconds, of either sign.
-
+    The Earth is taken as a sphere: good to 1 % of the way.
     """
     latitude, longitude, altitude = place
     east, north, up = v_n.tolist()
@@ -85,14 +66,14 @@ def carried(place: Place, v_n: Array, dt: float) -> Place:
             altitude + up * dt)
 
 
-def way(start: Place, end: Place) -> tuple[float, float, float]:
-    """Return the way east, north and up between two places, metres: `carried` the other way."""
+def enu_offset(start: Place, end: Place) -> tuple[float, float, float]:
+    """Return how far east, north and up one place is of another, metres, on the same sphere."""
     east = math.remainder(end[1] - start[1], 2 * math.pi) * max(math.cos(start[0]), 1e-3)
     return SEMI_MAJOR_AXIS * east, SEMI_MAJOR_AXIS * (end[0] - start[0]), end[2] - start[2]
 
 
 def matrix_en(latitude: ArrayLike, longitude: ArrayLike) -> Array:
-    """``C_en``, shape (..., 3, 3): columns are east, north and up in the Earth-fixed frame."""
+    """Return ``C_en``, shape (..., 3, 3): its columns are east, north and up."""
     sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
     sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)
     matrix = np.zeros(np.broadcast_shapes(np.shape(sin_lat), np.shape(sin_lon)) + (3, 3))
@@ -108,15 +89,7 @@ def matrix_en(latitude: ArrayLike, longitude: ArrayLike) -> Array:
 
 
 def matrix_earth_turned(time: ArrayLike) -> Array:
-    """
-    ``Rz(W t)``, shape (..., 3, 3): from the Earth-fixed frame after `time` to the one before.
-
-    Parameters
-    ----------
-    time : array_like, shape (...)
-        Seconds since the frames coincided.
-
-    """
+    """Return ``Rz(W t)``: from the Earth-fixed frame to what it was `time` seconds before."""
     angle = EARTH_RATE * np.asarray(time, dtype=float)
     matrix = np.zeros(angle.shape + (3, 3))
     matrix[..., 0, 0] = matrix[..., 1, 1] = np.cos(angle)
@@ -127,7 +100,7 @@ def matrix_earth_turned(time: ArrayLike) -> Array:
 
 
 def gravity_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
-    """Gravity ``g_n`` (normal) in ENU, shape (..., 3), m/s^2."""
+    """Return normal gravity ``g_n`` in ENU, shape (..., 3), m/s^2."""
     magnitude = normal_gravity(latitude, altitude)
     vector = np.zeros(np.shape(magnitude) + (3,))
     vector[..., 2] = -magnitude
@@ -135,7 +108,7 @@ def gravity_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
 
 
 def earth_rate_n(latitude: ArrayLike) -> Array:
-    """Earth rate ``omega_ie_n`` in ENU, shape (..., 3), rad/s."""
+    """Return the Earth rate ``omega_ie_n`` in ENU, shape (..., 3), rad/s."""
     vector = np.zeros(np.shape(latitude) + (3,))
     vector[..., 1] = EARTH_RATE * np.cos(latitude)
     vector[..., 2] = EARTH_RATE * np.sin(latitude)
@@ -143,7 +116,7 @@ def earth_rate_n(latitude: ArrayLike) -> Array:
 
 
 def position_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
-    """Position from the Earth's centre in ENU axes, shape (..., 3), metres."""
+    """Return the position from the Earth's centre in ENU axes, shape (..., 3), metres."""
     sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
     prime_vertical = SEMI_MAJOR_AXIS / np.sqrt(1 - ECCENTRICITY2 * sin_lat ** 2)
     vector = np.zeros(np.broadcast_shapes(np.shape(latitude), np.shape(altitude)) + (3,))
@@ -154,13 +127,13 @@ def position_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
 
 
 def gravitation_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
-    """Gravitation ``g_n + omega_ie x (omega_ie x r)`` in ENU, shape (..., 3), m/s^2."""
+    """Return gravitation, ``g_n + omega_ie x (omega_ie x r)``, in ENU, m/s^2."""
     rate = earth_rate_n(latitude)
     return gravity_n(latitude, altitude) + cross(rate, ground_velocity_n(latitude, altitude))
 
 
 def ground_velocity_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
-    """Inertial velocity ``omega_ie x r`` of what rests on the Earth, ENU, shape (..., 3), m/s."""
+    """Return the inertial velocity ``omega_ie x r`` of what rests on the Earth, ENU, m/s."""
     return cross(earth_rate_n(latitude), position_n(latitude, altitude))
 
 
@@ -182,26 +155,5 @@ class LocalLevel:
         self._C_n0e = matrix_en(latitude, longitude).T
 
     def matrix(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike) -> Array:
-        """``C_n0n``, shape (..., 3, 3), at `time` seconds since t0."""
+        """Return ``C_n0n``, shape (..., 3, 3), at `time` seconds since t0."""
         return self._C_n0e @ matrix_earth_turned(time) @ matrix_en(latitude, longitude)
-
-    def position(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike,
-                 altitude: ArrayLike) -> Array:
-        """Position from the Earth's centre in n0 axes, shape (..., 3), metres."""
-        return self._seen(time, latitude, longitude, position_n(latitude, altitude))
-
-    def velocity(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike,
-                 altitude: ArrayLike, v_n: ArrayLike) -> Array:
-        """Inertial velocity in n0 axes, shape (..., 3), m/s: ``C_n0n (v_n + omega_ie x r)``."""
-        return self._seen(time, latitude, longitude,
-                          np.asarray(v_n, dtype=float) + ground_velocity_n(latitude, altitude))
-
-    def gravitation(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike,
-                    altitude: ArrayLike) -> Array:
-        """Gravitation in n0 axes, shape (..., 3), m/s^2."""
-        return self._seen(time, latitude, longitude, gravitation_n(latitude, altitude))
-
-    def _seen(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike,
-              vector_n: Array) -> Array:
-        """Turn a vector from ENU at `time` into n0 axes."""
-        return (self.matrix(time, latitude, longitude) @ vector_n[..., None])[..., 0]

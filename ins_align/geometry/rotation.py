@@ -18,7 +18,6 @@ Matrices are ``C_xy`` (components in y to components in x), quaternions are (x, 
 same rotation with w >= 0, angles are radians.
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -28,50 +27,24 @@ Array = NDArray[np.float64]
 Index = NDArray[np.integer[Any]]
 
 # Below this angle (rad) four terms of the Taylor series of sin(x)/x and friends are exact to
-# rounding, below the second one two are.
-_SERIES_ANGLE, _SMALL_ANGLE = 0.05, 1e-3
-# Numbers from which on arrays are summed one by one.
-_MANY = 100
+# rounding.
+_SERIES_ANGLE = 0.05
 
 
 def apply(matrix: Array, vectors: Array) -> Array:
     """
-    Products of matrices and vectors.
+    Return ``matrix @ vector``, shapes (..., m, n) and (..., n), with leading axes that broadcast.
 
-    Each on its own: those of one matrix with many vectors at a time depend, in the last bit, on
-    how many they are.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (..., m, n)
-        One, or one for each vector.
-    vectors : ndarray, shape (..., n)
-        Many of them.
-
-    Returns
-    -------
-    ndarray, shape (..., m)
-
+    Each on its own: the last bit of a product of one matrix with many vectors depends on how many.
     """
     return (matrix @ vectors[..., None])[..., 0]
 
 
 def product(left: Array, right: Array) -> Array:
     """
-    Return ``left @ right``, written out: with the stack in Fortran order, for many at a time.
+    Return ``left @ right``, shapes (..., m, n) and (..., n, k), in Fortran order.
 
-    Parameters
-    ----------
-    left : ndarray, shape (..., m, n)
-        One, or one for each right one.
-    right : ndarray, shape (..., n, k)
-        Many of them.
-
-    Returns
-    -------
-    ndarray, shape (..., m, k)
-        In Fortran order.
-
+    Written out, which for many small matrices in Fortran order is quicker.
     """
     terms = (np.multiply(left[..., k:k + 1], right[..., k:k + 1, :], order='F')
              for k in range(left.shape[-1]))
@@ -83,38 +56,15 @@ def product(left: Array, right: Array) -> Array:
 
 def by_row(matrix: Array, vectors: Array) -> Array:
     """
-    Derive ``matrix @ X @ vector`` by X, row by row.
+    Return the derivative of ``matrix @ X @ vector`` to X, row by row, shape (..., 3, 9).
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (..., 3, 3)
-        The left factor.
-    vectors : ndarray, shape (..., 3)
-        The right factor.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 9)
-
+    Shapes (..., 3, 3) and (..., 3).
     """
     return (matrix[..., None] * vectors[..., None, None, :]).reshape(matrix.shape[:-1] + (9,))
 
 
 def skew(vector: ArrayLike) -> Array:
-    """
-    Cross-product matrix ``[v x]``.
-
-    Parameters
-    ----------
-    vector : array_like, shape (..., 3)
-        The left factor.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-        ``skew(a) @ b == cross(a, b)``.
-
-    """
+    """Return the matrix ``[v x]``, shape (..., 3, 3), of v, shape (..., 3)."""
     v = np.asarray(vector, dtype=float)
     matrix = np.zeros(v.shape + (3,))
     matrix[..., 0, 1] = -v[..., 2]
@@ -128,10 +78,10 @@ def skew(vector: ArrayLike) -> Array:
 
 def cross(a: ArrayLike, b: ArrayLike) -> Array:
     """
-    Cross product over the last axis; leading axes broadcast.
+    Return the cross product over the last axis; leading axes broadcast.
 
-    Several times faster than numpy.cross on the small arrays of one GNSS interval. The result is
-    laid out in memory as the larger one is.
+    On small arrays this is several times faster than numpy.cross. The result lies in memory as
+    the larger one does.
     """
     a = np.asarray(a, dtype=float)
     b = np.asarray(b, dtype=float)
@@ -143,7 +93,7 @@ def cross(a: ArrayLike, b: ArrayLike) -> Array:
 
 
 def _trigonometric_factors(angle2: Array) -> tuple[Array, Array]:
-    """sin(x)/x and (1 - cos x)/x^2 of x^2."""
+    """Return sin(x)/x and (1 - cos x)/x^2 of x^2."""
     a = 1 - angle2 / 6 * (1 - angle2 / 20 * (1 - angle2 / 42))
     b = 0.5 - angle2 / 24 * (1 - angle2 / 30 * (1 - angle2 / 56))
     small = angle2 < _SERIES_ANGLE ** 2
@@ -194,50 +144,14 @@ def _rodrigues(v: Array, angle2: Array, odd: Array, even: Array) -> Array:
 
 
 def exp_so3(vector: ArrayLike) -> Array:
-    """
-    Rotation matrix of a rotation vector (Rodrigues' formula).
-
-    Parameters
-    ----------
-    vector : array_like, shape (..., 3)
-        Radians.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-
-    """
+    """Return rotation matrices, shape (..., 3, 3), of rotation vectors (Rodrigues' formula)."""
     v = np.asarray(vector, dtype=float)
-    if v.ndim > 1:
-        squares = _squared_norm(v)
-        return _rodrigues(v, squares, *_trigonometric_factors(squares))
-    x, y, z = v.tolist()                          # a single one is quicker without arrays
-    angle2 = x * x + y * y + z * z
-    if angle2 < _SMALL_ANGLE ** 2:
-        a, b = 1 - angle2 / 6, 0.5 - angle2 / 24
-    else:
-        angle = math.sqrt(angle2)
-        a, b = math.sin(angle) / angle, 2 * math.sin(angle / 2) ** 2 / angle2
-    d = 1 - b * angle2
-    return np.array([[d + b * x * x, b * x * y - a * z, b * x * z + a * y],
-                     [b * x * y + a * z, d + b * y * y, b * y * z - a * x],
-                     [b * x * z - a * y, b * y * z + a * x, d + b * z * z]])
+    angle2 = _squared_norm(v)
+    return _rodrigues(v, angle2, *_trigonometric_factors(angle2))
 
 
 def rotated(rotation: Array, vectors: Array) -> Array:
-    """
-    Return ``exp_so3(rotation) @ vectors`` without the matrices.
-
-    Parameters
-    ----------
-    rotation, vectors : ndarray, shape (..., 3)
-        Rotation vectors, radians, and what is turned by them.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-
-    """
+    """Return ``exp_so3(rotation) @ vectors``, all of shape (..., 3), without the matrices."""
     a, b = _trigonometric_factors(_squared_norm(rotation))
     sideways = cross(rotation, vectors)
     return vectors + a[..., None] * sideways + b[..., None] * cross(rotation, sideways)
@@ -245,21 +159,10 @@ def rotated(rotation: Array, vectors: Array) -> Array:
 
 def log_so3(matrix: ArrayLike) -> Array:
     """
-    Rotation vector of a rotation matrix, angle in [0, pi].
+    Return rotation vectors, shape (..., 3), of rotation matrices, angle in [0, pi].
 
-    Up to a right angle from sine and cosine, beyond it through the quaternion, which keeps full
-    precision near pi.
-
-    Parameters
-    ----------
-    matrix : array_like, shape (..., 3, 3)
-        Rotation matrix.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        Radians.
-
+    Up to a right angle they come from sine and cosine, beyond it from the quaternion, which keeps
+    full precision near pi.
     """
     m = np.asarray(matrix, dtype=float)
     cosine = 0.5 * (m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2] - 1)
@@ -285,19 +188,7 @@ def _arctan2(y: Array, x: Array) -> Array:
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
-    """
-    Rotation matrix of a quaternion, which is normalised first.
-
-    Parameters
-    ----------
-    quaternion : array_like, shape (..., 4)
-        (x, y, z, w).
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-
-    """
+    """Return rotation matrices of quaternions (x, y, z, w) of any length, shape (..., 4)."""
     q = np.asarray(quaternion, dtype=float)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     s = skew(q[..., :3])
@@ -306,21 +197,10 @@ def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
 
 def quaternion_from_matrix(matrix: ArrayLike) -> Array:
     """
-    Quaternion of a rotation matrix, w >= 0.
+    Return quaternions (x, y, z, w), shape (..., 4), w >= 0, of rotation matrices.
 
-    Shepperd's method, which divides by the largest of the four components (S. W. Shepperd,
-    "Quaternion from rotation matrix", J. Guidance and Control 1(3), 1978).
-
-    Parameters
-    ----------
-    matrix : array_like, shape (..., 3, 3)
-        Rotation matrix.
-
-    Returns
-    -------
-    ndarray, shape (..., 4)
-        (x, y, z, w).
-
+    Shepperd's method divides by the largest of the four components (S. W. Shepperd, "Quaternion
+    from rotation matrix", J. Guidance and Control 1(3), 1978).
     """
     m = np.asarray(matrix, dtype=float)
     trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
@@ -343,17 +223,9 @@ def quaternion_from_matrix(matrix: ArrayLike) -> Array:
 
 def matrix_from_rpy(rpy: ArrayLike) -> Array:
     """
-    ``C_nb = Rz(yaw) Ry(pitch) Rx(roll)`` (REP-103).
+    Return ``C_nb = Rz(yaw) Ry(pitch) Rx(roll)`` (REP-103) of roll, pitch, yaw, shape (..., 3).
 
-    Parameters
-    ----------
-    rpy : array_like, shape (..., 3)
-        Roll, pitch, yaw in radians; yaw is counter-clockwise from east.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-
+    Yaw is counter-clockwise from east.
     """
     rpy = np.asarray(rpy, dtype=float)
     x, y, z = np.eye(3)
@@ -363,18 +235,9 @@ def matrix_from_rpy(rpy: ArrayLike) -> Array:
 
 def roll_pitch_yaw(matrix: ArrayLike) -> Array:
     """
-    Roll, pitch and yaw of ``C_nb``: the inverse of `matrix_from_rpy`.
+    Return roll, pitch and yaw of ``C_nb``, shape (..., 3): the inverse of `matrix_from_rpy`.
 
-    Parameters
-    ----------
-    matrix : array_like, shape (..., 3, 3)
-        ``C_nb``.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        Radians; pitch in [-pi/2, pi/2], the others in (-pi, pi].
-
+    Pitch is in [-pi/2, pi/2], the others are in (-pi, pi].
     """
     m = np.asarray(matrix, dtype=float)
     return np.stack([_arctan2(m[..., 2, 1], m[..., 2, 2]),
@@ -383,38 +246,15 @@ def roll_pitch_yaw(matrix: ArrayLike) -> Array:
 
 
 def orthonormalized(matrix: Array) -> Array:
-    """
-    Nearest rotation matrix to first order, against drift of long products.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (..., 3, 3)
-        A rotation matrix up to rounding.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-
-    """
+    """Return the nearest rotation to first order, against the rounding of long products."""
     return 1.5 * matrix - 0.5 * matrix @ (matrix.swapaxes(-1, -2) @ matrix)
 
 
 def cumulative_rotations(steps: Array) -> Array:
     """
-    Prefix products ``steps[0] @ steps[1] @ ... @ steps[k]`` for every k.
+    Return ``steps[0] @ steps[1] @ ... @ steps[k]`` for every k, shape (..., n, 3, 3).
 
-    One after the other, over all leading axes at once: what comes out for one run does not depend
-    on what else is worked out with it, to the last bit.
-
-    Parameters
-    ----------
-    steps : ndarray, shape (..., n, 3, 3)
-        Rotation matrices.
-
-    Returns
-    -------
-    ndarray, shape (..., n, 3, 3)
-
+    To the last bit a run's products do not depend on what else is worked out with it.
     """
     steps = np.ascontiguousarray(np.moveaxis(steps, -3, 0))
     total = steps.copy()
@@ -425,9 +265,4 @@ def cumulative_rotations(steps: Array) -> Array:
 
 def running_sum(start: Array, steps: Array) -> Array:
     """Return ``start + steps[0] + ... + steps[k]`` for every k, to the bit as one by one."""
-    if start.size < _MANY:
-        return np.cumsum(np.concatenate([start[None], steps]), axis=0)[1:]
-    total = np.empty(steps.shape)
-    for step, after in zip(steps, total):         # several times faster than a sum over axis 0
-        start = np.add(start, step, out=after)
-    return total
+    return np.cumsum(np.concatenate([start[None], steps]), axis=0)[1:]

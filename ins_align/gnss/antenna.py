@@ -14,16 +14,14 @@
 """Where the GNSS antenna is: GNSS messages put together to the epochs that a method takes."""
 
 from collections import Counter, deque
-from collections.abc import Sequence
-from dataclasses import dataclass
 import math
 
 from ins_align.config import Config
-from ins_align.geometry.earth import carried, GRAVITY_EQUATOR, Place, SEMI_MAJOR_AXIS, way
+from ins_align.geometry.earth import (
+    dead_reckon, enu_offset, GRAVITY_EQUATOR, Place, SEMI_MAJOR_AXIS)
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.buffer import GnssEpoch
-from ins_align.gnss.messages import Fix, Velocity
-from ins_align.imu.plausibility import VelocityCheck
+from ins_align.gnss.messages import AntennaEpoch, Fix, Velocity
 import numpy as np
 
 # A fix this far (m) from where the last one and the velocity lead, and as much again for every
@@ -39,52 +37,14 @@ _UNKNOWN_VERTICAL_STD, _UNKNOWN_ALTITUDE_STD = 1e3, 1e4
 # good receiver can mean, from 1 mm (1 mm/s) on.
 BETTER_THAN_USUAL, USUAL_EPOCHS = 100.0, 11
 BEST_VARIANCE = 1e-6
-
-
-@dataclass(frozen=True)
-class AntennaEpoch:
-    """
-    Where the antenna is and how it moves at a GNSS epoch, as a method takes it.
-
-    Attributes
-    ----------
-    stamp_ns : int
-    latitude, longitude, altitude : float
-        Of the antenna, radians and metres; always there.
-    v_n : ndarray, shape (3,), or None
-        Antenna velocity, ENU, m/s.
-    velocity_covariance, position_covariance : ndarray, shape (3, 3)
-        ENU.
-    position_measured : bool
-        Whether the position is a measurement to align with.
-    gravity_drift : float
-        Noise density of gravity because the place is not known, m/s/sqrt(s).
-    fault : str
-        Fault of the velocities up to here, in words; '' when none is known.
-    dry : bool
-        Whether there is no GNSS message at all: an epoch that divides an outage.
-    stated : (bool, bool)
-        Whether the receiver states the noise of the velocity and of the position.
-
-    """
-
-    stamp_ns: int
-    latitude: float
-    longitude: float
-    altitude: float
-    v_n: Array | None
-    velocity_covariance: Array
-    position_measured: bool
-    position_covariance: Array
-    gravity_drift: float = 0.0
-    fault: str = ''
-    dry: bool = False
-    stated: tuple[bool, bool] = (True, True)
-
-
-def velocities_of(epochs: Sequence[AntennaEpoch]) -> Array:
-    """Return the velocities of K epochs, shape (K, 3), zero where there is none."""
-    return np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n for epoch in epochs])
+# Distance over which velocity and position are compared: at least this, and so many sigmas.
+MIN_DISTANCE = 10.0
+DISTANCE_SIGMAS = 8.0
+# Mismatch, as a share of the distance, that no noise explains, and how many in a row convict.
+MAX_MISMATCH = 0.5
+CONVICTING = 4
+# So many fixes in a row have to agree, to within the same share of the distance, at its end.
+AGREEING = 3
 
 
 class Antenna:
@@ -186,17 +146,17 @@ class Antenna:
             self._place = (*self._place[:2], fix.altitude_m)
         predicted = self._place
         if predicted is not None and v_n is not None and dt < MAX_CARRIED:
-            predicted = carried(predicted, v_n, dt)
+            predicted = dead_reckon(predicted, v_n, dt)
         if fix is not None:
             place = (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg),
                      fix.altitude_m if fix.vertical or predicted is None else predicted[2])
             silent = (stamp_ns - self._fix_ns) * 1e-9
             if (predicted is None
-                    or math.hypot(*way(predicted, place)) <= MAX_FIX_JUMP * (1 + silent)):
+                    or math.hypot(*enu_offset(predicted, place)) <= MAX_FIX_JUMP * (1 + silent)):
                 self._jumps = 0
                 self._altitude_known |= fix.vertical
                 if self._place is not None and v_n is None and dt > 0:
-                    self._speed = math.hypot(*way(self._place, place)) / dt
+                    self._speed = math.hypot(*enu_offset(self._place, place)) / dt
                 self._place, self._place_ns, self._fix_ns = place, stamp_ns, stamp_ns
                 return True
             self._counts['fix_jump'] += 1
@@ -265,3 +225,64 @@ class StatedNoise:
             return covariance
         scale = np.sqrt(factors)
         return covariance * scale * scale[:, None]
+
+
+class VelocityCheck:
+    """Whether the receiver's velocity is the derivative of its position: frame and axes."""
+
+    def __init__(self) -> None:
+        """Start with nothing compared."""
+        self._origin: Place | None = None
+        self._path = 0.0, 0.0
+        # East and north of the fix, and of what the velocity makes of the way, since the origin.
+        self._recent: deque[tuple[float, ...]] = deque(maxlen=AGREEING)
+        self._anchor: tuple[float, ...] | None = None
+        self._last: tuple[float, float, float] | None = None
+        self.bad_in_a_row = 0
+        self._as_ned_in_a_row = 0
+
+    def add(self, time: float, place: Place, v_n: Array, position_std: float) -> None:
+        """Take an epoch that has both; seconds, radians, metres, ENU."""
+        east, north, _ = v_n.tolist()
+        if self._last is not None and 0 < time - self._last[0] < 2.5:
+            half = (time - self._last[0]) / 2
+            self._path = (self._path[0] + half * (self._last[1] + east),
+                          self._path[1] + half * (self._last[2] + north))
+        else:
+            self._origin = None
+        self._last = time, east, north
+        if self._origin is None:
+            self._origin, self._path, self._anchor = place, (0.0, 0.0), None
+            self._recent.clear()
+        self._recent.append((*enu_offset(self._origin, place)[:2], *self._path))
+        if len(self._recent) < AGREEING:
+            return
+        here = self._recent[AGREEING // 2]
+        if self._anchor is None:
+            self._anchor = here
+            return
+        moved_e, moved_n, went_e, went_n = (now - then for now, then in zip(here, self._anchor))
+        distance = max(math.hypot(moved_e, moved_n), math.hypot(went_e, went_n))
+        tolerance = MAX_MISMATCH * distance
+        # A wild fix is no journey, and one after the other they do not agree.
+        if (distance < max(MIN_DISTANCE, DISTANCE_SIGMAS * position_std)
+                or any(math.dist(other[:2], here[:2]) > tolerance for other in self._recent)):
+            return
+        bad = math.hypot(moved_e - went_e, moved_n - went_n) > tolerance
+        as_ned = math.hypot(moved_e - went_n, moved_n - went_e) < tolerance
+        self._origin = None                   # the next journey begins here
+        if as_ned and not bad:
+            return                            # to north-east both frames say the same
+        self.bad_in_a_row = self.bad_in_a_row + 1 if bad else 0
+        self._as_ned_in_a_row = self._as_ned_in_a_row + 1 if as_ned else 0
+
+    @property
+    def fault(self) -> str:
+        """Fault in words; empty when nothing is known to be wrong."""
+        if self.bad_in_a_row < CONVICTING:
+            return ''
+        if self._as_ned_in_a_row >= CONVICTING:
+            return ('the GNSS velocity contradicts the change of position, and would fit it with '
+                    'north and east exchanged: set velocity_frame to the other one (enu, ned)')
+        return ('the GNSS velocity contradicts the change of position: check that it is given in '
+                'a world frame (velocity_frame) and in m/s')

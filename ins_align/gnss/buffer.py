@@ -20,22 +20,20 @@ and not on when somebody looked.
 """
 
 from collections import Counter, deque
-from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
-from ins_align.geometry.earth import carried
-from ins_align.gnss.messages import Fix, Velocity
-import numpy as np
+from ins_align.geometry.earth import dead_reckon
+from ins_align.gnss.messages import (
+    fault_of_fix, Fix, usable_velocity, Velocity, with_an_altitude)
 
-# Beyond these no receiver measures; such values would overflow the integrals (m/s, m).
-MAX_SPEED, MAX_ALTITUDE = 2000.0, 1e6
 # A GNSS stamp this far ahead of the IMU comes from another clock (ns).
 MAX_AHEAD_NS = 10_000_000_000
 MAX_PENDING = 10_000
 # A fix and a velocity that are no further apart than this are of one epoch: many drivers stamp
 # each message when it arrives (ns).
 PAIR_NS = 50_000_000
-NO_FIX, STATUS_UNKNOWN = -1, -2
+STATUS_UNKNOWN = -2
 # A receiver without a fix does not know its velocity either, whatever it sends: none is taken
 # until the next fix, or for this long (ns).
 NO_FIX_NS = 2_000_000_000
@@ -46,33 +44,7 @@ _LEFT_OUT = {'no_fix': 'without a fix', 'undecodable': 'that cannot be decoded',
              'ahead': 'far ahead of the IMU'}
 
 
-def fault_of_fix(fix: Fix) -> str:
-    """Return what a fix that cannot be used is counted as: ``no_fix``, ``nan``, or ''."""
-    fix = with_an_altitude(fix)
-    position = fix.latitude_deg, fix.longitude_deg, fix.altitude_m
-    if fix.status == NO_FIX or position[:2] == (0.0, 0.0):
-        return 'no_fix'
-    return '' if (all(map(math.isfinite, position)) and abs(fix.latitude_deg) <= 90.0
-                  and abs(fix.longitude_deg) <= 360.0
-                  and abs(fix.altitude_m) < MAX_ALTITUDE) else 'nan'
-
-
-def with_an_altitude(fix: Fix) -> Fix:
-    """Return a fix whose altitude is 0, and not measured, where it is nan: in a 2D fix."""
-    return fix._replace(altitude_m=0.0, vertical=False) if math.isnan(fix.altitude_m) else fix
-
-
-def usable_velocity(velocity: Velocity) -> Velocity | None:
-    """Return what can be used of a velocity, without its vertical where that is nan."""
-    east, north, up = velocity.velocity.tolist()
-    if math.isnan(up):
-        up = 0.0
-        velocity = velocity._replace(velocity=np.array([east, north, up]), vertical=False)
-    return velocity if all(abs(value) < MAX_SPEED for value in (east, north, up)) else None
-
-
-@dataclass
-class GnssEpoch:
+class GnssEpoch(NamedTuple):
     """What the receiver said at one stamp."""
 
     stamp_ns: int
@@ -83,18 +55,6 @@ class GnssEpoch:
     def is_half(self) -> bool:
         """Whether there is a fix or a velocity alone."""
         return (self.fix is None) != (self.velocity is None)
-
-    def with_other_half(self, other: 'GnssEpoch') -> 'GnssEpoch | None':
-        """Join a fix and a velocity at the velocity's stamp; None if that is not what they are."""
-        fix, velocity = self.fix or other.fix, self.velocity or other.velocity
-        if fix is None or velocity is None or not (self.is_half and other.is_half):
-            return None
-        latitude, longitude, altitude = carried(
-            (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg), fix.altitude_m),
-            velocity.velocity, (velocity.stamp_ns - fix.stamp_ns) * 1e-9)
-        return GnssEpoch(velocity.stamp_ns, fix._replace(
-            stamp_ns=velocity.stamp_ns, latitude_deg=math.degrees(latitude),
-            longitude_deg=math.degrees(longitude), altitude_m=altitude), velocity)
 
 
 class GnssBuffer:
@@ -112,12 +72,6 @@ class GnssBuffer:
     pair_ns : int
         A fix and a velocity that are no further apart are of one epoch; 0: where the stamp is one.
 
-    Attributes
-    ----------
-    off_ns : dict
-        Of ``fix_late``, ``fix_ahead``, ``velocity_late``, ``velocity_ahead``: how far from the
-        newest IMU sample the last one was.
-
     """
 
     def __init__(self, lateness_ns: int, counts: Counter[str], pair_ns: int = 0) -> None:
@@ -129,7 +83,8 @@ class GnssBuffer:
         self._said: tuple[float, ...] = ()          # position and velocity, released last
         self._fix_ns = -(1 << 62)                   # the last fix that was released
         self._no_fix_ns: deque[int] = deque(maxlen=MAX_PENDING)
-        self.off_ns: dict[str, int] = {}
+        # How far from the newest IMU sample the last one was that is counted by a name.
+        self._off_ns: dict[str, int] = {}
 
     def add_fix(self, fix: Fix, imu_newest_ns: int | None) -> None:
         """Take a position, or count why not."""
@@ -157,11 +112,21 @@ class GnssBuffer:
 
     def _put(self, kind: str, message: Fix | Velocity, imu_newest_ns: int | None) -> None:
         """Put a fix or a velocity into the epoch of its stamp; of two the first counts."""
-        epoch = self._epoch(message.stamp_ns, imu_newest_ns, kind)
-        if epoch is not None and getattr(epoch, kind) is None:
-            setattr(epoch, kind, message)
-        elif epoch is not None:
+        stamp_ns = message.stamp_ns
+        off = self._off(stamp_ns, imu_newest_ns)
+        if imu_newest_ns is not None and off:
+            self._counts[f'{kind}_{off}'] += 1
+            self._off_ns[f'{kind}_{off}'] = abs(stamp_ns - imu_newest_ns)
+            return
+        if len(self._pending) >= MAX_PENDING:
+            del self._pending[min(self._pending)]
+            self._counts['gnss_overflow'] += 1
+        epoch = self._pending.get(stamp_ns, GnssEpoch(stamp_ns))
+        if getattr(epoch, kind) is not None:
             self._counts[f'{kind}_duplicate'] += 1
+        else:
+            self._pending[stamp_ns] = (epoch._replace(fix=message) if isinstance(message, Fix)
+                                       else epoch._replace(velocity=message))
 
     def _off(self, stamp_ns: int, imu_newest_ns: int | None) -> str:
         """Return how a stamp is too far from the IMU to be used: ``late``, ``ahead`` or ''."""
@@ -170,20 +135,6 @@ class GnssBuffer:
         if stamp_ns < imu_newest_ns - self._lateness_ns:
             return 'late'
         return 'ahead' if stamp_ns > imu_newest_ns + MAX_AHEAD_NS else ''
-
-    def _epoch(self, stamp_ns: int, imu_newest_ns: int | None, kind: str) -> GnssEpoch | None:
-        """Return the pending epoch of a stamp; None and a count when it cannot be used."""
-        off = self._off(stamp_ns, imu_newest_ns)
-        if imu_newest_ns is not None and off:
-            reason = f'{kind}_{off}'
-            self._counts[reason] += 1
-            self.off_ns[reason] = abs(stamp_ns - imu_newest_ns)
-            return None
-        if len(self._pending) >= MAX_PENDING:
-            oldest = min(self._pending)
-            del self._pending[oldest]
-            self._counts['gnss_overflow'] += 1
-        return self._pending.setdefault(stamp_ns, GnssEpoch(stamp_ns))
 
     def left_out(self, kind: str, before: Counter[str]) -> str:
         """
@@ -195,7 +146,7 @@ class GnssBuffer:
         for ending, why in _LEFT_OUT.items():
             name = f'{kind}_{ending}'
             if count := self._counts[name] - before[name]:
-                off_ns = self.off_ns.get(name)
+                off_ns = self._off_ns.get(name)
                 off = '' if off_ns is None else f' (the last one by {off_ns * 1e-9:.1f} s)'
                 parts.append(f'{count} {why}{off}')
         return ', '.join(parts)
@@ -216,24 +167,24 @@ class GnssBuffer:
         released = []
         place = 0
         while place < len(stamps) and stamps[place] <= upto_ns:
-            epoch = self._pending[stamps[place]]
-            close = next((self._pending[stamp] for stamp in stamps[place + 1:place + 2]
-                          if stamp <= epoch.stamp_ns + self._pair_ns), None)
-            joint = None if close is None else epoch.with_other_half(close)
-            half_may_come = (epoch.is_half and close is None and not last
-                             and epoch.stamp_ns + self._pair_ns > upto_ns)
-            if half_may_come or (joint is not None and joint.stamp_ns > upto_ns):
+            paired_upto_ns = stamps[place] + self._pair_ns
+            first, *close = (self._pending[stamp] for stamp in stamps[place:place + 2]
+                             if stamp <= paired_upto_ns)
+            epoch = _joined(first, *close)
+            half_may_come = first.is_half and not close and not last and paired_upto_ns > upto_ns
+            if half_may_come or epoch.stamp_ns > upto_ns:
                 break
-            parts = [epoch] if close is None or joint is None else [epoch, close]
+            parts = [first] if epoch is first else [first, *close]
             place += len(parts)
-            if any(part.fix for part in parts):
-                self._fix_ns = epoch.stamp_ns
-            if self._repeats(parts):
+            fix = parts[0].fix or parts[-1].fix
+            if fix is not None:
+                self._fix_ns = first.stamp_ns
+            if self._repeats(fix, epoch.velocity):
                 self._counts['gnss_repeated'] += 1
-            elif self._is_without_fix(joint or epoch):
+            elif self._is_without_fix(epoch):
                 self._counts['velocity_no_fix'] += 1
             else:
-                released.append(joint or epoch)
+                released.append(epoch)
         for stamp in stamps[:place]:
             del self._pending[stamp]
         if self._no_fix_ns:
@@ -252,17 +203,30 @@ class GnssBuffer:
         return (epoch.fix is None and said_ns > self._fix_ns
                 and epoch.stamp_ns - said_ns <= NO_FIX_NS)
 
-    def _repeats(self, parts: list[GnssEpoch]) -> bool:
+    def _repeats(self, fix: Fix | None, velocity: Velocity | None) -> bool:
         """
         Whether an epoch says to the last bit what the one before said, and that it moves.
 
         No receiver measures that: a driver sends its last message again.
         """
-        fix = next((part.fix for part in parts if part.fix), None)
-        velocity = next((part.velocity for part in parts if part.velocity), None)
         before, self._said = self._said, ()
         if fix is not None and velocity is not None:
             v_n = velocity.velocity.tolist()
             if any(v_n):
                 self._said = fix.latitude_deg, fix.longitude_deg, fix.altitude_m, *v_n
         return bool(self._said) and self._said == before
+
+
+def _joined(first: GnssEpoch, close: GnssEpoch | None = None) -> GnssEpoch:
+    """Return a fix and a velocity as one epoch at the velocity's stamp, or else the first."""
+    if close is None or not (first.is_half and close.is_half):
+        return first
+    fix, velocity = first.fix or close.fix, first.velocity or close.velocity
+    if fix is None or velocity is None:
+        return first
+    latitude, longitude, altitude = dead_reckon(
+        (math.radians(fix.latitude_deg), math.radians(fix.longitude_deg), fix.altitude_m),
+        velocity.velocity, (velocity.stamp_ns - fix.stamp_ns) * 1e-9)
+    return GnssEpoch(velocity.stamp_ns, fix._replace(
+        stamp_ns=velocity.stamp_ns, latitude_deg=math.degrees(latitude),
+        longitude_deg=math.degrees(longitude), altitude_m=altitude), velocity)

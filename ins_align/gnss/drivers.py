@@ -118,15 +118,8 @@ def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velo
     """
     Convert a message of one of RECEIVERS.
 
-    Parameters
-    ----------
-    msg : object
-        With the fields of the ROS message.
-    msgtype : str
-        Key of RECEIVERS.
-    config : Config
-        Standard deviations that are not stated; its velocity_frame is not for these messages,
-        which say what axes they have.
+    `config` has the standard deviations that are not stated; its velocity_frame is not for these
+    messages, which say what axes they have.
 
     Raises
     ------
@@ -164,11 +157,7 @@ def imu_from_driver(msg: Any, msgtype: str) -> tuple[int, np.ndarray, np.ndarray
     """
     Convert a message of one of INERTIAL_UNITS like `messages.imu_from_msg`.
 
-    Raises
-    ------
-    MessageError
-        If a field is missing.
-
+    A field that is missing is a MessageError.
     """
     row = INERTIAL_UNITS[msgtype]
     try:

@@ -11,14 +11,22 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""ROS messages to arrays: works on anything with the fields of the ROS message."""
+"""
+ROS messages as numbers, what of them can be used, and the epochs that a method takes.
+
+Works on anything with the fields of the ROS message.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
 import re
 from typing import Any, NamedTuple
 
 from ins_align.config import Config
+from ins_align.geometry.rotation import Array
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -35,6 +43,9 @@ _BODY_FRAME = re.compile(r'(?:^|[_\-/.])(?:base|body|chassis|footprint|imu|ins|v
 # brought between a tenth of a millimetre and a kilometre, or matrices of it have no inverse.
 SMALLEST_VARIANCE = 1e-12
 MIN_VARIANCE, MAX_VARIANCE = 1e-8, 1e6
+# Beyond these no receiver measures; such values would overflow the integrals (m/s, m).
+MAX_SPEED, MAX_ALTITUDE = 2000.0, 1e6
+NO_FIX = -1  # status
 
 
 class MessageError(ValueError):
@@ -62,6 +73,86 @@ class Velocity(NamedTuple):
     vertical: bool = True  # whether it is measured
 
 
+@dataclass(frozen=True)
+class AntennaEpoch:
+    """
+    Where the antenna is and how it moves at a GNSS epoch, as a method takes it.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    latitude, longitude, altitude : float
+        Of the antenna, radians and metres; always there.
+    v_n : ndarray, shape (3,), or None
+        Antenna velocity, ENU, m/s.
+    velocity_covariance, position_covariance : ndarray, shape (3, 3)
+        ENU.
+    position_measured : bool
+        Whether the position is a measurement to align with.
+    gravity_drift : float
+        Noise density of gravity because the place is not known, m/s/sqrt(s).
+    fault : str
+        Fault of the velocities up to here, in words; '' when none is known.
+    dry : bool
+        Whether there is no GNSS message at all: an epoch that divides an outage.
+    stated : (bool, bool)
+        Whether the receiver states the noise of the velocity and of the position.
+
+    """
+
+    stamp_ns: int
+    latitude: float
+    longitude: float
+    altitude: float
+    v_n: Array | None
+    velocity_covariance: Array
+    position_measured: bool
+    position_covariance: Array
+    gravity_drift: float = 0.0
+    fault: str = ''
+    dry: bool = False
+    stated: tuple[bool, bool] = (True, True)
+
+
+def velocities_of(epochs: Sequence[AntennaEpoch]) -> Array:
+    """Return the velocities of K epochs, shape (K, 3), zero where there is none."""
+    return np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n for epoch in epochs])
+
+
+def fault_of_fix(fix: Fix) -> str:
+    """Return what a fix that cannot be used is counted as: ``no_fix``, ``nan``, or ''."""
+    fix = with_an_altitude(fix)
+    position = fix.latitude_deg, fix.longitude_deg, fix.altitude_m
+    if fix.status == NO_FIX or position[:2] == (0.0, 0.0):
+        return 'no_fix'
+    return '' if (all(map(math.isfinite, position)) and abs(fix.latitude_deg) <= 90.0
+                  and abs(fix.longitude_deg) <= 360.0
+                  and abs(fix.altitude_m) < MAX_ALTITUDE) else 'nan'
+
+
+def with_an_altitude(fix: Fix) -> Fix:
+    """Return a fix whose altitude is 0, and not measured, where it is nan: in a 2D fix."""
+    return fix._replace(altitude_m=0.0, vertical=False) if math.isnan(fix.altitude_m) else fix
+
+
+def usable_velocity(velocity: Velocity) -> Velocity | None:
+    """Return what can be used of a velocity, without its vertical where that is nan."""
+    east, north, up = velocity.velocity.tolist()
+    if math.isnan(up):
+        up = 0.0
+        velocity = velocity._replace(velocity=np.array([east, north, up]), vertical=False)
+    return velocity if all(abs(value) < MAX_SPEED for value in (east, north, up)) else None
+
+
+def numbers_of(message: Fix | Velocity) -> tuple[list[float], str]:
+    """Return a position or velocity, its vertical 0 where that is nan, and why it is useless."""
+    if isinstance(message, Velocity):
+        usable = usable_velocity(message)
+        return (usable or message).velocity.tolist(), '' if usable else 'nan'
+    fix = with_an_altitude(message)
+    return [fix.latitude_deg, fix.longitude_deg, fix.altitude_m], fault_of_fix(fix)
+
+
 def stamp_from_msg(msg: Any) -> int:
     """Return the header's stamp in nanoseconds."""
     stamp = msg.header.stamp
@@ -69,18 +160,7 @@ def stamp_from_msg(msg: Any) -> int:
 
 
 def imu_from_msg(msg: Any) -> tuple[int, np.ndarray, np.ndarray]:
-    """
-    Convert sensor_msgs/Imu; its orientation is not looked at.
-
-    Returns
-    -------
-    stamp_ns : int
-    gyro : ndarray, shape (3,)
-        Angular rate, rad/s.
-    accel : ndarray, shape (3,)
-        Specific force, m/s^2.
-
-    """
+    """Return stamp, ns, angular rate, rad/s, and specific force, m/s^2, of sensor_msgs/Imu."""
     rate, force = msg.angular_velocity, msg.linear_acceleration
     return (stamp_from_msg(msg), np.array([rate.x, rate.y, rate.z]),
             np.array([force.x, force.y, force.z]))
@@ -88,9 +168,16 @@ def imu_from_msg(msg: Any) -> tuple[int, np.ndarray, np.ndarray]:
 
 def fix_from_msg(msg: Any) -> Fix:
     """Convert sensor_msgs/NavSatFix; a covariance of unknown type or without sense is None."""
-    return fixes([stamp_from_msg(msg)], [[msg.latitude, msg.longitude, msg.altitude]],
-                 np.array(msg.position_covariance, float).reshape(1, 3, 3),
-                 [msg.position_covariance_type], [msg.status.status])[0]
+    return fixes_from_msgs([msg])[0]
+
+
+def fixes_from_msgs(msgs: Sequence[Any]) -> list[Fix]:
+    """Convert many messages like `fix_from_msg`."""
+    return fixes([stamp_from_msg(msg) for msg in msgs],
+                 [[msg.latitude, msg.longitude, msg.altitude] for msg in msgs],
+                 np.array([msg.position_covariance for msg in msgs], float).reshape(-1, 3, 3),
+                 [msg.position_covariance_type for msg in msgs],
+                 [msg.status.status for msg in msgs])
 
 
 def fixes(stamps_ns: ArrayLike, places: ArrayLike, covariances: np.ndarray,
@@ -125,19 +212,28 @@ def velocity_from_msg(msg: Any, config: Config) -> Velocity:
         If the message says that the velocity is given in a body frame.
 
     """
-    covariance = None
-    frame = msg.header.frame_id
-    if config.velocity_type == 'TwistStamped':
-        linear = msg.twist.linear
-    elif config.velocity_type == 'Vector3Stamped':
-        linear = msg.vector
+    return velocities_from_msgs([msg], config)[0]
+
+
+def velocities_from_msgs(msgs: Sequence[Any], config: Config) -> list[Velocity]:
+    """Convert many messages of the same `frame_of_velocity` like `velocity_from_msg`."""
+    covariances = None
+    if config.velocity_type == 'Vector3Stamped':
+        linear = [msg.vector for msg in msgs]
+    elif config.velocity_type == 'TwistStamped':
+        linear = [msg.twist.linear for msg in msgs]
     else:
-        linear = msg.twist.twist.linear
-        covariance = np.array(msg.twist.covariance, dtype=float).reshape(1, 6, 6)
-        if config.velocity_type == 'Odometry':
-            frame = msg.child_frame_id  # the frame of nav_msgs/Odometry's twist
-    return velocities([stamp_from_msg(msg)], frame, [[linear.x, linear.y, linear.z]], covariance,
-                      config)[0]
+        linear = [msg.twist.twist.linear for msg in msgs]
+        covariances = np.array([msg.twist.covariance for msg in msgs], float).reshape(-1, 6, 6)
+    return velocities([stamp_from_msg(msg) for msg in msgs],
+                      frame_of_velocity(msgs[0], config.velocity_type),
+                      [[each.x, each.y, each.z] for each in linear], covariances, config)
+
+
+def frame_of_velocity(msg: Any, velocity_type: str) -> str:
+    """Return the frame that a message says its velocity is in."""
+    frame: str = msg.child_frame_id if velocity_type == 'Odometry' else msg.header.frame_id
+    return frame
 
 
 def is_body_frame(frame: str) -> bool:
@@ -197,13 +293,8 @@ def _usable_covariances(covariances: np.ndarray, default_std: tuple[float, float
     """
     Return symmetric positive definite (3, 3) covariances, None where nothing is known.
 
-    Parameters
-    ----------
-    covariances : ndarray, shape (N, 3, 3)
-        As sent, with whatever drivers put in for "unknown".
-    default_std : three floats or None
-        Stands in for single unknown variances; None: one unknown variance makes all unknown.
-
+    Of covariances as sent, with whatever drivers put in for "unknown". `default_std` stands in
+    for single unknown variances; None: one unknown variance makes all unknown.
     """
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     known = (variances >= SMALLEST_VARIANCE) & (variances < np.inf)

@@ -144,11 +144,7 @@ def velocity_frame(velocities: Series, positions: Series) -> VelocityFrame:
     """
     Compare velocities, taken as ENU, m/s, with the change of position, ENU, m.
 
-    Returns
-    -------
-    VelocityFrame
-        Its frame is 'unknown' where the vehicle moved less than MIN_WINDOWS distances.
-
+    The frame is 'unknown' where the vehicle moved less than MIN_WINDOWS distances.
     """
     moved, travelled = _distances(velocities, positions)
     count = moved.shape[0]
@@ -176,16 +172,7 @@ def find_manoeuvres(velocities: Series) -> Manoeuvres | None:
     """
     Find changes of the horizontal velocity, which are what shows a heading.
 
-    Parameters
-    ----------
-    velocities : Series
-        As from `on_grid` or `velocity_from_positions`.
-
-    Returns
-    -------
-    Manoeuvres or None
-        None: there are too few velocities.
-
+    Of velocities as from `on_grid` or `velocity_from_positions`; None where there are too few.
     """
     times, v = velocities.times, velocities.vectors[:, :2]
     if times.size < 2:

@@ -16,8 +16,9 @@
 from collections import Counter
 
 from ins_align.geometry.rotation import Array, Index
-from ins_align.imu.plausibility import IMU_BEFORE, without_spikes
+from ins_align.imu.noise import IMU_BEFORE, without_spikes
 import numpy as np
+from numpy.typing import ArrayLike
 
 # Beyond these no sensor measures; such values would overflow the integrals (rad/s, m/s^2).
 MAX_RATE, MAX_ACCELERATION = 200.0, 2000.0
@@ -48,6 +49,20 @@ class ImuBuffer:
         Where samples are counted: ``imu``, ``imu_nan``, ``imu_duplicate``, ``imu_out_of_order``,
         ``imu_late``, ``imu_ahead``.
 
+    Attributes
+    ----------
+    stamps : ndarray of int, shape (N,)
+        Of what is sorted, strictly increasing, ns.
+    samples : ndarray, shape (N, 6)
+        Angular rate, rad/s, and specific force, m/s^2; in Fortran order, so that each axis is
+        contiguous in memory.
+    newest_ns : int or None
+        The newest stamp that has come.
+    used_ns : int
+        Up to here samples are used: what comes later and is older is late.
+    jumped_to_ns : int or None
+        Where the clock has jumped back to.
+
     """
 
     def __init__(self, lateness_ns: int, counts: Counter[str]) -> None:
@@ -56,11 +71,9 @@ class ImuBuffer:
         self._reach_ns = max(lateness_ns, MAX_GAP_NS)
         self._counts = counts
         self.stamps = np.zeros(0, np.int64)
-        # In Fortran order, so that each axis of a sensor is contiguous in memory.
         self.samples = np.zeros((0, 6), order='F')
-        self._new_stamps: list[int] = []
-        self._new_samples: list[tuple[float, ...]] = []
-        self._new_arrays: list[tuple[np.ndarray, Array, Array]] = []
+        # What is not sorted into these yet: stamps and samples, of one sample or of many.
+        self._new: list[tuple[ArrayLike, ArrayLike]] = []
         self.newest_ns: int | None = None
         self.used_ns = -(1 << 62)
         self._suspect_ns: int | None = None
@@ -96,8 +109,7 @@ class ImuBuffer:
             if self._set_back(stamp_ns):
                 self.jumped_to_ns = stamp_ns
                 return
-        self._new_stamps.append(stamp_ns)
-        self._new_samples.append((*gyro, *accel))
+        self._new.append(((stamp_ns,), ((*gyro, *accel),)))
 
     def add_many(self, stamps_ns: np.ndarray, gyro: Array, accel: Array) -> int:
         """
@@ -122,8 +134,7 @@ class ImuBuffer:
                     return k
             return int(stamps_ns.size)
         self._suspect_ns = None
-        self._flatten()
-        self._new_arrays.append((np.asarray(stamps_ns, np.int64), gyro, accel))
+        self._new.append((stamps_ns, np.hstack([gyro, accel])))
         self.newest_ns = int(stamps_ns[-1])
         return int(stamps_ns.size)
 
@@ -150,14 +161,6 @@ class ImuBuffer:
         inside = np.searchsorted(self.stamps, stamp_ns) - np.searchsorted(self.stamps, first)
         return bool(inside > 1.5 * number)
 
-    def _flatten(self) -> None:
-        """Turn single samples into an array."""
-        if self._new_stamps:
-            samples = np.array(self._new_samples, float)
-            self._new_arrays.append((np.array(self._new_stamps, np.int64), samples[:, :3],
-                                     samples[:, 3:]))
-            self._new_stamps, self._new_samples = [], []
-
     def consolidate(self, last: bool = False) -> None:
         """
         Sort what is new into the arrays, without what is broken, late or there twice.
@@ -167,12 +170,11 @@ class ImuBuffer:
         if last and self._ahead is not None:
             self._counts['imu_ahead'] += 1
             self._ahead = None
-        self._flatten()
-        if not self._new_arrays:
+        if not self._new:
             return
-        stamps, gyro, accel = map(np.concatenate, zip(*self._new_arrays))
-        samples = np.concatenate([gyro.T, accel.T])
-        self._new_arrays = []
+        new, self._new = self._new, []
+        stamps = np.concatenate([stamps for stamps, _ in new])
+        samples = np.asfortranarray(np.concatenate([samples for _, samples in new])).T
         self._counts['imu'] += stamps.size
         with np.errstate(invalid='ignore'):
             good = np.all(np.abs(samples) < _LIMITS, axis=0)
@@ -218,16 +220,9 @@ class ImuBuffer:
 
     def rates_since(self, stamp_ns: int) -> tuple[Index, Array, Array] | None:
         """
-        Return the angular rates after a stamp, without spikes; None where there is a gap.
+        Return the angular rates after a stamp, rad/s, without spikes; None where there is a gap.
 
-        Returns
-        -------
-        stamps : ndarray of int, shape (N,)
-        rates : ndarray, shape (N, 3)
-            rad/s.
-        rate : ndarray, shape (3,)
-            Interpolated at `stamp_ns`.
-
+        Stamps, shape (N,), rates, (N, 3), and the rate at the stamp itself, (3,).
         """
         self.consolidate()
         first = int(np.searchsorted(self.stamps, stamp_ns, side='right'))

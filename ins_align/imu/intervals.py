@@ -24,19 +24,13 @@ class SensorErrors(NamedTuple):
     """
     Errors of gyros and accelerometers that stay: true = measured - matrix @ measured - bias.
 
-    Attributes
-    ----------
-    gyro_bias, accel_bias : ndarray, shape (3,) or (K, 3)
-        rad/s, m/s^2.
-    gyro_matrix, accel_matrix : ndarray, shape (3, 3) or (K, 3, 3)
-        Scale factor errors on the diagonal, misalignment beside it.
-
+    A matrix has scale factor errors on its diagonal and misalignments beside it.
     """
 
-    gyro_bias: Array
-    gyro_matrix: Array
-    accel_bias: Array
-    accel_matrix: Array
+    gyro_bias: Array        # (3,), rad/s
+    gyro_matrix: Array      # (3, 3)
+    accel_bias: Array       # (3,), m/s^2
+    accel_matrix: Array     # (3, 3)
 
     @staticmethod
     def none() -> 'SensorErrors':
@@ -45,15 +39,9 @@ class SensorErrors(NamedTuple):
 
     @staticmethod
     def of(vector: Array) -> 'SensorErrors':
-        """Return those that make up a vector, shape (..., 24), the matrices row by row."""
-        gyro, accel = vector[..., :12], vector[..., 12:]
-        square = vector.shape[:-1] + (3, 3)
-        return SensorErrors(gyro[..., :3], gyro[..., 3:].reshape(square),
-                            accel[..., :3], accel[..., 3:].reshape(square))
-
-    def vector(self) -> Array:
-        """Return all of them, shape (24,): those of the gyros first, bias before matrix."""
-        return np.concatenate([array.ravel() for array in self])
+        """Return those that make up a vector, shape (24,), the matrices row by row."""
+        return SensorErrors(vector[:3], vector[3:12].reshape(3, 3), vector[12:15],
+                            vector[15:].reshape(3, 3))
 
 
 @dataclass(frozen=True)
@@ -71,8 +59,8 @@ class Intervals:
         Integral and double integral of the specific force, m/s and m.
     J_Rg, J_vg, J_pg, J_va, J_pa : ndarray, shape (K, 3, 12)
         Derivatives to bias and matrix of the gyros (g) and of the accelerometers (a), in the order
-        of `SensorErrors.vector`: of the rotation as a left error (``R <- exp_so3(J_Rg d) R``), of
-        v, of p.
+        of `SensorErrors.of`: of the rotation as a left error (``R <- exp_so3(J_Rg d) R``), of v,
+        of p.
     Q : ndarray, shape (K, 9, 9)
         Covariance of the errors (rotation at the start, v, p) that the sensors' noise leaves.
     Q_excess : ndarray, shape (K, 9, 9)
@@ -113,14 +101,9 @@ class Intervals:
         """
         Return what the intervals would be with the signs of sensors changed, leading axes (K, M).
 
-        To second order in the rotation over an interval, with rate and force steady in it: good
-        for telling the signs apart.
-
-        Parameters
-        ----------
-        signs : ndarray, shape (M, 4)
-            +1 or -1: of the gyros x, y, z and of the accelerometers.
-
+        `signs`, shape (M, 4), are those of the gyros x, y, z and of the accelerometers. To second
+        order in the rotation over an interval, with rate and force steady in it: good for telling
+        the signs apart.
         """
         gyro, accel = signs[:, :3], signs[:, 3:]
         wider = {name: array[:, None] for name, array in vars(self).items()}

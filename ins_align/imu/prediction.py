@@ -42,11 +42,8 @@ class Prediction:
     Parameters
     ----------
     stamp_ns : int
-        Of the epoch.
-    C_nb : ndarray, shape (3, 3)
-        Body to ENU at the epoch.
-    covariance : ndarray, shape (3, 3)
-        Of the small rotation about the axes of ENU at the epoch, rad^2.
+    C_nb, covariance : ndarray, shape (3, 3)
+        Body to ENU at the epoch, and its small rotation about the axes of ENU, rad^2.
     gyro_bias, gyro_matrix : array_like, shape (3,) and (3, 3)
         The rate is ``measured - gyro_matrix @ measured - gyro_bias``, rad/s.
     angle_random_walk : float
@@ -83,21 +80,9 @@ class Prediction:
 
     def carry(self, stamp_ns: int, gyro: Sequence[float]) -> bool:
         """
-        Carry on to one sample, with the mean of its rate and that of the last one.
+        Carry on to one sample (rad/s), with the mean of its rate and that of the last one.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            Of the sample.
-        gyro : three floats
-            As measured, rad/s.
-
-        Returns
-        -------
-        bool
-            Whether the attitude is now that at the sample. It is not when the sample is old or
-            broken.
-
+        Return whether the attitude is now that at the sample: not when it is old or broken.
         """
         x, y, z = gyro
         if stamp_ns <= self.stamp_ns or not (

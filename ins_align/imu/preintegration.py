@@ -19,12 +19,12 @@ samples both are taken as cubics in time; a GNSS stamp inside a step splits it t
 of an interval, and all intervals of a batch, are handled as arrays.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from ins_align.geometry.rotation import (
     Array, cross, cumulative_rotations, exp_and_left_jacobian, Index, orthonormalized, product,
     skew)
-from ins_align.imu.intervals import Intervals, SensorErrors
+from ins_align.imu.intervals import Intervals
 from ins_align.imu.recent import Recent
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,50 +35,26 @@ UNEVEN = 0.1
 DERIVATIVE_STEPS = 4
 
 
-@dataclass(frozen=True)
-class Noise:
-    """
-    White noise of the sensors in each step, shape () or (K, n).
+class Noise(NamedTuple):
+    """White noise of the sensors in each step, shape () or (K, n), rad/sqrt(s), m/s/sqrt(s)."""
 
-    Attributes
-    ----------
-    angle_random_walk, velocity_random_walk : array_like
-        rad/sqrt(s) and m/s/sqrt(s), as stated.
-    gyro_excess, accel_excess : array_like
-        What was measured beyond that, in the same units.
-
-    """
-
-    angle_random_walk: ArrayLike = 0.0
+    angle_random_walk: ArrayLike = 0.0      # as stated
     velocity_random_walk: ArrayLike = 0.0
-    gyro_excess: ArrayLike = 0.0
+    gyro_excess: ArrayLike = 0.0            # as measured beyond that
     accel_excess: ArrayLike = 0.0
 
 
-@dataclass(frozen=True)
-class Steps:
-    """
-    IMU samples cut into K intervals of n steps, and their derivatives to time.
+class Steps(NamedTuple):
+    """IMU samples cut into K intervals of n steps, and their derivatives to time."""
 
-    Attributes
-    ----------
-    dt : ndarray, shape (K, n)
-        Seconds; shorter intervals are padded with steps of zero length.
-    omega, f : ndarray, shape (K, n + 1, 3)
-        Angular rate, rad/s, and specific force, m/s^2, at the ends of the steps.
-    omega_dot, f_dot : ndarray, shape (K, n + 1, 3)
-
-    """
-
-    dt: Array
-    omega: Array
-    f: Array
+    dt: Array           # (K, n), s; shorter intervals are padded with steps of zero length
+    omega: Array        # (K, n + 1, 3), rad/s, at the ends of the steps
+    f: Array            # the same of the specific force, m/s^2
     omega_dot: Array
     f_dot: Array
 
 
-def split_at_epochs(stamps: 'Array | Index', gyro: Array, accel: Array,
-                    epochs: 'Array | Index', unit: float = 1.0) -> Steps:
+def split_at_epochs(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Steps:
     """
     Cut a run of samples into the intervals between epochs.
 
@@ -87,27 +63,21 @@ def split_at_epochs(stamps: 'Array | Index', gyro: Array, accel: Array,
 
     Parameters
     ----------
-    stamps : ndarray, shape (N,)
-        Sample times, strictly increasing, first <= epochs[0], last >= epochs[-1].
-    gyro, accel : ndarray, shape (N, 3)
-        Angular rate, rad/s; specific force, m/s^2.
-    epochs : ndarray, shape (K + 1,)
+    stamps_ns : ndarray of int, shape (N,)
+        Strictly increasing, first <= epochs_ns[0], last >= epochs_ns[-1].
+    samples : ndarray, shape (N, 6)
+        Angular rate, rad/s, and specific force, m/s^2.
+    epochs_ns : ndarray of int, shape (K + 1,)
         Increasing; two equal ones make an interval of no length.
-    unit : float
-        Of stamps and epochs, seconds. Integers of 1e-9 keep the result free of the origin of time.
-
-    Returns
-    -------
-    Steps
 
     """
-    samples = np.concatenate([gyro.T, accel.T])
-    slopes = _slopes(samples, np.diff(stamps) * unit)
+    samples = samples.T
+    slopes = _slopes(samples, np.diff(stamps_ns) * 1e-9)
     # Of the epochs. Values, then slopes; samples and epochs side by side to be picked from.
-    right = np.clip(np.searchsorted(stamps, epochs), 1, stamps.size - 1)
+    right = np.clip(np.searchsorted(stamps_ns, epochs_ns), 1, stamps_ns.size - 1)
     left = right - 1
-    h = (stamps[right] - stamps[left]) * unit
-    t = (epochs - stamps[left]) * unit / h
+    h = (stamps_ns[right] - stamps_ns[left]) * 1e-9
+    t = (epochs_ns - stamps_ns[left]) * 1e-9 / h
     rise = samples[:, right] - samples[:, left]
     bend0, bend1 = h * slopes[:, left] - rise, rise - h * slopes[:, right]
     value = samples[:, left] + t * rise + t * (1 - t) * ((1 - t) * bend0 + t * bend1)
@@ -116,14 +86,14 @@ def split_at_epochs(stamps: 'Array | Index', gyro: Array, accel: Array,
     known = np.concatenate([np.concatenate([samples, value], axis=1),
                             np.concatenate([slopes, slope], axis=1)])
     # Knots are the start of an interval, the samples inside it, and its end as often as it takes.
-    first = np.searchsorted(stamps, epochs[:-1], side='right')
-    last = np.searchsorted(stamps, epochs[1:], side='left')
+    first = np.searchsorted(stamps_ns, epochs_ns[:-1], side='right')
+    last = np.searchsorted(stamps_ns, epochs_ns[1:], side='left')
     inner = first + np.arange(-1, max(int(np.max(last - first)), 0) + 1)[:, None]
-    end = stamps.size + np.arange(1, epochs.size)
+    end = stamps_ns.size + np.arange(1, epochs_ns.size)
     knots = np.where(inner < last, inner, end)
     knots[0] = end - 1
     omega, f, omega_dot, f_dot = known.take(knots, axis=1).reshape(4, 3, *knots.shape)
-    return Steps(np.diff(np.concatenate([stamps, epochs])[knots], axis=0).T * unit,
+    return Steps(np.diff(np.concatenate([stamps_ns, epochs_ns])[knots], axis=0).T * 1e-9,
                  omega.T, f.T, omega_dot.T, f_dot.T)
 
 
@@ -138,57 +108,9 @@ def _slopes(samples: Array, spacing: Array) -> Array:
     return np.concatenate([rise[:, :1], inner, rise[:, -1:]], axis=1)
 
 
-def white_noise(stamps: 'Array | Index', samples: Array, first: Index, last: Index,
-                unit: float = 1.0) -> Array:
+def preintegrate(steps: Steps, noise: Noise, recent: Recent) -> Intervals:
     """
-    White noise density of gyros and accelerometers, measured in K windows of the data.
-
-    Third divided differences take out everything that is quadratic over four samples, which
-    motion is, and leave what is new in each sample. Vibration counts as noise.
-
-    Parameters
-    ----------
-    stamps : ndarray, shape (N,)
-        Strictly increasing.
-    samples : ndarray, shape (N, 6)
-        Angular rate and specific force.
-    first, last : ndarray of int, shape (K,)
-        Each window's first sample and the one after its last.
-    unit : float
-        Of stamps, seconds.
-
-    Returns
-    -------
-    ndarray, shape (K, 2)
-        rad/sqrt(s) and m/s/sqrt(s), mean over the axes; 0 for fewer than eight samples.
-
-    """
-    count = last - first - 3
-    enough = count >= 5
-    if not np.any(enough):
-        return np.zeros((first.size, 2))
-    n = stamps.size - 3
-    # From each of four samples to the next ones.
-    one, two, three = ((stamps[k:] - stamps[:-k]) * unit for k in (1, 2, 3))
-    (a, b, c), (ab, bc) = ([spacing[i:i + n] for i in range(count)]
-                           for spacing, count in ((one, 3), (two, 2)))
-    weights = 1 / np.stack([-(a * ab * three), a * b * bc, -(ab * b * c), three * bc * c])
-    weights /= np.sqrt(np.sum(weights ** 2, axis=0))
-    left = np.zeros((6, n + 1))
-    for i in range(4):
-        left[:, :-1] += weights[i] * samples.T[:, i:i + n]
-    first, last, count = (np.where(enough, x, y) for x, y in ((first, 0), (last, n), (count, 1)))
-    sums = np.add.reduceat(np.square(left), np.stack([first, last - 3], axis=1).ravel(),
-                           axis=1)[:, ::2]
-    spacing = (stamps[last - 1] - stamps[first]) * unit / (last - first - 1)
-    density = np.sqrt(sums.T.reshape(-1, 2, 3).mean(axis=2) * (spacing / count)[:, None])
-    return np.where(enough[:, None], density, 0.0)
-
-
-def preintegrate(steps: Steps, sensors: SensorErrors, noise: Noise,
-                 recent: 'Recent | None' = None) -> Intervals:
-    """
-    Integrate the steps of K intervals.
+    Integrate the steps of K intervals as if the sensors had no errors.
 
     Angle and velocity increments come from the cubic through both ends of a step (trapezoid with
     end correction, whose noise telescopes); coning and sculling terms are of second order [1]_,
@@ -198,17 +120,10 @@ def preintegrate(steps: Steps, sensors: SensorErrors, noise: Noise,
     ----------
     steps : Steps
         The samples, cut at the epochs.
-    sensors : SensorErrors
-        Subtracted first.
     noise : Noise
         Of the sensors, in each step.
-    recent : Recent, optional
-        Motion before the end of each interval. Without it force and rate at the end are taken to
-        have lasted.
-
-    Returns
-    -------
-    Intervals
+    recent : Recent
+        Motion before the end of each interval.
 
     References
     ----------
@@ -219,10 +134,7 @@ def preintegrate(steps: Steps, sensors: SensorErrors, noise: Noise,
     """
     # In Fortran order, so that the components of vectors and matrices, which all that follows is
     # made of, are contiguous in memory.
-    dt, *measured, omega_dot, f_dot = map(np.asfortranarray, vars(steps).values())
-    omega, f = (values - _applied(matrix, values) - bias for values, matrix, bias in zip(
-        measured, (sensors.gyro_matrix, sensors.accel_matrix),
-        (sensors.gyro_bias, sensors.accel_bias)))
+    dt, omega, f, omega_dot, f_dot = map(np.asfortranarray, steps)
     omega0, omega1 = omega[:, :-1], omega[:, 1:]
     f0, f1 = f[:, :-1], f[:, 1:]
     h = dt[..., None]
@@ -251,43 +163,28 @@ def preintegrate(steps: Steps, sensors: SensorErrors, noise: Noise,
     duration = passed[:, -1]
     remaining = duration[:, None] - passed + 0.5 * dt       # from the middle of each step on
     derivatives = _derivatives(dt, product(A, h[..., None] * jacobian), u, *(
-        0.5 * (values[:, :-1] + values[:, 1:]) for values in measured))
+        0.5 * (values[:, :-1] + values[:, 1:]) for values in (omega, f)))
 
     v, p = v_end[:, -1], p_end[:, -1]
     v_rest = v[:, None] - v_mid
     p_rest = p[:, None] - (p_end - 0.5 * p_step) - v_mid * remaining[..., None]
     Q, Q_excess = _covariances(noise, dt, v_rest, p_rest, remaining)
-    # Intervals are chained for hours.
+    # Intervals are chained for hours, and taken one by one.
     R = orthonormalized(turned[:, -1])
-    if recent is None:
-        recent = Recent.steady(steps.f[:, -1], steps.omega[:, -1])
-    # Others take them one by one.
     return Intervals(*map(np.ascontiguousarray, (
-        duration, R, v, p, *derivatives, Q, Q_excess, steps.omega[:, -1], recent.gained,
-        recent.turned)))
+        duration, R, v, p, *derivatives, Q, Q_excess, omega[:, -1], *recent)))
 
 
 def _covariances(noise: Noise, dt: Array, v_rest: Array, p_rest: Array,
                  remaining: Array) -> tuple[Array, Array]:
     """Return covariances of the errors at the end from what is stated and from what is beyond."""
-    if not any(np.any(density) for density in vars(noise).values()):
-        return (np.zeros((dt.shape[0], 9, 9)),) * 2
-    gyro_noise = _of_gyros(dt, v_rest, p_rest)
-    accel_noise = _of_accelerometers(dt, dt, remaining)
-
     def covariance(gyro: ArrayLike, accel: ArrayLike) -> Array:
-        """Of the errors at the end, from densities in each step."""
-        gyro_least, gyro_more = _least_and_more(gyro, dt)
-        accel_least, accel_more = _least_and_more(accel, dt)
-        total = gyro_least * gyro_noise + accel_least * accel_noise
-        if gyro_more.any():
-            total += _of_gyros(gyro_more * dt, v_rest, p_rest)
-        if accel_more.any():
-            total += _of_accelerometers(accel_more * dt, dt, remaining)
-        return total
+        if not (np.any(gyro) or np.any(accel)):
+            return np.zeros((dt.shape[0], 9, 9))
+        return (_of_gyros(np.square(gyro) * dt, v_rest, p_rest)
+                + _of_accelerometers(np.square(accel) * dt, dt, remaining))
 
-    return (covariance(noise.angle_random_walk, noise.velocity_random_walk),
-            covariance(noise.gyro_excess, noise.accel_excess))
+    return covariance(*noise[:2]), covariance(*noise[2:])
 
 
 def _applied(matrix: Array, vectors: Array) -> Array:
@@ -305,28 +202,12 @@ def _total(values: Array) -> Array:
 def _derivatives(dt: Array, turns: Array, u: Array, rate: Array,
                  force: Array) -> tuple[Array, Array, Array, Array, Array]:
     """
-    Derive rotation, v and p by the errors of the gyros, v and p by those of the accelerometers.
+    Return J_Rg, J_vg, J_pg, J_va, J_pa of `Intervals`.
 
-    A gyro bias turns the rest of the interval by minus the integral of the attitude; an entry of
-    a matrix is a bias in proportion to a rate or force. A few steps are taken as one: what the
-    motion does within them is of second order in something that is small.
-
-    Parameters
-    ----------
-    dt : ndarray, shape (K, n)
-        Seconds of the steps.
-    turns : ndarray, shape (K, n, 3, 3)
-        Integral of the attitude over each step.
-    u : ndarray, shape (K, n, 3)
-        Velocity gained in it.
-    rate, force : ndarray, shape (K, n, 3)
-        As measured.
-
-    Returns
-    -------
-    J_Rg, J_vg, J_pg, J_va, J_pa : ndarray, shape (K, 3, 12)
-        As in `Intervals`.
-
+    A gyro bias turns the rest of the interval by minus the integral of the attitude (`turns`, of
+    each step); an entry of a matrix is a bias in proportion to a rate or force. A few steps are
+    taken as one: what the motion does within them is of second order in something that is small.
+    `u` is the velocity gained in each step.
     """
     def together(values: Array) -> Array:
         sums = values[:, ::DERIVATIVE_STEPS].copy(order='K')
@@ -353,17 +234,6 @@ def _derivatives(dt: Array, turns: Array, u: Array, rate: Array,
     remaining = (passed[:, -1:] - passed + 0.5 * seconds)[..., None, None]
     return (-turned_by[:, -1], _total(pushes), _total(remaining * pushes),
             -_total(by_accelerometers), -_total(remaining * by_accelerometers))
-
-
-def _least_and_more(density: ArrayLike, dt: Array) -> tuple[Array, Array]:
-    """
-    Square of a density, () or (K, n): the least of each interval, (K, 1, 1), and the rest.
-
-    Steps that only fill up an interval have no say: there are as many as the longest one needs.
-    """
-    squares = np.square(density)
-    least = np.where(dt > 0, squares, squares.max(initial=0.0)).min(axis=1, keepdims=True)
-    return least[..., None], squares - least
 
 
 def _of_gyros(variance: Array, v_rest: Array, p_rest: Array) -> Array:

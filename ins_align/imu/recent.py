@@ -19,8 +19,8 @@ What the specific force has added to the velocity since, and the rates to the ro
 the epoch back to that moment. They are kept at a ladder of ages that follows a walker's steps.
 """
 
-from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 from ins_align.geometry.rotation import Array, cross, Index, rotated
 import numpy as np
@@ -30,39 +30,20 @@ RUNG, RUNGS = 0.025, 40
 # Between samples so far apart (s) nobody knows how the vehicle has moved.
 SILENCE = 0.3
 AGES = RUNG * np.arange(1, RUNGS + 1)
-# Steps of all epochs, each as many as the one with most, that are looked at in one go.
-MAX_STEPS = 65536
 # So many rungs apart force and rate are calm of vibration.
 SMOOTH = 2
 # Coefficients of the cubics that are 1 at one of the places 0, 1, 2, 3 and 0 at the others.
 CUBIC = np.linalg.inv(np.vander(np.arange(4.0), increasing=True))
 
 
-@dataclass(frozen=True)
-class Recent:
-    """
-    Integrals from each of `AGES` before an epoch up to it, of K epochs.
+class Recent(NamedTuple):
+    """Integrals from each of `AGES` before an epoch up to it, of K epochs."""
 
-    Attributes
-    ----------
-    gained : ndarray, shape (K, RUNGS, 3)
-        Of the specific force, m/s, in the body frame at the epoch.
-    turned : ndarray, shape (K, RUNGS, 3)
-        Of the angular rate: rotation vector of the body, rad.
-
-    """
-
-    gained: Array
-    turned: Array
-
-    @staticmethod
-    def steady(force: Array, rate: Array) -> 'Recent':
-        """Return what forces and rates, shape (K, 3), would have made had they lasted."""
-        return Recent(*(AGES[:, None] * values[:, None] for values in (force, rate)))
+    gained: Array       # (K, RUNGS, 3), of the specific force, m/s, in the body frame at the epoch
+    turned: Array       # (K, RUNGS, 3), of the angular rate: rotation vector of the body, rad
 
 
-def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'Array | Index',
-                  unit: float = 1.0) -> Recent:
+def recent_motion(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Recent:
     """
     Integrate samples over the time before each of K epochs.
 
@@ -72,14 +53,12 @@ def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'A
 
     Parameters
     ----------
-    stamps : ndarray, shape (N,)
-        Sample times, strictly increasing, first <= epochs, last >= epochs.
-    gyro, accel : ndarray, shape (N, 3)
-        Angular rate, rad/s; specific force, m/s^2.
-    epochs : ndarray, shape (K,)
-        Stamps of the epochs.
-    unit : float
-        Of stamps and epochs, seconds.
+    stamps_ns : ndarray of int, shape (N,)
+        Strictly increasing, first <= epochs_ns, last >= epochs_ns.
+    samples : ndarray, shape (N, 6)
+        Angular rate, rad/s, and specific force, m/s^2.
+    epochs_ns : ndarray of int, shape (K,)
+        Their stamps.
 
     References
     ----------
@@ -87,36 +66,30 @@ def recent_motion(stamps: 'Array | Index', gyro: Array, accel: Array, epochs: 'A
        navigation", IEEE Transactions on Aerospace and Electronic Systems 7(1), 1971.
 
     """
-    ages = (AGES / unit).astype(stamps.dtype)
-    last = np.maximum(np.searchsorted(stamps, epochs), 1)
-    rungs = np.searchsorted(stamps, epochs[:, None] - ages, side='right') - 1
+    samples = samples.T
+    ages = (AGES / 1e-9).astype(np.int64)
+    last = np.maximum(np.searchsorted(stamps_ns, epochs_ns), 1)
+    rungs = np.searchsorted(stamps_ns, epochs_ns[:, None] - ages, side='right') - 1
     first = np.clip(rungs[:, -1], 0, last - 1)
     most = np.max(last - first)
-    if epochs.size > 1 and epochs.size * most > MAX_STEPS:
-        middle = (epochs.size + 1) // 2
-        halves = [recent_motion(stamps, gyro, accel, half, unit)
-                  for half in (epochs[:middle], epochs[middle:])]
-        return Recent(*(np.concatenate(arrays) for arrays in zip(
-            *(vars(half).values() for half in halves))))
     # In Fortran order, so that the components of vectors are contiguous in memory.
     step = (first + np.arange(most)[:, None]).T
     inside = step < last[:, None]
     step = np.minimum(step, last[:, None] - 1)
-    begin, end = ((stamps[step.T + k] - epochs).T * unit for k in (0, 1))
+    begin, end = ((stamps_ns[step.T + k] - epochs_ns).T * 1e-9 for k in (0, 1))
     # Nothing is known of a silence and what was before it.
     heard = np.logical_and.accumulate((end - begin < SILENCE)[:, ::-1], axis=1)[:, ::-1]
     dt = np.where(inside & heard, np.minimum(end, 0.0) - begin, 0.0)[..., None]
-    samples = np.concatenate([gyro.T, accel.T])
     middle = (0.5 * (samples[:, :-1] + samples[:, 1:])).take(step.T, axis=1).T
     both = _seen_from_epoch(dt, middle[..., :3], middle[..., 3:])
     sums = np.cumsum(dt * both, axis=1)
     # Up to a rung: the steps before its own, and of that what lies before.
     own = np.clip(rungs - first[:, None], 0, step.shape[1] - 1)
-    rows = np.arange(epochs.size)[:, None]
+    rows = np.arange(epochs_ns.size)[:, None]
     before = (sums[rows, own]
               + (-AGES - np.minimum(end, 0.0)[rows, own])[..., None] * both[rows, own])
     span = np.cumsum(dt, axis=1)[:, -1]
-    at_end = np.concatenate([accel[last], gyro[last]], axis=-1)
+    at_end = samples[[3, 4, 5, 0, 1, 2]][:, last].T
     mean = np.where(span > 0, sums[:, -1] / np.maximum(span, 1e-9), at_end)[:, None]
     missing = (AGES - span)[..., None]
     integrals = sums[:, -1:] + np.where(missing > 1e-6, missing * mean, -before)
@@ -127,18 +100,8 @@ def _seen_from_epoch(dt: Array, rate: Array, force: Array) -> Array:
     """
     Return forces in the axes of the body at the epoch, and what changes the rotation up to it.
 
-    Parameters
-    ----------
-    dt : ndarray, shape (K, n, 1)
-        Seconds of the steps before each epoch.
-    rate, force : ndarray, shape (K, n, 3)
-        In the body frame of the step.
-
-    Returns
-    -------
-    ndarray, shape (K, n, 6)
-        Force, then rate.
-
+    `dt` are the seconds of the steps before each epoch, shape (K, n, 1), rate and force in the
+    body frame of the step, (K, n, 3); both together come back, force first, (K, n, 6).
     """
     turn = dt * rate
     turned = np.cumsum(turn, axis=1)
@@ -154,14 +117,9 @@ def _seen_from_epoch(dt: Array, rate: Array, force: Array) -> Array:
 
 def exact(integrals: Array, age: float) -> tuple[Array, Array, Array]:
     """
-    Follow a force or rate back to an age.
+    Follow a force or rate, shape (K, RUNGS, 3) as in `Recent`, back to an age.
 
-    Parameters
-    ----------
-    integrals : ndarray, shape (K, RUNGS, 3)
-        As in `Recent`.
-    age : float
-        Seconds before the epoch; negative ones are extrapolated.
+    Before age 0 it is extrapolated.
 
     Returns
     -------
@@ -182,21 +140,7 @@ def exact(integrals: Array, age: float) -> tuple[Array, Array, Array]:
 
 
 def smooth(integrals: Array, age: float) -> tuple[Array, Array]:
-    """
-    Return a force or rate at an age, calm of vibration, and its derivative to the age.
-
-    Parameters
-    ----------
-    integrals : ndarray, shape (K, RUNGS, 3)
-        As in `Recent`.
-    age : float
-        Seconds before the epoch; negative ones are extrapolated.
-
-    Returns
-    -------
-    value, change : ndarray, shape (K, 3)
-
-    """
+    """Return a force or rate at an age, calm of vibration, and its derivative to the age."""
     _, value, change = _cubic(age, SMOOTH)
     return value[1:] @ integrals, change[1:] @ integrals
 

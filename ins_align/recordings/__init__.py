@@ -21,9 +21,14 @@ chooses the topics that an alignment reads, `decode` makes arrays of them, `limi
 from typing import NamedTuple
 
 
+def printable(line: str) -> str:
+    """Make a line that may quote a recording fit for a terminal."""
+    return ''.join(letter if letter.isprintable() else '?' for letter in line)
+
+
 def one_line(text: str) -> str:
-    """Make text that may quote a recording fit for a line on a terminal."""
-    return ''.join(letter if letter.isprintable() else '?' for letter in text[:1000])
+    """Make a text that may quote a recording a line that is not too long."""
+    return printable(text[:1000])
 
 
 class BagError(ValueError):

@@ -49,7 +49,6 @@ DATABASE_PATH = re.compile(r'[\w/. ~+=@,-]*\.db3', re.ASCII)
 COMMANDS = {'.bag': 'rosbag reindex {0}', '.mcap': 'mcap recover {0} -o mended.mcap',
             '.db3': 'sqlite3 {0} .recover | sqlite3 mended.db3'}
 BLOCK = 4096  # messages yielded at a time
-GROUP = 256  # messages taken at a time, so few that they stay in the processor's cache
 PIECE_BYTES = 1 << 20  # of a file, unpacked at a time
 INDEX_ENTRY_BYTES = 12  # of a message in the index of a ROS 1 file
 MAX_PASSES = 20  # over a ROS 1 file, parts of which are read again where its chunks overlap
@@ -89,7 +88,6 @@ class Bag:
         with ExitStack() as stack:
             self._readers = self._opened(stack)
             with _bag_errors(self.path):
-                self._readers.sort(key=lambda reader: reader.start_time)
                 filled = [reader for reader in self._readers if reader.end_time]
                 # Of whatever type and size they are in a file, here they fit into 64 bits.
                 times_ns = np.array([(reader.start_time, reader.end_time - 1)
@@ -131,16 +129,9 @@ class Bag:
                    if topic in topics}
         with _bag_errors(self.path):
             records = self._records(numbers, start_ns, stop_ns)
-            while True:
-                columns: tuple[list[Any], ...] = [], [], []
-                while len(columns[0]) < BLOCK and (
-                        group := list(itertools.islice(records, min(GROUP, BLOCK)))):
-                    for column, values in zip(columns, zip(*group)):
-                        column += values
-                connections, times_ns, messages = columns
-                if not messages:
-                    return
-                places = np.fromiter(map(numbers.__getitem__, map(id, connections)), np.int64)
+            while group := list(itertools.islice(records, BLOCK)):
+                connections, times_ns, messages = zip(*group)
+                places = np.array([numbers[id(connection)] for connection in connections])
                 yield Block(np.array(times_ns, np.int64), places, [
                     _without_compression([messages[place] for place in chosen.tolist()])
                     for chosen in (np.flatnonzero(places == number)
@@ -149,17 +140,11 @@ class Bag:
     def _records(self, chosen: Container[int], start_ns: int | None, stop_ns: int | None,
                  ) -> Iterator[tuple[Any, int, bytes]]:
         """Return connections, times and messages of all files in the order of time."""
-        streams, starts, ends = [], [], [0]
-        for reader in self._readers:
-            connections = [connection for connection in reader.connections
-                           if id(connection) in chosen]
-            if connections:
-                streams.append(_short(reader.messages(connections, start_ns, stop_ns)))
-                starts.append(reader.start_time)
-                ends.append(reader.end_time)
-        if all(end <= start for end, start in zip(ends, starts)):
-            return itertools.chain(*streams)
-        return heapq.merge(*streams, key=itemgetter(1))
+        wanted = [(reader, [connection for connection in reader.connections
+                            if id(connection) in chosen]) for reader in self._readers]
+        return heapq.merge(*(_short(reader.messages(connections, start_ns, stop_ns))
+                             for reader, connections in wanted if connections),
+                           key=itemgetter(1))
 
     def first_message(self, topic: Topic) -> bytes | None:
         """Return the first message of a topic, where there is one."""

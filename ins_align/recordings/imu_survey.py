@@ -23,7 +23,7 @@ from ins_align.config import Config, ImuNoise, PRESETS
 from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.motion import GRID, Series
-from ins_align.imu.plausibility import force_fault, RangeCheck
+from ins_align.imu.noise import force_fault, RangeCheck
 import numpy as np
 
 WINDOW = 2.0  # s in which noise is measured
@@ -79,7 +79,7 @@ class ImuFacts:
 def survey_imu(times: Array, samples: Array, velocities: Series, gravity: float,
                ) -> ImuFacts | None:
     """
-    Measure an IMU.
+    Measure an IMU; None: there are too few samples.
 
     Parameters
     ----------
@@ -92,18 +92,14 @@ def survey_imu(times: Array, samples: Array, velocities: Series, gravity: float,
     gravity : float
         Where the vehicle is, m/s^2.
 
-    Returns
-    -------
-    ImuFacts or None
-        None: there are too few samples.
-
     """
     if times.size < 20 or times[-1] <= times[0]:
         return None
     interval = float(np.median(np.diff(times)))
+    sensors = samples[:, :3], samples[:, 3:]
     sizes = np.linalg.norm(samples.reshape(-1, 2, 3), axis=2)
     mean_force, max_rate = float(np.mean(sizes[:, 1])), float(np.quantile(sizes[:, 0], 0.999))
-    up = samples[:, 3:].mean(axis=0)
+    up = sensors[1].mean(axis=0)
     up /= np.linalg.norm(up) or 1.0
     grid, cells = _cells(times, samples)
     ratio = turn_ratio(grid, cells[:, :3], up, velocities)
@@ -121,15 +117,9 @@ def survey_imu(times: Array, samples: Array, velocities: Series, gravity: float,
         mean = cells[rest].mean(axis=0)
         rate, force = mean[:3], float(np.linalg.norm(mean[3:]) - gravity)
         part, quiet = slice(*np.searchsorted(times, grid[[rest[0], rest[-1]]]).tolist()), 0.5
-    resolutions = [_resolution(values) for values in (samples[:, :3], samples[:, 3:])]
-    walks = [_random_walk(values[part], interval, quiet)
-             for values in (samples[:, :3], samples[:, 3:])]
-    # Noise of half a quantum carries small values over it; less leaves an error that lasts.
-    rounds = [walk / math.sqrt(interval) < resolution.half_width
-              for walk, resolution in zip(walks, resolutions)]
-    lost = [resolution.half_width / math.sqrt(3.0) * rounded  # uniform, 1 sigma
-            for resolution, rounded in zip(resolutions, rounds)]
-    walks = [max(walk, std * math.sqrt(interval)) for walk, std in zip(walks, lost)]
+    resolutions = [_resolution(values) for values in sensors]
+    walks, lost = zip(*(_noise(values[part], resolution.half_width, interval, quiet)
+                        for values, resolution in zip(sensors, resolutions)))
     # What the Earth's rate does not explain is bias, in whatever direction.
     biases = (0.0 if rate is None else abs(float(np.linalg.norm(rate)) - EARTH_RATE)
               / math.sqrt(3.0), 0.0 if force is None else abs(force))
@@ -138,10 +128,10 @@ def survey_imu(times: Array, samples: Array, velocities: Series, gravity: float,
     grade, covers = _grade(measured)
     return ImuFacts(
         mean_force, tuple(up.tolist()), math.degrees(max_rate), *resolutions,
-        math.degrees(walks[0]) * 60.0, walks[1] * 60.0, (rounds[0], rounds[1]),
+        math.degrees(walks[0]) * 60.0, walks[1] * 60.0, (lost[0] > 0.0, lost[1] > 0.0),
         len(rest) * GRID, None if rate is None else tuple(np.degrees(rate).tolist()), force, ratio,
         tuple(filter(None, faults)), _at_end_of_range(times, samples), grade, covers,
-        _settings(measured, grade, rate is not None, rounds[0]))
+        _settings(measured, grade, rate is not None, lost[0] > 0.0))
 
 
 def _settings(measured: ImuNoise, grade: str, at_rest: bool, rounds: bool) -> tuple[str, ...]:
@@ -202,17 +192,17 @@ def _at_end_of_range(times: Array, samples: Array) -> tuple[str, ...]:
     """Say which sensors were at the end of their range, and where that is."""
     check = RangeCheck()
     check.add((times * 1e9).astype(np.int64), samples)
+    largest = np.abs(samples).reshape(-1, 2, 3).max(axis=(0, 2))
     return tuple(
-        f'{name} at the end of their range, {np.abs(values).max():.4g} {unit}, in {count} '
-        'samples: let the driver set a larger one'
-        for name, values, unit, count in zip(
-            ('gyroscopes', 'accelerometers'), np.split(samples, 2, axis=1), ('rad/s', 'm/s^2'),
+        f'{name} at the end of their range, {value:.4g} {unit}, in {count} samples: let the '
+        'driver set a larger one' for name, value, unit, count in zip(
+            ('gyroscopes', 'accelerometers'), largest, ('rad/s', 'm/s^2'),
             np.count_nonzero(check.densities, axis=0)) if count)
 
 
-def _random_walk(values: Array, interval: float, quiet: float) -> float:
-    """Return the white noise of a sensor, its unit times sqrt(s), at a quantile of windows."""
-    walks = [0.0]
+def _noise(values: Array, half_width: float, interval: float, quiet: float) -> tuple[float, float]:
+    """Return the white noise of a sensor, per sqrt(Hz), and the bias that rounding hides."""
+    walk = 0.0
     for average in {1, max(round(AVERAGING / interval), 1)}:
         count = values.shape[0] // average
         means = values[:count * average].reshape(count, average, 3).mean(axis=1)
@@ -221,8 +211,13 @@ def _random_walk(values: Array, interval: float, quiet: float) -> float:
         windows = second.shape[0] // length
         if windows:
             variance = second[:windows * length].reshape(windows, length, 3).mean(axis=(1, 2)) / 6
-            walks.append(math.sqrt(float(np.quantile(variance, quiet)) * interval * average))
-    return max(walks)
+            walk = max(walk, math.sqrt(
+                float(np.quantile(variance, quiet)) * interval * average))
+    # Noise of half a quantum carries small values over it; less leaves an error that lasts.
+    if walk / math.sqrt(interval) >= half_width:
+        return walk, 0.0
+    lost = half_width / math.sqrt(3.0)  # uniform, 1 sigma
+    return max(walk, lost * math.sqrt(interval)), lost
 
 
 def _cells(times: Array, samples: Array) -> tuple[Array, Array]:

@@ -28,24 +28,25 @@ from ins_align.checks import (
 from ins_align.config import Config, config_from_mapping, parse_override
 from ins_align.geometry.earth import normal_gravity
 from ins_align.gnss.buffer import MAX_AHEAD_NS
-from ins_align.gnss.drivers import type_in_words
+from ins_align.gnss.messages import NED_ORDER, NED_SIGNS
 from ins_align.gnss.motion import (
     differences, EMPTY, find_manoeuvres, heading_in_words, MANOEUVRE_SPEED, MANOEUVRE_TIME,
-    Manoeuvres, on_grid, Series, track, velocity_frame, velocity_from_positions, VelocityFrame,
+    Manoeuvres, on_grid, Series, track, velocity_frame, velocity_from_positions,
     without_wild_positions)
 from ins_align.imu.buffer import MAX_GAP_NS
-from ins_align.recordings import BagError
+from ins_align.recordings import BagError, printable
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.imu_survey import ImuFacts, Resolution, survey_imu
 from ins_align.recordings.motion_fit import fit_motion, MotionFit
-from ins_align.recordings.reader import choose_topics, is_command
+from ins_align.recordings.reader import choose_topics
 from ins_align.recordings.topic_survey import (
-    Gap, KINDS, MAX_ASTRAY, read_candidates, Recorded, Timing)
+    Gap, MAX_ASTRAY, read_candidates, Recorded, TopicInfo)
 from ins_align.report import format_table
 import numpy as np
 
 MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
 MIN_AHEAD = 0.3  # s: clocks that differ by less may be jitter
+MAX_AHEAD, MAX_BEHIND = MAX_AHEAD_NS * 1e-9, 10.0  # s: stamps further apart are of two clocks
 MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s and so many sigmas beyond it: a delay to be set
 MIN_START = 5.0  # s that an alignment starts before a manoeuvre
 MAX_NO_FIX = 0.1  # share of positions without a fix that is worth a word
@@ -56,24 +57,6 @@ FRAME_FAULTS = {
     'turned': 'it is turned by {0.angle_deg:.0f} deg against the change of position: its axes are '
               'not east and north',
     'contradiction': 'it is {0.speed_ratio:.2g} times the change of position: check its unit'}
-
-
-@dataclass(frozen=True)
-class TopicInfo:
-    """A topic that an alignment could read."""
-
-    name: str
-    msgtype: str
-    kind: str  # imu, fix or velocity
-    timing: Timing
-    faults: tuple[str, ...]  # each makes the topic useless as it is
-    usable_share: float  # of the messages: finite and, of fixes, with a fix
-    no_fix_share: float | None = None  # of fixes
-    covariance_share: float | None = None  # of GNSS messages that state a covariance
-    sigma: tuple[float, float] | None = None  # stated, horizontal and vertical, median
-    frame: VelocityFrame | None = None  # of velocities
-    vertical_absent: bool = False  # of velocities: the vertical one is always 0
-    imu: ImuFacts | None = None
 
 
 @dataclass(frozen=True)
@@ -110,178 +93,101 @@ def inspect(path: str | os.PathLike[str]) -> Info:
 
     """
     with Bag(path) as bag:
-        return _Survey(bag, read_candidates(bag)).info()
+        return _Survey(bag).info()
 
 
 class _Survey:
     """Looks at the topics and draws the conclusions."""
 
-    def __init__(self, bag: Bag, candidates: list[Recorded]) -> None:
+    def __init__(self, bag: Bag) -> None:
         self._bag = bag
-        self._data = {(data.kind, data.topic.name): data for data in candidates}
         self._notes: list[str] = []
         self._settings: list[str] = []
         self._obstacles: list[str] = []
+        self._all = read_candidates(bag)
+        self._imus, self._fixes, self._velocities = (
+            [data for data in self._all if data.kind == kind]
+            for kind in ('imu', 'fix', 'velocity'))
 
     def info(self) -> Info:
         """Return everything that is known."""
-        fixes = [self._fix(data) for data in self._of('fix')]
-        fix = _best(fixes)
-        positions, gravity = EMPTY, 9.81
-        if fix is not None:
-            if fault := self._exchanged(self._data[fix.kind, fix.name]):
-                fixes[fixes.index(fix)] = dataclasses.replace(fix, faults=(fault,))
-            positions_deg = self._data[fix.kind, fix.name].series()
-            positions = without_wild_positions(track(positions_deg))
-            latitude, _, altitude = np.median(positions_deg.vectors, axis=0).tolist()
-            gravity = float(normal_gravity(math.radians(latitude), altitude))
-        velocities = [self._velocity(data, positions) for data in self._of('velocity')]
-        velocity = _best(velocities)
+        positions, gravity = self._positions()
         motion, grid = differences(positions), velocity_from_positions(positions)
-        if velocity is not None:
-            motion = self._enu(velocity)
+        for data in self._velocities:
+            _look_at_velocity(data, positions)
+        if (velocity := _best(self._velocities)) is not None:
+            motion = _in_enu(velocity)
             grid = on_grid(motion)
-        imus = [self._imu(data, grid, gravity) for data in self._of('imu')]
-        chosen = {'imu': _best(imus) or next(iter(imus), None),
-                  'fix': _best(fixes) or next(iter(fixes), None), 'velocity': velocity}
-        gnss = [topic for topic in (chosen['fix'], velocity) if topic is not None]
-        found = find_manoeuvres(grid)
+        for data in self._imus:
+            _look_at_imu(data, grid, gravity, alone=len(self._imus) == 1)
+        imu, fix = (_best(topics) or next(iter(topics), None)
+                    for topics in (self._imus, self._fixes))
+        gnss = [data for data in (fix, velocity) if data is not None]
         fit = lateness = None
-        if (imu := chosen['imu']) is not None:
-            self._advise_imu(imu)
-        self._advise_gnss(chosen['fix'], velocity, velocities)
         if imu is not None:
-            lateness = self._lateness(imu, gnss)
-            if not self._has_other_clock(imu, gnss) and gnss:
-                ahead = min(_age(imu) - _age(topic) for topic in gnss)
-                fit = self._fit(imu, velocity or fix, motion, gravity)
-                self._advise_motion(ahead, lateness, fit, velocity)
-        for topics in (imus, fixes, velocities):
-            good = [topic.name for topic in topics if not topic.faults]
+            self._advise_imu(imu)
+        self._advise_gnss(fix, velocity)
+        if imu is not None:
+            lateness = _lateness(imu, gnss)
+            self._compare_clocks(imu, gnss)
+            if gnss and not self._obstacles:
+                if not imu.faults and (source := velocity or _best(self._fixes)) is not None:
+                    fit = _fit(imu, source, motion, gravity)
+                self._advise_motion(min(imu.age_s - data.age_s for data in gnss), lateness, fit,
+                                    velocity)
+        for topics in (self._imus, self._fixes, self._velocities):
+            good = [data.name for data in topics if not data.faults]
             if len(good) > 1:
                 self._notes.append(f'{", ".join(good)}: each could be read, the command takes the '
                                    'one with the most messages; choose for yourself')
+        chosen = {'imu': imu, 'fix': fix, 'velocity': velocity}
         command = self._command(chosen)
         # The end of a file that was cut off is known from what could be read of it.
         start_ns = self._bag.start_ns or 0
         end_ns = max([self._bag.end_ns or start_ns, *(
-            int(data.recorded_ns.max()) for data in self._data.values() if data.recorded_ns.size)])
+            int(data.recorded_ns.max()) for data in self._all if data.recorded_ns.size)])
+        found = find_manoeuvres(grid)
         return Info(
             str(self._bag.path), (end_ns - start_ns) * 1e-9, start_ns,
-            (*imus, *fixes, *velocities),
-            {kind: None if topic is None else topic.name for kind, topic in chosen.items()},
+            (*self._imus, *self._fixes, *self._velocities),
+            {kind: None if data is None else data.name for kind, data in chosen.items()},
             lateness, found, fit, heading_in_words(found), tuple(self._notes),
             tuple(self._obstacles), command, tuple(self._bag.warnings))
 
-    def _of(self, kind: str) -> list[Recorded]:
-        return [data for data in self._data.values() if data.kind == kind]
-
-    def _topic(self, data: Recorded, faults: list[str], **more: Any) -> TopicInfo:
-        count = data.stamps_ns.size
-        if not count:
-            faults = [*faults, (data.undecodable_why or 'its messages cannot be decoded')
-                      if data.undecodable else 'it has no messages']
-        stated = data.sigmas[np.isfinite(data.sigmas).all(axis=1)]
-        if data.sigmas.size:
-            more['covariance_share'] = stated.shape[0] / count
-        if stated.size:
-            more['sigma'] = tuple(np.median(stated, axis=0).tolist())
-        return TopicInfo(
-            data.topic.name, type_in_words(data.topic.msgtype), data.kind, data.timing(),
-            tuple(faults), float(np.mean(data.usable)) if count else 0.0, **more)
-
-    def _fix(self, data: Recorded) -> TopicInfo:
-        faults = []
-        count = data.stamps_ns.size
-        if count and not data.usable.any():
-            beyond = [beyond_the_poles(*place) for place in data.values[:, :2].tolist()]
-            faults.append('no message has a fix' if data.no_fix == count else
-                          BEYOND_THE_POLES if np.mean(beyond) > 0.5 else
-                          'no message has a fix and numbers that can be used')
-        return self._topic(data, faults, no_fix_share=data.no_fix / count if count else None)
-
-    def _exchanged(self, data: Recorded) -> str:
-        """Say that latitude and longitude are exchanged, and exchange them for the rest."""
-        for velocity in self._of('velocity'):
-            if fault := exchange_fault(data.series(), velocity.series()):
-                data.values = data.values[:, [1, 0, 2]]
-                return fault
-        return ''
-
-    def _velocity(self, data: Recorded, positions: Series) -> TopicInfo:
-        faults = []
-        if is_command(data.topic):
-            faults.append('its name is that of a command, not of a measurement')
-        if not data.usable.any():
-            return self._topic(data, faults + ['no message has numbers that can be used']
-                               * bool(data.stamps_ns.size))
-        frame = velocity_frame(data.series(), positions)
-        if data.refused and frame.frame not in FRAMES_THAT_FIT:
-            faults.append(data.refused)
-        if frame.frame in FRAME_FAULTS:
-            faults.append(FRAME_FAULTS[frame.frame].format(frame))
-        values = data.values[data.usable] != 0.0
-        return self._topic(data, faults, frame=frame, vertical_absent=bool(
-            values[:, :2].any() and not values[:, 2].any()))
-
-    def _imu(self, data: Recorded, motion: Series, gravity: float) -> TopicInfo:
-        faults = []
-        if data.unmeasured and len(self._of('imu')) > 1:
-            faults.append(data.unmeasured)
-        times, values = data.series()
-        facts = survey_imu(times, values, motion, gravity)
-        if facts is not None:
-            faults += facts.faults
-        elif data.stamps_ns.size:
-            faults.append('it has too few usable samples')
-        rate = data.timing().rate_hz
-        if rate is not None and rate < MIN_RATE:
-            faults.append(f'its rate is {rate:.2g} Hz: an alignment starts over after '
-                          f'{MAX_GAP_NS * 1e-9:g} s without a sample')
-        return self._topic(data, faults, imu=facts)
-
-    def _enu(self, velocity: TopicInfo) -> Series:
-        series = self._data[velocity.kind, velocity.name].series()
-        if velocity.frame is not None and velocity.frame.frame == 'ned':
-            return Series(series.times, series.vectors[:, [1, 0, 2]] * (1.0, 1.0, -1.0))
-        return series
-
-    def _fit(self, imu: TopicInfo, gnss: TopicInfo | None, motion: Series,
-             gravity: float) -> MotionFit | None:
-        """Compare the motion of the IMU with that of the GNSS, on the clocks of their stamps."""
-        if imu.faults or gnss is None:
-            return None
-        apart = _age(imu) - _age(gnss)
-        samples = self._data[imu.kind, imu.name].series()
-        return fit_motion(samples.times, *np.split(samples.vectors, 2, axis=1),
-                          Series(motion.times + apart, motion.vectors), gravity,
-                          (0.0, apart) if abs(apart) >= MIN_AHEAD else (0.0,))
-
-    def _lateness(self, imu: TopicInfo, gnss: list[TopicInfo]) -> float | None:
-        """Return how late GNSS messages come after newer IMU samples, 99 percent of them."""
-        samples = self._data[imu.kind, imu.name]
-        newest = np.maximum.accumulate(samples.stamps_ns[samples.usable])
-        late = [np.zeros(0)]
-        for data in (self._data[topic.kind, topic.name] for topic in gnss if newest.size):
-            before = np.searchsorted(samples.recorded_ns[samples.usable],
-                                     data.recorded_ns[data.usable]) - 1
-            late.append((newest[before] - data.stamps_ns[data.usable])[before >= 0] * 1e-9)
-        lateness = np.concatenate(late)
-        return float(np.quantile(lateness, 0.99)) if lateness.size else None
+    def _positions(self) -> tuple[Series, float]:
+        """Look at positions; return the track of the best, without spikes, and gravity there."""
+        for data in self._fixes:
+            if data.stamps_ns.size and not data.usable.any():
+                beyond = [beyond_the_poles(*place) for place in data.values[:, :2].tolist()]
+                data.faults += ('no message has a fix' if data.no_fix_share == 1.0 else
+                                BEYOND_THE_POLES if np.mean(beyond) > 0.5 else
+                                'no message has a fix and numbers that can be used',)
+        fix = _best(self._fixes)
+        if fix is None:
+            return EMPTY, 9.81
+        for velocity in self._velocities:
+            if fault := exchange_fault(fix.series(), velocity.series()):
+                fix.faults += (fault,)
+                fix.values = fix.values[:, [1, 0, 2]]
+                break
+        positions_deg = fix.series()
+        latitude, _, altitude = np.median(positions_deg.vectors, axis=0).tolist()
+        return (without_wild_positions(track(positions_deg)),
+                float(normal_gravity(math.radians(latitude), altitude)))
 
     def _advise(self, when: object, note: str = '', setting: str = '') -> None:
         if when:
             self._notes.extend(filter(None, [note]))
             self._settings.extend(filter(None, [setting]))
 
-    def _advise_imu(self, imu: TopicInfo) -> None:
+    def _advise_imu(self, imu: Recorded) -> None:
         if imu.imu is None:
             return
-        gap, data = imu.timing.longest_gap or Gap(0.0, 0.0), self._data[imu.kind, imu.name]
+        gap = imu.timing.longest_gap or Gap(0.0, 0.0)
         self._notes.extend(imu.imu.too_small)
         self._settings.extend(imu.imu.settings)
-        self._advise(data.unmeasured and not imu.faults,
-                     f'{imu.name}: {data.unmeasured}; its numbers are used all the same '
+        self._advise(imu.unmeasured and not imu.faults,
+                     f'{imu.name}: {imu.unmeasured}; its numbers are used all the same '
                      '(covariances that are not known are 0)')
         self._advise(gap.duration_s > MAX_GAP_NS * 1e-9,
                      f'the IMU is silent for {gap.duration_s:.1f} s at {gap.start_s:.1f} s: an '
@@ -291,37 +197,34 @@ class _Survey:
                      'the attitude will be that of the axes as they are, however the IMU is '
                      'mounted')
 
-    def _advise_gnss(self, fix: TopicInfo | None, velocity: TopicInfo | None,
-                     velocities: list[TopicInfo]) -> None:
+    def _advise_gnss(self, fix: Recorded | None, velocity: Recorded | None) -> None:
         no_fix = fix.no_fix_share or 0.0 if fix is not None else 0.0
         self._advise(no_fix > MAX_NO_FIX, f'{no_fix:.0%} of the positions are without a fix')
         if velocity is None or velocity.frame is None:
-            self._advise(velocities, setting='use_velocity=false')
+            self._advise(self._velocities, setting='use_velocity=false')
             self._advise(fix, 'there is no velocity that can be used: it is aligned from '
                          'positions alone, which takes longer unless they are RTK')
             return
-        name, data = velocity.frame.frame, self._data[velocity.kind, velocity.name]
+        name = velocity.frame.frame
         self._advise(name == 'unknown', 'nothing tells the frame of the velocity (too little '
                      'motion): it is taken as east-north-up')
-        self._advise(name == 'ned' or name == 'enu' and data.refused,
+        self._advise(name == 'ned' or name == 'enu' and velocity.refused,
                      setting=f'velocity_frame={name}')
         self._advise(velocity.frame.upside_down, 'the vertical velocity has the wrong sign')
         self._advise(velocity.vertical_absent, setting='velocity_vertical=absent')
 
-    def _has_other_clock(self, imu: TopicInfo, gnss: list[TopicInfo]) -> bool:
-        for topic in gnss:
-            late = _age(topic) - _age(imu)
-            if topic.timing.stamp_age_s is not None and not -MAX_AHEAD_NS * 1e-9 < late < 10.0:
+    def _compare_clocks(self, imu: Recorded, gnss: list[Recorded]) -> None:
+        for data in gnss:
+            late = data.age_s - imu.age_s
+            if data.stamps_ns.size and not -MAX_AHEAD < late < MAX_BEHIND:
                 self._obstacles.append(
-                    f'the stamps of {topic.name} are {abs(late):.1f} s '
+                    f'the stamps of {data.name} are {abs(late):.1f} s '
                     f'{"behind" if late > 0.0 else "ahead of"} those of {imu.name}: they are of '
                     'different clocks')
-        return bool(self._obstacles)
 
     def _advise_motion(self, ahead: float, lateness: float | None, fit: MotionFit | None,
-                       velocity: TopicInfo | None) -> None:
-        delay = None if fit is None else fit.delay
-        if delay is None:
+                       velocity: Recorded | None) -> None:
+        if fit is None or (delay := fit.delay) is None:
             self._advise(
                 ahead >= MIN_AHEAD, f'the stamps of GNSS messages are {ahead:.1f} s ahead of '
                 'those of the IMU: their clocks differ, which gnss_delay corrects as far as '
@@ -341,32 +244,97 @@ class _Survey:
         # Velocities that mostly come without a covariance.
         if fit is not None and fit.velocity_std is not None and velocity is not None and (
                 velocity.covariance_share or 0.0) < 0.5:
-            for name, std in zip(('velocity_std', 'velocity_std_vertical'), fit.velocity_std):
-                self._advise(not (velocity.vertical_absent and name.endswith('vertical')),
-                             setting=f'{name}={max(std, 1e-3):.2g}')
+            horizontal, vertical = (f'{max(std, 1e-3):.2g}' for std in fit.velocity_std)
+            self._settings.append(f'velocity_std={horizontal}')
+            self._advise(not velocity.vertical_absent, setting=f'velocity_std_vertical={vertical}')
         if lateness is not None and Config.gnss_lateness < lateness < MAX_LATENESS:
             advice, value = lateness_advice(lateness)
             self._advise(True, advice, f'gnss_lateness={value}')
 
-    def _command(self, chosen: dict[str, TopicInfo | None]) -> str | None:
+    def _command(self, chosen: dict[str, Recorded | None]) -> str | None:
         """Return the command, tried as far as its choice of topics goes."""
         path = str(self._bag.path)
         arguments = ['ins_align', 'replay', path if not path.startswith('-') else f'./{path}']
-        names: dict[str, str | None] = dict.fromkeys(KINDS)
-        for kind, topic in chosen.items():
-            if topic is not None and topic.faults:
-                self._obstacles.append(f'{topic.name} cannot be used: {topic.faults[0]}')
-            if topic is not None and len(self._of(kind)) > 1:
-                names[kind] = topic.name
-                arguments += [f'--{kind}-topic', topic.name]
+        names: dict[str, str] = {}
+        for kind, data in chosen.items():
+            if data is not None and data.faults:
+                self._obstacles.append(f'{data.name} cannot be used: {data.faults[0]}')
+            if data is not None and sum(other.kind == kind for other in self._all) > 1:
+                names[kind] = data.name
+                arguments += [f'--{kind}-topic', data.name]
         for setting in self._settings:
             arguments += ['--set', setting]
         config = config_from_mapping(dict(map(parse_override, self._settings)))
         try:
-            choose_topics(self._bag, config, names['imu'], names['fix'], names['velocity'])
+            choose_topics(self._bag, config, **names)
         except BagError as error:
             self._obstacles.append(str(error))
         return None if self._obstacles else shlex.join(arguments)
+
+
+def _look_at_velocity(data: Recorded, positions: Series) -> None:
+    """Find the frame of a velocity and what makes it useless."""
+    if not data.usable.any():
+        if data.stamps_ns.size:
+            data.faults += ('no message has numbers that can be used',)
+        return
+    data.frame = velocity_frame(data.series(), positions)
+    if data.refused and data.frame.frame not in FRAMES_THAT_FIT:
+        data.faults += (data.refused,)
+    if data.frame.frame in FRAME_FAULTS:
+        data.faults += (FRAME_FAULTS[data.frame.frame].format(data.frame),)
+    moved = (data.values[data.usable] != 0.0).any(axis=0)
+    data.vertical_absent = bool(moved[:2].any() and not moved[2])
+
+
+def _look_at_imu(data: Recorded, motion: Series, gravity: float, alone: bool) -> None:
+    """Measure an IMU and find what makes it useless."""
+    if data.unmeasured and not alone:
+        data.faults += (data.unmeasured,)
+    data.imu = survey_imu(*data.series(), motion, gravity)
+    if data.imu is not None:
+        data.faults += data.imu.faults
+    elif data.stamps_ns.size:
+        data.faults += ('it has too few usable samples',)
+    rate = data.timing.rate_hz
+    if rate is not None and rate < MIN_RATE:
+        data.faults += (f'its rate is {rate:.2g} Hz: an alignment starts over after '
+                        f'{MAX_GAP_NS * 1e-9:g} s without a sample',)
+
+
+def _in_enu(velocity: Recorded) -> Series:
+    series = velocity.series()
+    if velocity.frame is not None and velocity.frame.frame == 'ned':
+        return Series(series.times, series.vectors[:, NED_ORDER] * NED_SIGNS)
+    return series
+
+
+def _fit(imu: Recorded, gnss: Recorded, motion: Series, gravity: float) -> MotionFit:
+    """Compare the motion of the IMU with that of the GNSS, on the clocks of their stamps."""
+    apart = imu.age_s - gnss.age_s
+    samples = imu.series()
+    return fit_motion(samples.times, *np.split(samples.vectors, 2, axis=1),
+                      Series(motion.times + apart, motion.vectors), gravity,
+                      (0.0, apart) if abs(apart) >= MIN_AHEAD else (0.0,))
+
+
+def _lateness(imu: Recorded, gnss: list[Recorded]) -> float | None:
+    """Return how late GNSS messages come after newer IMU samples, 99 percent of them, s."""
+    newest = np.maximum.accumulate(imu.stamps_ns[imu.usable])
+    late = [np.zeros(0)]
+    for data in gnss if newest.size else ():
+        before = np.searchsorted(imu.recorded_ns[imu.usable], data.recorded_ns[data.usable]) - 1
+        late.append((newest[before] - data.stamps_ns[data.usable])[before >= 0] * 1e-9)
+    lateness = np.concatenate(late)
+    return float(np.quantile(lateness, 0.99)) if lateness.size else None
+
+
+def _best(topics: list[Recorded]) -> Recorded | None:
+    """Return the topic to read: without faults, its frame known, the most messages."""
+    good = [data for data in topics if not data.faults]
+    return max(good, default=None, key=lambda data: (
+        data.frame is not None and data.frame.frame in FRAMES_THAT_FIT,
+        data.timing.count * data.usable_share))
 
 
 def describe(info: Info) -> str:
@@ -481,20 +449,3 @@ def _about_motion(found: Manoeuvres | None, fit: MotionFit | None) -> list[str]:
         lines.append('noise of the GNSS velocity: {:.2g} m/s horizontally, {:.2g} m/s vertically'
                      .format(*fit.velocity_std))
     return lines
-
-
-def _age(topic: TopicInfo) -> float:
-    return topic.timing.stamp_age_s or 0.0
-
-
-def _best(topics: list[TopicInfo]) -> TopicInfo | None:
-    """Return the topic to read: without faults, its frame known, the most messages."""
-    good = [topic for topic in topics if not topic.faults]
-    return max(good, default=None, key=lambda topic: (
-        topic.frame is not None and topic.frame.frame in FRAMES_THAT_FIT,
-        topic.timing.count * topic.usable_share))
-
-
-def printable(line: str) -> str:
-    """Make a line that quotes a recording fit for a terminal."""
-    return ''.join(letter if letter.isprintable() else '?' for letter in line)

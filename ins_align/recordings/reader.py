@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 import dataclasses
 from dataclasses import dataclass
+import itertools
 from operator import attrgetter, itemgetter
 import os
 from typing import NamedTuple
@@ -28,19 +29,16 @@ from ins_align.geometry.transform import Transform
 from ins_align.gnss.drivers import (
     DRIVER_TYPES, imu_from_driver, INERTIAL_UNITS, LIVE_TYPES, NoTimeError, receiver_from_msg,
     RECEIVERS, type_in_words)
-from ins_align.gnss.messages import Fix, MessageError, Velocity, velocity_from_msg
+from ins_align.gnss.messages import MessageError, velocity_from_msg
 from ins_align.mounting import find_mounting, FixedFrames, Mounting
 from ins_align.recordings import BagError, Topic
 from ins_align.recordings.bag import Bag, Block
 from ins_align.recordings.decode import (
-    decode_by_kind, decode_imu_topic, decode_orientations, deserialize, GNSS_TYPES, IMU_TYPE,
-    ImuSamples, Orientations, Refused)
+    decode_gnss, decode_imu, decode_orientations, deserialize, FIX_TYPE, Gnss, IMU_TYPE,
+    ImuSamples, Orientations, short_name, unmeasured, VECTOR_TYPE, VELOCITY_TYPES)
 from ins_align.results import Severity
 import numpy as np
 
-FIX_TYPES, VELOCITY_TYPES = ([name for name, fields in GNSS_TYPES.items() if fields.kind == kind]
-                             for kind in ('fix', 'velocity'))
-VECTOR_TYPE = 'geometry_msgs/msg/Vector3Stamped'  # of a velocity or of anything else
 TF_TYPE = 'tf2_msgs/msg/TFMessage'
 UNSTAMPED_TYPES = ['geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistWithCovariance',
                    'geometry_msgs/msg/Vector3']
@@ -56,36 +54,20 @@ class Topics(NamedTuple):
     imu: Topic
     fix: Topic
     velocity: Topic | None
-    velocity_type: str | None  # as the parameter of that name has it
     reference: Topic | None
     base: Transform | None = None  # from the configured base to the IMU
 
 
 @dataclass(frozen=True)
 class Request:
-    """
-    What to read of which recording.
-
-    Attributes
-    ----------
-    path : path
-        rosbag2 directory or file, ROS 1 bag.
-    config : Config
-        ``velocity_type`` is used where the recording leaves a choice, as are the standard
-        deviations of GNSS messages without any.
-    imu_topic, fix_topic, velocity_topic : str, optional
-        Where there is more than one candidate.
-    start, duration : float, optional
-        Part of the recording, seconds from its start, by recorded time.
-
-    """
+    """What to read of which recording: the arguments of `replay`."""
 
     path: str | os.PathLike[str]
     config: Config = Config()
     imu_topic: str | None = None
     fix_topic: str | None = None
     velocity_topic: str | None = None
-    start: float | None = None
+    start: float | None = None  # s from the start of the recording, by recorded time
     duration: float | None = None
 
 
@@ -95,8 +77,7 @@ class Part(NamedTuple):
     topics: Topics
     config: Config  # as requested, for the type of velocity that was found
     imu: ImuSamples
-    # Each GNSS message, and how many of the IMU samples come before it.
-    gnss: tuple[tuple[int, Fix | Velocity | Refused], ...]
+    gnss: tuple[tuple[int, Gnss], ...]  # each after how many of the IMU samples
     orientations: Orientations
     done: float  # how much of the recording this ends at, 0 to 1
     warnings: tuple[str, ...]  # so far
@@ -121,27 +102,24 @@ def read(request: Request) -> Iterator[Part]:
             reasons = f' ({bag.warnings[0]})' if bag.warnings else ''
             raise BagError(f'{error}{reasons}') from None
         config = request.config
-        if topics.velocity_type is not None:
-            config = dataclasses.replace(config, velocity_type=topics.velocity_type)
+        if topics.velocity is not None and topics.velocity.msgtype in VELOCITY_TYPES:
+            config = dataclasses.replace(config, velocity_type=short_name(topics.velocity.msgtype))
         mounting = _mounting(bag, topics, config)
         config, topics = mounting.config, topics._replace(base=mounting.base)
-        start_ns = (bag.start_ns or 0) + round((request.start or 0.0) * 1e9)
-        stop_ns = (None if request.duration is None
-                   else start_ns + round(request.duration * 1e9))
-        end_ns = bag.end_ns or start_ns
-        if stop_ns is not None:
-            end_ns = min(end_ns, stop_ns)
-        done = 0.0
-        empty = request.start is not None or request.duration is not None
         wanted = list(dict.fromkeys(topic for topic in topics if isinstance(topic, Topic)))
-        for block in bag.blocks(wanted, None if request.start is None else start_ns, stop_ns):
-            if end_ns > start_ns:
-                last_ns = int(block.times_ns[-1])
-                done = min(max((last_ns - start_ns) / (end_ns - start_ns), 0.0), 1.0)
+        first_ns = bag.start_ns or 0
+        start_ns = None if request.start is None else first_ns + round(request.start * 1e9)
+        begin_ns, end_ns = first_ns if start_ns is None else start_ns, bag.end_ns or first_ns
+        stop_ns = None if request.duration is None else begin_ns + round(request.duration * 1e9)
+        length_ns = (end_ns if stop_ns is None else min(end_ns, stop_ns)) - begin_ns
+        done, empty = 0.0, True
+        for block in bag.blocks(wanted, start_ns, stop_ns):
+            if length_ns > 0:
+                done = min(max((int(block.times_ns[-1]) - begin_ns) / length_ns, 0.0), 1.0)
             yield _decoded(block, wanted, topics, config, done, tuple(bag.warnings))
             empty = False
-        if empty:
-            raise BagError(f'{request.path} has no IMU or GNSS messages {_part(request, bag)}')
+        if empty and (start_ns, stop_ns) != (None, None):
+            raise BagError(f'{request.path} has no IMU or GNSS messages {_window(request, bag)}')
         nothing = Block(np.zeros(0, np.int64), np.zeros(0, np.int64), [()] * len(wanted))
         yield _decoded(nothing, wanted, topics, config, 1.0, tuple(bag.warnings))
 
@@ -176,41 +154,37 @@ def _frame_id(bag: Bag, topic: Topic) -> str:
     return ''
 
 
-def _part(request: Request, bag: Bag) -> str:
+def _window(request: Request, bag: Bag) -> str:
     """Say which part of a recording was asked for, and how long all of it is."""
     start = request.start or 0.0
-    part = (f'after {start:g} s' if request.duration is None
-            else f'between {start:g} s and {start + request.duration:g} s')
+    window = (f'after {start:g} s' if request.duration is None
+              else f'between {start:g} s and {start + request.duration:g} s')
     if bag.start_ns is None or bag.end_ns is None:
-        return part
-    return f'{part}: it is {(bag.end_ns - bag.start_ns) * 1e-9:.1f} s long'
+        return window
+    return f'{window}: it is {(bag.end_ns - bag.start_ns) * 1e-9:.1f} s long'
 
 
 def _decoded(block: Block, wanted: list[Topic], topics: Topics, config: Config, done: float,
              warnings: tuple[str, ...]) -> Part:
     """Decode a block, the messages of a topic all at once."""
-    gnss: list[tuple[int, Fix | Velocity | Refused]] = []
-    orientations: Sequence[bytes] = ()
-    for number, (topic, messages) in enumerate(zip(wanted, block.messages)):
-        places = np.flatnonzero(block.topics == number)
-        if topic is topics.imu:
-            samples = decode_imu_topic(messages, topic)
-            before = np.zeros(block.topics.size, np.int64)
-            before[places] = samples.decoded
-            before = np.cumsum(before)
-        elif topic is topics.reference:
-            orientations = messages
-        kinds = [kind for kind, source in (('fix', topics.fix), ('velocity', topics.velocity))
-                 if topic is source]
-        if kinds:
-            found = decode_by_kind(messages, topic, config)
-            for kind in kinds:
-                gnss += zip(places.tolist(), found[kind])
+    number_of = {topic: number for number, topic in enumerate(wanted)}
+    samples = decode_imu(block.messages[number_of[topics.imu]], topics.imu)
+    before = np.zeros(block.topics.size, np.int64)
+    before[block.topics == number_of[topics.imu]] = samples.decoded
+    before = np.cumsum(before)
+    gnss: list[tuple[int, Gnss]] = []
+    for topic in dict.fromkeys(filter(None, (topics.fix, topics.velocity))):
+        found = decode_gnss(block.messages[number_of[topic]], topic, config)
+        places = np.flatnonzero(block.topics == number_of[topic]).tolist()
+        for kind, source in (('fix', topics.fix), ('velocity', topics.velocity)):
+            if topic is source:
+                gnss += zip(places, found[kind])
     gnss.sort(key=itemgetter(0))
+    reference = topics.reference or topics.imu
+    orientations = block.messages[number_of[reference]] if topics.reference else ()
     return Part(topics, config, samples,
                 tuple((int(before[place]), message) for place, message in gnss),
-                decode_orientations(orientations, (topics.reference or topics.imu).encoding),
-                done, warnings)
+                decode_orientations(orientations, reference), done, warnings)
 
 
 def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | None = None,
@@ -228,43 +202,46 @@ def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | N
         the option that chooses one.
 
     """
-    imu_topic = _required(bag, 'IMU', [IMU_TYPE], [*INERTIAL_UNITS], imu)
-    fix_topic = _required(bag, 'position', *(
-        (FIX_TYPES, [*RECEIVERS]) if config.fix_type == 'NavSatFix' else
-        ([LIVE_TYPES[config.fix_type]], [*FIX_TYPES, *RECEIVERS])), fix)
-    velocity_topic = None
-    if velocity is not None:
-        velocity_topic = _named(bag, 'velocity', [*VELOCITY_TYPES, *RECEIVERS], velocity)
-        _measures(bag, velocity_topic, config)  # for the warning: it is read as the user wishes
-    elif config.use_velocity is not False and fix_topic.msgtype in RECEIVERS:
-        velocity_topic = fix_topic
-    elif config.use_velocity is not False:
-        preferred = [name for name in VELOCITY_TYPES if _short(name) == config.velocity_type]
-        others = [name for name in VELOCITY_TYPES if name not in preferred]
-        twists = [name for name in others if name != VECTOR_TYPE]
-        velocity_topic = _only(bag, 'velocity', preferred, config)
-        if velocity_topic is not None:
-            _warn_of_others(bag, velocity_topic, others)
-        else:
-            velocity_topic = (_only(bag, 'velocity', twists, config)
-                              or _only(bag, 'velocity', [VECTOR_TYPE], config)
-                              or _only(bag, 'velocity', [*RECEIVERS], config))
-        if velocity_topic is None:
-            _warn_of_unstamped(bag)
+    imu_topic = _required(bag, 'IMU', ([IMU_TYPE], [*INERTIAL_UNITS]), imu)
+    fix_topic = _required(bag, 'position', (
+        ([FIX_TYPE], [*RECEIVERS]) if config.fix_type == 'NavSatFix' else
+        ([LIVE_TYPES[config.fix_type]], [FIX_TYPE, *RECEIVERS])), fix)
     reference = next((topic for topic in bag.topics if topic.name == REFERENCE_TOPIC
                       and topic.msgtype == IMU_TYPE), None)
-    return Topics(imu_topic, fix_topic, velocity_topic,
-                  _short(velocity_topic.msgtype) if velocity_topic is not None
-                  and velocity_topic.msgtype in VELOCITY_TYPES else None, reference)
+    return Topics(imu_topic, fix_topic, _velocity(bag, config, fix_topic, velocity), reference)
 
 
-def _required(bag: Bag, what: str, types: list[str], others: list[str], name: str | None,
-              ) -> Topic:
-    """Return the one topic of some types, or of others where there is none of these."""
-    topic = (_only(bag, what, types) or _only(bag, what, others) if name is None
-             else _named(bag, what, [*types, *others], name))
+def _velocity(bag: Bag, config: Config, fix: Topic, name: str | None) -> Topic | None:
+    """Choose a velocity, if there is one, and warn of those that are left out."""
+    if name is None and config.use_velocity is False:
+        return None
+    if name is None and fix.msgtype in RECEIVERS:
+        return fix
+    preferred = [each for each in VELOCITY_TYPES if short_name(each) == config.velocity_type]
+    others = [each for each in VELOCITY_TYPES if each not in preferred]
+    twists = [each for each in others if each != VECTOR_TYPE]
+    topic = _choose(bag, 'velocity', (preferred, twists, [VECTOR_TYPE], [*RECEIVERS]), name,
+                    config)
     if topic is None:
-        raise BagError(f'{bag.path} has no {what} topic ({_in_words(types)}); {_listing(bag)}')
+        for other in sorted(_candidates(bag, UNSTAMPED_TYPES), key=attrgetter('name')):
+            if not is_command(other):
+                bag.warn(f'{other.name} cannot be used: {type_in_words(other.msgtype)} has no '
+                         f'stamp; a velocity needs {_in_words(VELOCITY_TYPES)}')
+    elif name is not None:
+        _measures(bag, topic, config)  # for the warning: it is read as the user wishes
+    elif topic.msgtype in preferred:
+        if names := sorted(f'{other.name} ({short_name(other.msgtype)})'
+                           for other in _candidates(bag, others)
+                           if _measures(bag, other, say=False)):
+            bag.warn(f'the velocity is read from {topic.name} ({short_name(topic.msgtype)}), '
+                     f'not from {", ".join(names)}: --velocity-topic chooses')
+    return topic
+
+
+def _required(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None) -> Topic:
+    topic = _choose(bag, what, groups, name)
+    if topic is None:
+        raise BagError(f'{bag.path} has no {what} topic ({_in_words(groups[0])}); {_listing(bag)}')
     return topic
 
 
@@ -273,16 +250,23 @@ def _candidates(bag: Bag, types: list[str]) -> list[Topic]:
             and REFERENCE_NAMESPACE not in topic.name]
 
 
-def _only(bag: Bag, what: str, types: list[str], config: Config = Config()) -> Topic | None:
-    """Return the one topic of some types; where there are more the one that measures."""
-    candidates = _candidates(bag, types)
-    if what == 'velocity' or len(candidates) > 1 or types[0] in DRIVER_TYPES:
-        candidates = [topic for topic in candidates if _measures(bag, topic, config)]
-    if len(candidates) > 1:
-        names = ', '.join(sorted(topic.name for topic in candidates))
-        raise BagError(f'{bag.path} has more than one {what} topic ({names}): '
-                       f'choose one with {OPTIONS[what]}')
-    return candidates[0] if candidates else None
+def _choose(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None,
+            config: Config = Config()) -> Topic | None:
+    """Return the topic of a name, or the one that measures of the first types that there are."""
+    if name is not None:
+        return _named(bag, what, list(dict.fromkeys(itertools.chain(*groups))), name)
+    for types in groups:
+        candidates = _candidates(bag, types)
+        # The only one of a standard type is read whatever it says of itself.
+        if what == 'velocity' or len(candidates) > 1 or types[0] in DRIVER_TYPES:
+            candidates = [topic for topic in candidates if _measures(bag, topic, config)]
+        if len(candidates) > 1:
+            names = ', '.join(sorted(topic.name for topic in candidates))
+            raise BagError(f'{bag.path} has more than one {what} topic ({names}): '
+                           f'choose one with {OPTIONS[what]}')
+        if candidates:
+            return candidates[0]
+    return None
 
 
 def _named(bag: Bag, what: str, types: list[str], name: str) -> Topic:
@@ -294,26 +278,9 @@ def _named(bag: Bag, what: str, types: list[str], name: str) -> Topic:
     if topic is None:
         raise BagError(f'{bag.path} has no topic {full_name}; {_listing(bag)}')
     if topic.msgtype not in types:
-        raise BagError(f'{OPTIONS[what]} {full_name} is of type {_in_words([topic.msgtype])}, '
+        raise BagError(f'{OPTIONS[what]} {full_name} is of type {type_in_words(topic.msgtype)}, '
                        f'but {what} needs {_in_words(types)}')
     return topic
-
-
-def _warn_of_others(bag: Bag, velocity: Topic, types: list[str]) -> None:
-    """Say which velocities of other types are left out."""
-    names = sorted(f'{topic.name} ({_short(topic.msgtype)})' for topic in _candidates(bag, types)
-                   if _measures(bag, topic, say=False))
-    if names:
-        bag.warn(f'the velocity is read from {velocity.name} ({_short(velocity.msgtype)}), not '
-                 f'from {", ".join(names)}: --velocity-topic chooses')
-
-
-def _warn_of_unstamped(bag: Bag) -> None:
-    """Say which topics may be velocities, of types that an alignment cannot use."""
-    for topic in sorted(_candidates(bag, UNSTAMPED_TYPES), key=attrgetter('name')):
-        if not is_command(topic):
-            bag.warn(f'{topic.name} cannot be used: {_in_words([topic.msgtype])} has no stamp; a '
-                     f'velocity needs {_in_words(VELOCITY_TYPES)}')
 
 
 def may_be_velocity(topic: Topic) -> bool:
@@ -347,14 +314,12 @@ def _measures(bag: Bag, topic: Topic, config: Config = Config(), say: bool = Tru
             imu_from_driver(message, topic.msgtype)
         elif topic.msgtype in VELOCITY_TYPES:
             velocity_from_msg(message, dataclasses.replace(
-                config, velocity_type=_short(topic.msgtype)))
+                config, velocity_type=short_name(topic.msgtype)))
     except MessageError as error:
         if say:
             bag.warn(f'{topic.name} cannot be used: {error}')
         return False
-    # sensor_msgs/Imu: -1 marks what a sensor does not measure.
-    return topic.msgtype != IMU_TYPE or (message.angular_velocity_covariance[0] != -1.0
-                                         and message.linear_acceleration_covariance[0] != -1.0)
+    return topic.msgtype != IMU_TYPE or not unmeasured(message)
 
 
 def _listing(bag: Bag) -> str:
@@ -364,9 +329,5 @@ def _listing(bag: Bag) -> str:
             f'it has {", ".join(names[:LISTED_TOPICS])}{f" and {more} more" if more > 0 else ""}')
 
 
-def _short(msgtype: str) -> str:
-    return msgtype.rsplit('/', 1)[-1]
-
-
-def _in_words(types: list[str]) -> str:
+def _in_words(types: Sequence[str]) -> str:
     return ' or '.join(map(type_in_words, types))

@@ -23,12 +23,10 @@ from typing import Any
 from ins_align.config import Config
 from ins_align.geometry.rotation import (
     Array, exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw)
-from ins_align.gnss.buffer import fault_of_fix
-from ins_align.gnss.messages import Fix
+from ins_align.gnss.messages import fault_of_fix, Fix
 from ins_align.mounting import base_attitude
 from ins_align.offline import OfflineAligner
 from ins_align.processes import run_ahead
-from ins_align.recordings.decode import Attitudes
 from ins_align.recordings.reader import read, Request, Topics
 from ins_align.results import Attitude, attitude_json, Result
 import numpy as np
@@ -42,12 +40,13 @@ class Reference:
 
     Parameters
     ----------
-    *parts : Attitudes
-        At least one, in any order; of one stamp the first counts.
+    *parts : tuple of ndarray
+        Stamps, ns, and quaternions as from `Orientations.known`, at least one part, in any order;
+        of one stamp the first counts.
 
     """
 
-    def __init__(self, *parts: Attitudes) -> None:
+    def __init__(self, *parts: tuple[np.ndarray, np.ndarray]) -> None:
         stamps, quaternions = map(np.concatenate, zip(*parts))
         self._stamps_ns, first = np.unique(stamps, return_index=True)
         self._quaternions = quaternions[first]
@@ -166,7 +165,7 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
                       duration)
     run: OfflineAligner | None = None
     fixes: list[tuple[int, float, float]] = []
-    attitudes: list[Attitudes] = []
+    orientations: list[tuple[np.ndarray, np.ndarray]] = []
     for part in run_ahead(read, request) if read_ahead else read(request):
         run = run or OfflineAligner(part.config, part.topics.base)
         run.reject('imu_undecodable', np.count_nonzero(~part.imu.decoded))
@@ -174,7 +173,7 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
         fixes += [(message.stamp_ns, message.latitude_deg, message.longitude_deg)
                   for _, message in part.gnss
                   if isinstance(message, Fix) and not fault_of_fix(message)]
-        attitudes.append(part.orientations.known())
+        orientations.append(part.orientations.known())
         if progress is not None:
             progress(part.done)
     assert run is not None
@@ -182,8 +181,8 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
     first_fix_ns = fixes[0][0] if fixes else 0
     track = np.array([(stamp_ns - first_fix_ns, *place)
                       for stamp_ns, *place in fixes]).reshape(-1, 3)
-    there = any(known.stamps_ns.size for known in attitudes)
+    there = any(stamps_ns.size for stamps_ns, _ in orientations)
     return ReplayResult(
         config=part.config, status=status, epochs=epochs, bag=str(path), warnings=part.warnings,
-        reference=Reference(*attitudes) if there else None, topics=part.topics, track=track,
+        reference=Reference(*orientations) if there else None, topics=part.topics, track=track,
         first_fix_ns=first_fix_ns)

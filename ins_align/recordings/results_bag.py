@@ -27,7 +27,7 @@ from ins_align.imu.prediction import Prediction
 from ins_align.mounting import Mounting
 from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
-from ins_align.recordings.decode import decode_imu_topic, deserialize
+from ins_align.recordings.decode import decode_imu, deserialize
 from ins_align.recordings.replay import ReplayResult
 from ins_align.results import Epoch, State, Status
 from ins_align.status_values import base_values, level_of, status_values
@@ -127,7 +127,7 @@ class _Results:
         with Bag(self._result.bag) as bag:
             for block in bag.blocks([topic]):
                 messages = block.messages[0]
-                samples = decode_imu_topic(messages, topic)
+                samples = decode_imu(messages, topic)
                 places = np.flatnonzero(samples.decoded)
                 for place, *numbers in zip(
                         places.tolist(), samples.stamps_ns.tolist(), samples.gyro, samples.accel):

@@ -11,12 +11,15 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Checks that need no alignment: samples and units of the IMU, velocity against position."""
+"""
+What makes IMU samples miss the motion, and how much noise that is.
 
-from collections import deque
+Spikes, samples that repeat, the end of the sensors' range, lost samples, stamps that jitter,
+white noise as it is measured, and units that cannot be right.
+"""
+
 import math
 
-from ins_align.geometry.earth import Place, way
 from ins_align.geometry.rotation import Array, Index
 import numpy as np
 
@@ -24,14 +27,6 @@ import numpy as np
 # falls, flies loops (up to 6 g) or its units are wrong (m/s^2).
 FORCE_RANGE = 4.0, 60.0
 FORCE_TIME, FORCE_SAMPLES = 5.0, 20
-# Distance over which velocity and position are compared: at least this, and so many sigmas.
-MIN_DISTANCE = 10.0
-DISTANCE_SIGMAS = 8.0
-# Mismatch, as a share of the distance, that no noise explains, and how many in a row convict.
-MAX_MISMATCH = 0.5
-CONVICTING = 4
-# So many fixes in a row have to agree, to within the same share of the distance, at its end.
-AGREEING = 3
 # A spike leaves the mean of its neighbours by at least this (rad/s, m/s^2), by this many times as
 # much as the neighbours differ, and as other samples do: of so many before it, this one in the
 # order of size, so that one more spike among them does no harm.
@@ -51,6 +46,15 @@ BEYOND_END = 0.5
 BLIND_ANGLE = 0.35
 # Samples that both checks want to see before those that they judge.
 IMU_BEFORE = SPIKE_BEFORE + 2
+# A step this many times the usual one holds lost samples; what the motion can do meanwhile
+# (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
+GAP_STEPS = 2.5
+GAP_ANGULAR_ACCELERATION, GAP_JERK = 2.0, 20.0
+# Samples come in bunches, stamped on arrival, where the usual step is so much shorter than the
+# longest but for one in twenty: then those are the usual pauses.
+BUNCHED, PAUSES = 0.2, 0.95
+# Standard deviation of stamps over the median of what the steps between them deviate.
+JITTER_OF_MEDIAN = 1.4826 / math.sqrt(2)
 
 
 def without_spikes(stamps: Index, samples: Array) -> tuple[Array, np.ndarray]:
@@ -65,8 +69,8 @@ def without_spikes(stamps: Index, samples: Array) -> tuple[Array, np.ndarray]:
     stamps : ndarray of int, shape (N,)
         Increasing.
     samples : ndarray, shape (N, 6)
-        Angular rate, rad/s, and specific force, m/s^2. The first `SPIKE_BEFORE` + 1 and the last
-        one cannot be judged.
+        Angular rate, rad/s, and specific force, m/s^2. The first `SPIKE_BEFORE` + 1
+        and the last one cannot be judged.
 
     Returns
     -------
@@ -156,17 +160,7 @@ class RangeCheck:
         self.blind: list[int] = []
 
     def add(self, stamps: Index, samples: Array) -> None:
-        """
-        Take samples that follow those before.
-
-        Parameters
-        ----------
-        stamps : ndarray of int, shape (N,)
-            Increasing, ns.
-        samples : ndarray, shape (N, 6)
-            Angular rate, rad/s, and specific force, m/s^2.
-
-        """
+        """Take samples, stamps in ns, shape (N,), and values, (N, 6), that follow the last."""
         if not stamps.size:
             return
         at_end = self._at_end(samples).reshape(-1, 2, 3)
@@ -186,6 +180,19 @@ class RangeCheck:
         angles = np.concatenate([[self._angles], missed[:, 0] * seconds[:, 0] // BLIND_ANGLE])
         self.blind += stamps[k[angles[1:] > angles[:-1]]].tolist()
         self._angles = angles[-1]
+
+    def beyond(self, stamps: Index, ends_ns: Index, dt: Array) -> Array:
+        """Return densities, shape (2, K, n), of the steps `dt` between ends, of samples so far."""
+        beyond = np.zeros((2,) + dt.shape)
+        inside = slice(*np.searchsorted(self.stamps, ends_ns[[0, -1]]))
+        saturated = self.stamps[inside]
+        if saturated.size:
+            interval = np.searchsorted(ends_ns, saturated, side='right') - 1
+            # An interval's first step begins at its start, at a sample or between two.
+            first = np.searchsorted(stamps, ends_ns[:-1], side='right') - 1
+            step = np.searchsorted(stamps, saturated) - first[interval]
+            beyond[:, interval, step] = self.densities[inside].T
+        return beyond
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop what was found before a stamp."""
@@ -221,6 +228,77 @@ class RangeCheck:
         return at_end
 
 
+def white_noise(stamps_ns: Index, samples: Array, first: Index, last: Index) -> Array:
+    """
+    Return the white noise densities of gyros and accelerometers in K windows of the data.
+
+    Third divided differences take out everything that is quadratic over four samples, which
+    motion is, and leave what is new in each sample. Vibration counts as noise.
+
+    Parameters
+    ----------
+    stamps_ns : ndarray of int, shape (N,)
+        Strictly increasing.
+    samples : ndarray, shape (N, 6)
+        Angular rate, rad/s, and specific force, m/s^2.
+    first, last : ndarray of int, shape (K,)
+        Each window's first sample and the one after its last.
+
+    Returns
+    -------
+    ndarray, shape (K, 2)
+        rad/sqrt(s) and m/s/sqrt(s), mean over the axes; 0 for fewer than eight samples.
+
+    """
+    count = last - first - 3
+    enough = count >= 5
+    if not np.any(enough):
+        return np.zeros((first.size, 2))
+    n = stamps_ns.size - 3
+    # From each of four samples to the next ones.
+    one, two, three = ((stamps_ns[k:] - stamps_ns[:-k]) * 1e-9 for k in (1, 2, 3))
+    (a, b, c), (ab, bc) = ([spacing[i:i + n] for i in range(count)]
+                           for spacing, count in ((one, 3), (two, 2)))
+    weights = 1 / np.stack([-(a * ab * three), a * b * bc, -(ab * b * c), three * bc * c])
+    weights /= np.sqrt(np.sum(weights ** 2, axis=0))
+    left = np.zeros((6, n + 1))
+    for i in range(4):
+        left[:, :-1] += weights[i] * samples.T[:, i:i + n]
+    first, last, count = (np.where(enough, x, y) for x, y in ((first, 0), (last, n), (count, 1)))
+    sums = np.add.reduceat(np.square(left), np.stack([first, last - 3], axis=1).ravel(),
+                           axis=1)[:, ::2]
+    spacing = (stamps_ns[last - 1] - stamps_ns[first]) * 1e-9 / (last - first - 1)
+    density = np.sqrt(sums.T.reshape(-1, 2, 3).mean(axis=2) * (spacing / count)[:, None])
+    return np.where(enough[:, None], density, 0.0)
+
+
+def gap_and_jitter(stamps_ns: Index, first: Index, last: Index, dt: Array) -> tuple[Array, Array]:
+    """
+    Return what becomes of steps, `dt` of shape (K, n), with lost samples and jittering stamps.
+
+    The first is to be multiplied with what the motion can do in a gap, the second with what it
+    does to a sample whose stamp jitters: its change per second. Densities then. What is usual is
+    that in K windows of the stamps, as in `white_noise`.
+    """
+    steps, last = np.diff(stamps_ns) * 1e-9, last - 1
+    count = (last - first)[:, None]
+    place = np.arange(np.max(count))
+    windows = np.where(place < count, steps[first[:, None] + np.minimum(place, count - 1)], np.inf)
+
+    def ranked(values: Array, rank: Index) -> Array:
+        return np.take_along_axis(np.sort(values, axis=1), rank, axis=1)
+
+    half = count // 2
+    usual, pause = ranked(windows, np.hstack([half, (PAUSES * count).astype(int)])).T[..., None]
+    deviation = ranked(np.abs(windows - usual), half)
+    bunched = usual < BUNCHED * pause
+    # Of bunches the pause is the usual step, and they are spread evenly over it.
+    gap = np.where(dt > GAP_STEPS * np.where(bunched, pause, usual), dt, 0.0)
+    jitter = JITTER_OF_MEDIAN * np.where(bunched, 0.3 * pause, deviation)
+    # An error of acceleration * dt^2 over the step, as a density: squared, over dt.
+    return gap ** 1.5, jitter * np.sqrt(dt)
+
+
 def force_fault(mean: float) -> str:
     """Say what is wrong with a mean magnitude of the specific force, m/s^2; '' if nothing is."""
     return '' if FORCE_RANGE[0] < mean < FORCE_RANGE[1] else (
@@ -247,64 +325,3 @@ class ForceCheck:
         mean = self._sum / self._count
         self._sum, self._count, self._seconds = 0.0, 0, 0.0
         self.fault = force_fault(mean)
-
-
-class VelocityCheck:
-    """Whether the receiver's velocity is the derivative of its position: frame and axes."""
-
-    def __init__(self) -> None:
-        """Start with nothing compared."""
-        self._origin: Place | None = None
-        self._path = 0.0, 0.0
-        # East and north of the fix, and of what the velocity makes of the way, since the origin.
-        self._recent: deque[tuple[float, ...]] = deque(maxlen=AGREEING)
-        self._anchor: tuple[float, ...] | None = None
-        self._last: tuple[float, float, float] | None = None
-        self.bad_in_a_row = 0
-        self._as_ned_in_a_row = 0
-
-    def add(self, time: float, place: Place, v_n: Array, position_std: float) -> None:
-        """Take an epoch that has both; seconds, radians, metres, ENU."""
-        east, north, _ = v_n.tolist()
-        if self._last is not None and 0 < time - self._last[0] < 2.5:
-            half = (time - self._last[0]) / 2
-            self._path = (self._path[0] + half * (self._last[1] + east),
-                          self._path[1] + half * (self._last[2] + north))
-        else:
-            self._origin = None
-        self._last = time, east, north
-        if self._origin is None:
-            self._origin, self._path, self._anchor = place, (0.0, 0.0), None
-            self._recent.clear()
-        self._recent.append((*way(self._origin, place)[:2], *self._path))
-        if len(self._recent) < AGREEING:
-            return
-        here = self._recent[AGREEING // 2]
-        if self._anchor is None:
-            self._anchor = here
-            return
-        moved_e, moved_n, went_e, went_n = (now - then for now, then in zip(here, self._anchor))
-        distance = max(math.hypot(moved_e, moved_n), math.hypot(went_e, went_n))
-        tolerance = MAX_MISMATCH * distance
-        # A wild fix is no journey, and one after the other they do not agree.
-        if (distance < max(MIN_DISTANCE, DISTANCE_SIGMAS * position_std)
-                or any(math.dist(other[:2], here[:2]) > tolerance for other in self._recent)):
-            return
-        bad = math.hypot(moved_e - went_e, moved_n - went_n) > tolerance
-        as_ned = math.hypot(moved_e - went_n, moved_n - went_e) < tolerance
-        self._origin = None                   # the next journey begins here
-        if as_ned and not bad:
-            return                            # to north-east both frames say the same
-        self.bad_in_a_row = self.bad_in_a_row + 1 if bad else 0
-        self._as_ned_in_a_row = self._as_ned_in_a_row + 1 if as_ned else 0
-
-    @property
-    def fault(self) -> str:
-        """Fault in words; empty when nothing is known to be wrong."""
-        if self.bad_in_a_row < CONVICTING:
-            return ''
-        if self._as_ned_in_a_row >= CONVICTING:
-            return ('the GNSS velocity contradicts the change of position, and would fit it with '
-                    'north and east exchanged: set velocity_frame to the other one (enu, ned)')
-        return ('the GNSS velocity contradicts the change of position: check that it is given in '
-                'a world frame (velocity_frame) and in m/s')
