@@ -31,20 +31,21 @@ def test_medians_of_processes():
 
 
 def test_rows_have_ratios():
-    assert bench.row_of('x', 1.5, 3.0, 's', '1') == ['x', '1.5 s', '3 s', '0.50', '1']
+    assert bench.row_of('x', 1.5, 3.0, 's', '1') == {
+        'name': 'x', 'ours': '1.5 s', 'other': '3 s', 'ratio': '0.50', 'target': '1'}
 
 
 def test_every_epoch_is_timed(monkeypatch):
     monkeypatch.setattr(bench, 'EPOCH_SECONDS', 6.0)
     epochs, memory = bench.epoch_rows()
-    assert '30: median' in epochs[0]
-    median, longest = (float(cell.split()[0]) for cell in epochs[1:3])
+    assert '30: median' in epochs['name']
+    median, longest = (float(epochs[cell].split()[0]) for cell in ('ours', 'other'))
     assert 0.0 < median <= longest
-    assert float(memory[1].split()[0]) >= float(memory[2].split()[0]) >= 0.0
+    assert float(memory['ours'].split()[0]) >= float(memory['other'].split()[0]) >= 0.0
 
 
 def test_bare_pass_counts_the_recording(tmp_path, monkeypatch):
     monkeypatch.setattr(bench, 'REPEATS', 1)
     row = bench.replay_against_bare_pass(tmp_path, 'mcap', 1)
-    assert row[0] == 'replay of 1 min, mcap; bare pass'
-    assert all(float(cell.split()[0]) > 0.0 for cell in row[1:4])
+    assert row['name'] == 'replay of 1 min, mcap; bare pass'
+    assert all(float(row[cell].split()[0]) > 0.0 for cell in ('ours', 'other', 'ratio'))

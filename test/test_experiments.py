@@ -19,9 +19,10 @@ import math
 
 from ins_align import experiments
 from ins_align.aligner import Aligner, Attitude, State
-from ins_align.config import PRESETS
+from ins_align.config import Config, PRESETS
 from ins_align.experiments import (
-    bound, common, declare, declare_worse, note, recordings, spoilt, weak_spots)
+    bound, common, declare, declare_worse, note, recordings, weak_spots)
+from ins_align.experiments.stream import stream_of
 from ins_align.geometry.rotation import exp_so3, matrix_from_rpy
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
@@ -37,8 +38,9 @@ def square(number):
 
 def test_parallel_keeps_the_order_in_any_number_of_processes():
     tasks = list(range(7))
-    assert common.parallel(square, tasks, 1) == [n * n for n in tasks]
-    assert common.parallel(square, tasks, 2) == [n * n for n in tasks]
+    for jobs in (1, 2):
+        assert common.parallel(square, [tasks, [], tasks[:2]], jobs) == [
+            [n * n for n in tasks], [], [0, 1]]
 
 
 def test_error_is_counted_in_stated_sigmas():
@@ -63,7 +65,7 @@ def test_exact_model_is_that_of_the_simulation():
 
 def test_bound_is_reached_on_a_navigation_grade_flight(monkeypatch):
     monkeypatch.setattr(bound, 'TIMES', bound.TIMES[:6])
-    case = next(case for case in bound.cases() if case.grade == 'navigation')
+    case = next(case for case in bound.CASES if case.grade == 'navigation')
     limits = bound.bounds_of(case)
     runs = [bound.run_case((case, seed)) for seed in range(4)]
     result = bound.summary(case, limits, runs)
@@ -95,19 +97,22 @@ def test_every_combination_of_faults_is_drawn_once():
     names = {fault for combination in declare_worse.COMBINATIONS for fault in combination}
     assert names == set(declare_worse.FAULTS)
     seeds = range(len(declare_worse.COMBINATIONS) * len(declare_worse.SCENARIOS))
-    drawn = [declare_worse.drawn(seed) for seed in seeds]
-    assert drawn[7] == declare_worse.drawn(7)
+    drawn = [declare_worse.trial(seed) for seed in seeds]
+    assert drawn[7] == declare_worse.trial(7)
     assert len({(d['faults'], d['scenario']) for d in drawn}) == len(drawn)
 
 
 def test_imus_worse_than_configured(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(declare_worse, 'DURATION', 16.0)
     monkeypatch.setattr(declare_worse, 'STAND_STILL', 0.0)
-    clean = declare_worse.run_one(5, faults=(), scenario='car')
-    assert clean == declare_worse.run_one(5, faults=(), scenario='car')
+    task = declare_worse.trial(5, faults=(), scenario='car')
+    clean = declare.run_trial(task)
+    assert clean == declare.run_trial(task)
     assert clean['levelled']['current']['tilt_sigmas'] < 5
-    noisy = declare_worse.run_one(5, faults=('noise x 3',), scenario='car')
-    assert noisy['simulate'] == clean['simulate'] and noisy['levelled'] != clean['levelled']
+    worse = declare_worse.trial(5, faults=('noise x 3',), scenario='car')
+    noisy = declare.run_trial(worse)
+    assert worse['simulate'] == task['simulate'] | declare_worse.FAULTS['noise x 3']
+    assert noisy['levelled'] != clean['levelled']
     declare_worse.write(tmp_path, [clean])
     assert 'Beyond 3 sigma' in capsys.readouterr().out
     assert len(json.loads((tmp_path / 'declare-worse.json').read_text())['runs']) == 1
@@ -115,16 +120,16 @@ def test_imus_worse_than_configured(tmp_path, monkeypatch, capsys):
 
 def test_shares_beyond_the_limits(tmp_path, capsys):
     def result(faults, sigma):
-        angles = {'tilt_sigmas': sigma, 'heading_sigmas': 0.5}
-        return {'seed': 1, 'faults': faults, 'scenario': 'car', 'aligned': None,
+        angles = {'tilt_sigmas': sigma, 'heading_sigmas': 0.5, 'error_deg': [0.1, -0.2, 0.7]}
+        return {**declare_worse.trial(1, faults, 'car'), 'aligned': None,
                 'levelled': {'t_s': 4.0, 'initial': angles, 'current': angles}}
     fault = next(iter(declare_worse.FAULTS))
     declare_worse.write(tmp_path, [result((), 1.0), result((), 4.0), result((fault,), 6.0)])
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     none = next(line for line in lines if line[:1] == ['none'])
-    assert none[1:12] == '2 2 4.0 50.0 % 0.0 % 0.0 % 0.0 %'.split()
+    assert none[1:] == '2 2 4.0 1 (50.0 %) 0 (0.0 %) 4.0 0.2 0 (0.0 %) 0 (0.0 %) 0.5 0.7'.split()
     alone = next(line for line in lines if line[:len(fault.split())] == fault.split())
-    assert alone[len(fault.split()):][3:7] == '100.0 % 100.0 %'.split()
+    assert alone[len(fault.split()):][3:9] == '1 (100.0 %) 1 (100.0 %)'.split()
 
 
 def test_a_declared_trial_is_judged_against_the_truth(monkeypatch):
@@ -136,10 +141,6 @@ def test_a_declared_trial_is_judged_against_the_truth(monkeypatch):
     for moment in ('levelled', 'aligned', 'final'):
         for name in ('initial', 'current'):
             assert result[moment][name]['heading_sigmas'] < 5
-    assert declare.row('x', [result], 'aligned', 'heading_sigmas')[1:6] in (
-        [1, 1, 0, 0, 0], [1, 0, 1, 0, 0])
-    missing = {**result, 'aligned': None}
-    assert declare.row('x', [missing], 'aligned', 'heading_sigmas')[1:6] == [1, 0, 0, 0, 1]
 
 
 def test_note_with_and_without_lever_arm(monkeypatch):
@@ -197,9 +198,9 @@ def test_recordings_and_their_files(folder, tmp_path, capsys):
 
 def test_every_weak_spot_is_one_of_its_own():
     s = simulate('car', imu_rate=50.0, duration=100.0, seed=1, velocity_std_vertical=1.0)
-    whole = spoilt.stream_of(s)
+    whole = stream_of(s)
     for case in weak_spots.CASES:
-        stream = spoilt.stream_of(s)
+        stream = stream_of(s)
         if case.spoil is not None:
             case.spoil(stream, np.random.default_rng(1))
             assert stream.config != whole.config or any(
@@ -213,17 +214,17 @@ def test_every_weak_spot_is_one_of_its_own():
 def test_weak_spots_are_judged_by_the_clock_of_the_imu():
     s = simulate('flight', imu_grade='mems', duration=40.0, seed=1)
     for by_ns in (0, 3_600_000_000_000):
-        stream = spoilt.stream_of(s)
+        stream = stream_of(s)
         for rows in stream.imu, stream.fix, stream.velocity:
             rows['stamp'] += by_ns
         aligner = Aligner(common.config_for(s))
         true = partial(weak_spots.truth, s, stream)
-        result = weak_spots.follow(aligner, weak_spots.messages(stream, 100), true)
+        result = weak_spots.follow(aligner, weak_spots.messages(stream, Config(), 100), true)
         assert result['end'] and 0.0 < result['worst_sigmas'] < 5.0
         assert result['beyond_s'] == 0.0 and 0.3 < result['aligned_part'] < 0.9
         turned = exp_so3(np.radians([0.0, 0.0, 20.0]))
         wrong = weak_spots.follow(
-            Aligner(common.config_for(s)), weak_spots.messages(stream, 100),
+            Aligner(common.config_for(s)), weak_spots.messages(stream, Config(), 100),
             lambda stamps: [turned @ C for C in true(stamps)])
         assert wrong['declared_sigmas'] > 10.0 and 15.0 < wrong['worst_heading_deg'] < 25.0
         assert wrong['beyond_s'] == pytest.approx(40.0 - wrong['declared_s'], abs=0.5)

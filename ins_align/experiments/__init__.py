@@ -37,26 +37,11 @@ class ExperimentError(ValueError):
 def run(name: str, out_dir: str | Path, data_dir: str | Path | None = None,
         runs: int | None = None, jobs: int | None = None) -> None:
     """
-    Run an experiment, or all of them.
+    Run one of `NAMES` or `MEASUREMENTS`, or 'all' of the former; pages go to `out_dir`.
 
-    Parameters
-    ----------
-    name : str
-        One of `NAMES` or `MEASUREMENTS`, or 'all': those of `NAMES`.
-    out_dir : path
-        Made if it is not there.
-    data_dir : path, optional
-        Folder of recordings that carry a reference attitude on ``/reference/imu``.
-    runs : int, optional
-        Monte Carlo runs, where there are any.
-    jobs : int, optional
-        Processes at a time; by default one a processor.
-
-    Raises
-    ------
-    ExperimentError
-        If there is no such experiment or it lacks its input.
-
+    `data_dir` has recordings that carry a reference attitude on ``/reference/imu``; `runs` is of
+    Monte Carlo, `jobs` processes at a time, by default one a processor. ExperimentError says that
+    there is no such experiment or that it lacks its input.
     """
     known = (*NAMES, 'all', *MEASUREMENTS)
     if name not in known:

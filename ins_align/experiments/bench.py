@@ -14,7 +14,10 @@
 """
 Experiment ``bench``: speed, each figure against something measured in the same run.
 
-``--runs`` is how many minutes of data are replayed.
+``--runs`` is how many minutes of data are replayed. ``python -m ins_align.experiments.bench`` is a
+process that runs beside the node: ``bare`` subscribes to what the node subscribes to and does
+nothing, ``republish`` publishes each IMU message unchanged, ``listen`` takes what is published,
+``play BAG`` plays the drivers.
 """
 
 from __future__ import annotations
@@ -23,7 +26,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, ExitStack
 import os
 from pathlib import Path
-import pickle
 import resource
 import signal
 import statistics
@@ -34,7 +36,7 @@ import time
 from typing import Any
 
 from ins_align.aligner import Aligner
-from ins_align.experiments.common import config_for, Report
+from ins_align.experiments.common import config_for, JsonDict, Report
 from ins_align.simulation.simulate import give, simulate
 import numpy as np
 
@@ -43,7 +45,6 @@ REPEATS = 3
 CPU_SECONDS = 20.0
 EPOCH_SECONDS = 600.0
 TARGETS = {'mcap': '2.0', 'sqlite3': '3.0'}     # of replay over a bare pass, by storage
-NODES = 'ins_align.experiments.nodes'
 COUNT = """
 from pathlib import Path
 import sys
@@ -60,21 +61,23 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
     report.text('Ratios against something measured in the same run on the same machine; for '
                 'replay and start the median of three goes, for the node processor time of the '
                 'whole process while both run beside each other on the same messages.')
-    rows: list[list[str]] = []
     with tempfile.TemporaryDirectory() as folder:
-        for storage in TARGETS:
-            rows.append(replay_against_bare_pass(Path(folder), storage, minutes))
+        rows = [replay_against_bare_pass(Path(folder), storage, minutes) for storage in TARGETS]
         rows += node_rows(Path(folder))
-    rows += epoch_rows()
-    rows.append(start_row())
+    rows += [*epoch_rows(), start_row()]
     report.table('Ours, what it is measured against, their ratio and what it should be at most',
-                 ['', 'ours', 'other', 'ratio', 'target'], rows)
-    report.write([dict(zip(('name', 'ours', 'other', 'ratio', 'target'), row)) for row in rows])
+                 rows)
+    report.write(rows)
 
 
-def row_of(name: str, ours: float, other: float, unit: str, target: str) -> list[str]:
+def cells(name: str, ours: str, other: str, ratio: str = '', target: str = '') -> JsonDict:
     """Make a row of the table."""
-    return [name, f'{ours:.3g} {unit}', f'{other:.3g} {unit}', f'{ours / other:.2f}', target]
+    return {'name': name, 'ours': ours, 'other': other, 'ratio': ratio, 'target': target}
+
+
+def row_of(name: str, ours: float, other: float, unit: str, target: str) -> JsonDict:
+    """Make a row of two measurements and their ratio."""
+    return cells(name, f'{ours:.3g} {unit}', f'{other:.3g} {unit}', f'{ours / other:.2f}', target)
 
 
 def elapsed(command: Sequence[str]) -> float:
@@ -92,7 +95,7 @@ def medians(*commands: Sequence[str]) -> list[float]:
     return [statistics.median(column) for column in zip(*times)]
 
 
-def replay_against_bare_pass(folder: Path, storage: str, minutes: int) -> list[str]:
+def replay_against_bare_pass(folder: Path, storage: str, minutes: int) -> JsonDict:
     """Replay a recording, and only count its messages."""
     bag = folder / f'bag_{storage}'
     _command('simulate', str(bag), '--scenario', 'car', '--imu-rate', '200', '--duration',
@@ -111,21 +114,23 @@ def _command(*arguments: str) -> None:
     subprocess.run(_cli(*arguments), check=True, stdout=subprocess.DEVNULL)
 
 
-def node_rows(folder: Path) -> list[list[str]]:
+def node_rows(folder: Path) -> list[JsonDict]:
     """Compare processor times of nodes."""
-    script = folder / 'script.pickle'
-    script.write_bytes(pickle.dumps(_script(CPU_SECONDS + 15.0)))
+    bag = str(folder / 'played')
+    _command('simulate', bag, '--scenario', 'car', '--imu-rate', '200', '--gnss-rate', '10',
+             '--duration', f'{CPU_SECONDS + 15.0}')
+    beside = '-m', 'ins_align.experiments.bench'
     rows = []
     for name, title in (('bare', 'node, nobody listens; node that does nothing'),
                         ('republish', 'node, ~/imu listened to; node that republishes')):
         with ExitStack() as stack:
-            other = stack.enter_context(_process('-m', NODES, name))
+            other = stack.enter_context(_process(*beside, name))
             ours = stack.enter_context(_process(
                 '-m', 'ins_align.ros.main', '--ros-args', '-p', 'lever_arm:=[1.0, 1.0, 1.0]'))
             if name == 'republish':
-                stack.enter_context(_process('-m', NODES, 'listen'))
+                stack.enter_context(_process(*beside, 'listen'))
             time.sleep(3.0)
-            stack.enter_context(_process('-m', NODES, 'play', str(script)))
+            stack.enter_context(_process(*beside, 'play', bag))
             time.sleep(8.0)
             before = _cpu_seconds(ours), _cpu_seconds(other)
             time.sleep(CPU_SECONDS)
@@ -133,13 +138,6 @@ def node_rows(folder: Path) -> list[list[str]]:
                      for pid, start in zip((ours, other), before)]
         rows.append(row_of(title, *spent, '% CPU', '1.15'))
     return rows
-
-
-def _script(seconds: float) -> Any:
-    # In a process of its own, this one need not have ROS to be imported.
-    from ins_align.experiments.nodes import script_of
-
-    return script_of(simulate('car', imu_rate=200.0, gnss_rate=10.0, duration=seconds))
 
 
 @contextmanager
@@ -164,7 +162,7 @@ def _cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
 
-def epoch_rows() -> list[list[str]]:
+def epoch_rows() -> list[JsonDict]:
     """Measure the time of every GNSS epoch with its IMU samples, and how memory grows."""
     data = simulate('car', duration=EPOCH_SECONDS)
     aligner = Aligner(config_for(data))
@@ -179,14 +177,86 @@ def epoch_rows() -> list[list[str]]:
             start = now
             resident.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
     grown = resident[-1] - resident[len(resident) // 10]
-    return [[f'GNSS epoch of the estimator, {len(times)}: median; longest',
-             f'{np.median(times):.3g} ms', f'{max(times):.3g} ms', '', '20 ms'],
-            [f'largest memory in {EPOCH_SECONDS / 60:g} min; its growth after a tenth of them',
-             f'{resident[-1]:.0f} MB', f'{grown:.1f} MB', '', '']]
+    return [cells(f'GNSS epoch of the estimator, {len(times)}: median; longest',
+                  f'{np.median(times):.3g} ms', f'{max(times):.3g} ms', target='20 ms'),
+            cells(f'largest memory in {EPOCH_SECONDS / 60:g} min; its growth after a tenth of '
+                  'them', f'{resident[-1]:.0f} MB', f'{grown:.1f} MB')]
 
 
-def start_row() -> list[str]:
+def start_row() -> JsonDict:
     """Compare the start of the command with that of Python."""
     ours, other = medians(_cli('--help'), [sys.executable, '-c', 'pass'])
-    return ['ins_align --help; start of Python', f'{ours:.3g} s', f'{other:.3g} s',
-            f'{ours / other:.2f}', 'less than 0.5 s longer']
+    return row_of('ins_align --help; start of Python', ours, other, 's', 'less than 0.5 s longer')
+
+
+# The processes beside the node
+
+def _types() -> dict[str, Any]:
+    from geometry_msgs.msg import TwistWithCovarianceStamped
+    from sensor_msgs.msg import Imu, NavSatFix
+
+    return {'/imu/data_raw': Imu, '/fix': NavSatFix, '/fix_velocity': TwistWithCovarianceStamped}
+
+
+def _nothing(msg: Any) -> None:
+    pass
+
+
+def _spin(name: str) -> None:
+    import rclpy
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+    node, types = rclpy.create_node(name), _types()
+    imu_type = types['/imu/data_raw']
+    if name == 'listen':
+        for topic in ('/republish/imu', '/ins_align/imu'):
+            node.create_subscription(imu_type, topic, _nothing, 100, raw=True)
+    else:
+        callbacks = dict.fromkeys(types, _nothing)
+        if name == 'republish':
+            callbacks['/imu/data_raw'] = node.create_publisher(imu_type, '~/imu', 100).publish
+        for topic, callback in callbacks.items():
+            node.create_subscription(types[topic], topic, callback, QoSProfile(
+                depth=2000 if types[topic] is imu_type else 200,
+                reliability=ReliabilityPolicy.BEST_EFFORT))
+    # A signal between two waits of the executor would not be seen.
+    node.create_timer(1.0, lambda: None)
+    rclpy.spin(node)
+
+
+def _play(bag: str) -> None:
+    import rclpy
+    from rosbags.highlevel import AnyReader
+
+    types = _types()
+    with AnyReader([Path(bag)]) as reader:
+        script = [(connection.topic, time_ns, data) for connection, time_ns, data
+                  in reader.messages() if connection.topic in types]
+    node = rclpy.create_node('play')
+    publish = {topic: node.create_publisher(kind, topic, 1000).publish
+               for topic, kind in types.items()}
+    time.sleep(2.0)  # they have to find each other
+    start = time.monotonic() - script[0][1] * 1e-9
+    for topic, time_ns, data in script:
+        time.sleep(max(0.0, start + time_ns * 1e-9 - time.monotonic()))
+        publish[topic](bytes(data))
+
+
+def main(name: str, *arguments: str) -> int:
+    """Run one of the processes until it is interrupted."""
+    import rclpy
+    from rclpy.executors import ExternalShutdownException
+
+    rclpy.init()
+    try:
+        if name == 'play':
+            _play(*arguments)
+        else:
+            _spin(name)
+    except ExternalShutdownException:
+        pass
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main(*sys.argv[1:]))

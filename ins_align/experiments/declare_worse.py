@@ -15,7 +15,7 @@
 Experiment ``declare-worse``: what a declaration is worth with an IMU worse than configured.
 
 Every run is configured as `mems` with the right lever arm, and its IMU or receiver has one or two
-of `FAULTS`, of which the aligner knows nothing. `run_one` makes one run from its seed.
+of `FAULTS`, of which the aligner knows nothing. ``run_trial(trial(seed))`` makes one of them.
 """
 
 from __future__ import annotations
@@ -23,14 +23,12 @@ from __future__ import annotations
 import itertools
 import math
 from pathlib import Path
-from typing import Any
 
-from ins_align.aligner import Aligner, State
 from ins_align.config import PRESETS
 from ins_align.experiments.common import (
-    BINS, combination, config_for, first_in, JsonDict, parallel, Report, setup)
-from ins_align.experiments.declare import judged, worse
-from ins_align.simulation.simulate import epochs_of, SCENARIOS, simulate
+    combination, Groups, JsonDict, moment_table, offender_table, parallel, Report, setup, without)
+from ins_align.experiments.declare import DRAWN, run_trial
+from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
 
 RUNS = 500
@@ -40,6 +38,7 @@ _MEMS = PRESETS['mems']
 # The estimator takes misalignment and the errors of the accelerometers for 3 tenths of the gyros'
 # scale factor errors.
 _AXES = 3 * 0.3 * _MEMS.gyro_scale_std
+# What each changes of the arguments of `simulate`.
 FAULTS: dict[str, JsonDict] = {
     'accelerometer bias x 10': {'accel_bias_std': 10 * _MEMS.accel_bias_std},
     'scale, misalignment x 3': {
@@ -57,109 +56,45 @@ FAULTS: dict[str, JsonDict] = {
 COMBINATIONS: tuple[tuple[str, ...], ...] = (
     (), *((name,) for name in FAULTS), *itertools.combinations(FAULTS, 2))
 MOMENTS = {'levelled': 'LEVELLED (or ALIGNED at once)', 'aligned': 'ALIGNED'}
-ANGLES = {'tilt': 'tilt_sigmas', 'heading': 'heading_sigmas'}
 
 
 def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
     """Run seeds 0 to `runs`; print tables and write them."""
-    write(out, parallel(run_one, range(runs or RUNS), jobs, 'declare-worse'))
+    [trials] = parallel(run_trial, [[trial(seed) for seed in range(runs or RUNS)]], jobs,
+                        'declare-worse')
+    write(out, trials)
 
 
-def drawn(seed: int) -> JsonDict:
-    """Return what a seed stands for: ``faults``, ``scenario``, the arguments of `simulate`."""
-    faults, scenario = combination(seed, [3], COMBINATIONS, SCENARIOS)
+def trial(seed: int, faults: tuple[str, ...] | None = None,
+          scenario: str | None = None) -> JsonDict:
+    """Draw a run as `declare.trial` does; its faults and scenario may be given."""
+    drawn, drawn_scenario = combination(seed, [3], COMBINATIONS, SCENARIOS)
+    faults = drawn if faults is None else faults
     random = np.random.default_rng([4, seed])
-    return {'seed': seed, 'faults': faults, 'scenario': scenario, 'simulate': {
-        'seed': seed, 'duration': DURATION, **setup(random),
-        'stand_still': STAND_STILL * random.integers(2)}}
+    arguments = {'seed': seed, 'duration': DURATION, **setup(random),
+                 'stand_still': STAND_STILL * random.integers(2)}
+    for fault in faults:
+        arguments |= FAULTS[fault]
+    return {'index': seed, 'fault': ' and '.join(faults) or 'none', 'faults': faults,
+            'scenario': scenario or drawn_scenario, 'imu': 'mems', 'simulate': arguments,
+            'config': {'imu_grade': 'mems'}}
 
 
-def run_one(seed: int, faults: tuple[str, ...] | None = None, scenario: str | None = None,
-            **config: Any) -> JsonDict:
-    """
-    Simulate what a seed stands for and judge what is declared.
-
-    Parameters
-    ----------
-    seed : int
-        The result depends on the arguments alone.
-    faults : tuple of str, optional
-        Names of `FAULTS`, instead of those of the seed.
-    scenario : str, optional
-        Instead of that of the seed.
-    config
-        Parameters of `Config` that differ from `mems` with the right lever arm.
-
-    Returns
-    -------
-    dict
-        What `drawn` returns, and ``levelled`` and ``aligned`` (see `declare.judged`; None: never
-        declared) of the first such epochs, ``state`` and ``reason`` at the end, ``counts``.
-
-    """
-    task = drawn(seed)
-    task.update({name: value for name, value in (('faults', faults), ('scenario', scenario))
-                 if value is not None})
-    arguments = dict(task['simulate'])
-    for fault in task['faults']:
-        arguments.update(FAULTS[fault])
-    simulation = simulate(task['scenario'], **arguments)
-    aligner = Aligner(config_for(simulation, **{'imu_grade': 'mems', **config}))
-    epochs = list(epochs_of(aligner, simulation))
-    status = aligner.status()
-    return {**task, 'state': status.state.value, 'reason': status.reason,
-            'counts': dict(aligner.counts),
-            'levelled': judged(first_in(epochs, State.LEVELLED, State.ALIGNED), simulation),
-            'aligned': judged(first_in(epochs, State.ALIGNED), simulation)}
-
-
-def write(out: Path, results: list[JsonDict]) -> None:
+def write(out: Path, trials: list[JsonDict]) -> None:
     """Print tables and write them."""
-    report = Report('declare-worse', 'IMUs worse than configured', out,
-                    f' --runs {len(results)}')
+    report = Report('declare-worse', 'IMUs worse than configured', out, f' --runs {len(trials)}')
     report.text(
-        f'{len(results)} runs of {DURATION:g} s over all scenarios ({", ".join(SCENARIOS)}), half '
+        f'{len(trials)} runs of {DURATION:g} s over all scenarios ({", ".join(SCENARIOS)}), half '
         f'of them with {STAND_STILL:g} s at rest first, with random heading, latitude, mount and '
         'lever arm. All are configured as `mems` with the right lever arm. Errors against truth '
         'in stated sigmas: the worse of the attitude at t0 and the current one, and of the two '
         'axes of the tilt. A fault has the runs in which it is alone and those of its pairs. '
         'Target: at most 1 % beyond 3 sigma, none beyond 5.')
-    offenders = []
-    for moment, title in MOMENTS.items():
-        rows = [_row(name, chosen, moment) for name, chosen in _by_fault(results)]
-        report.table(f'First declared {title}', [
-            'fault', 'runs', 'declared', 'median, s',
-            *(f'{angle} beyond {limit:g}' for angle in ANGLES for limit in BINS),
-            'worst tilt, sigma', 'worst heading, sigma'], rows)
-        offenders += [[r['seed'], ' and '.join(r['faults']) or 'none', r['scenario'], moment,
-                       *(f'{worse(r, moment, angle):.1f}' for angle in ANGLES.values()),
-                       f"{r[moment]['t_s']:.1f}"] for r in results
-                      if any(worse(r, moment, angle) > BINS[0] for angle in ANGLES.values())]
-    report.table(f'Beyond {BINS[0]:g} sigma', [
-        'seed', 'faults', 'scenario', 'declared', 'tilt, sigma', 'heading, sigma', 'after, s'],
-        offenders)
-    report.write({'runs': results})
-
-
-def _by_fault(results: list[JsonDict]) -> list[tuple[str, list[JsonDict]]]:
-    """Group runs: without a fault, of each alone, of each in a pair, and all."""
-    groups = [('none', [r for r in results if not r['faults']])]
+    groups: Groups = [('none', [t for t in trials if not t['faults']])]
     for name in FAULTS:
-        groups += [(label, [r for r in results
-                            if name in r['faults'] and len(r['faults']) == count])
-                   for count, label in ((1, name), (2, f'{name}, in pairs'))]
-    return [*groups, ('all', results)]
-
-
-def _row(name: str, results: list[JsonDict], moment: str) -> list[Any]:
-    """Share of the declared runs beyond the limits."""
-    declared = [r for r in results if r[moment] is not None]
-    row: list[Any] = [name, len(results), len(declared)]
-    if not declared:
-        return row + 7 * [None]
-    sigmas = {angle: np.array([worse(r, moment, key) for r in declared])
-              for angle, key in ANGLES.items()}
-    return [*row, f"{np.median([r[moment]['t_s'] for r in declared]):.1f}",
-            *(f'{100 * np.mean(values > limit):.1f} %'
-              for values in sigmas.values() for limit in BINS),
-            *(f'{values.max():.1f}' for values in sigmas.values())]
+        groups += [(label, [t for t in trials if name in t['faults'] and len(t['faults']) == size])
+                   for size, label in ((1, name), (2, f'{name}, in pairs'))]
+    for moment, title in MOMENTS.items():
+        moment_table(report, f'First declared {title}', [*groups, ('all', trials)], moment)
+    offender_table(report, trials, *MOMENTS)
+    report.write({'runs': without(trials, *DRAWN)})

@@ -50,20 +50,10 @@ SWING_STEP = 0.1        # s, of the differences that give the angular accelerati
 
 @dataclass(frozen=True)
 class Bound:
-    """
-    Cramer-Rao bound of the initial attitude after each GNSS epoch.
+    """Cramer-Rao bound of the initial attitude after each GNSS epoch."""
 
-    Attributes
-    ----------
-    time : ndarray, shape (K,)
-        Seconds since t0, the first epoch.
-    covariance : ndarray, shape (K, 3, 3)
-        Of the small rotation about the axes of ENU, rad^2.
-
-    """
-
-    time: Array
-    covariance: Array
+    time: Array         # (K,), s since t0, the first epoch
+    covariance: Array   # (K, 3, 3), of the small rotation about the axes of ENU, rad^2
 
     def at(self, seconds: float) -> Array:
         """Return the bound after the last epoch up to `seconds` after t0."""
@@ -73,24 +63,13 @@ class Bound:
 def bound(simulation: Simulation, *, use_velocity: bool = True, use_position: bool = False,
           lever_arm_std: float = 0.0, delay_std: float = 0.0) -> Bound:
     """
-    Cramer-Rao bound on the true motion of a simulation.
+    Cramer-Rao bound on the true motion of a simulation: its noise is not used, what it states is.
 
-    Parameters
-    ----------
-    simulation : Simulation
-        Its truth, epochs and stated covariances are used; its noise is not.
-    use_velocity, use_position : bool
-        Which measurements count.
-    lever_arm_std, delay_std : float
-        Metres per axis and seconds; above 0 they are unknowns too.
-
-    Returns
-    -------
-    Bound
-
+    Lever arm (m per axis) and delay (s) are unknowns too where their sigma is above 0.
     """
     noise = simulation.imu_noise
-    epochs = _true_epochs_ns(simulation)
+    # Measurements may be older than their stamps.
+    epochs = simulation.gnss_stamps_ns - round(simulation.meta['gnss_delay'] * 1e9)
     path = _true_path(simulation, epochs)
     H = design_of(path, simulation.lever_arm)
     walk = bias_walk(path, noise, simulation.lever_arm)
@@ -109,9 +88,9 @@ class Path:
     Integrals over the motion at K epochs, in n0 axes.
 
     U and P are the first and second integral of the specific force; Theta, shape (K, 3, 12), the
-    integral of C and of C times each rate: what bias and matrix of the gyros turn; Gamma that of
-    ``[U' x] Theta``; Sigma, shape (K, 3, 12), that of C and of C times each force: what bias and
-    matrix of the accelerometers push; M holds the integrals of z z^T, z = (1, U, t U - P).
+    integral of C and of C times each rate: what bias and matrix of the gyros turn. H, shape
+    (K, 2, 3, 33), derives velocity and position of the IMU by all unknowns but lever arm and
+    delay; M holds the integrals of z z^T, z = (1, U, t U - P).
     """
 
     time: Array
@@ -119,10 +98,7 @@ class Path:
     U: Array
     P: Array
     Theta: Array
-    Gamma: Array
-    int_Gamma: Array
-    Sigma: Array
-    int_Sigma: Array
+    H: Array
     M: Array
     omega: Array          # of the body to inertial space, body axes
     omega_dot: Array
@@ -147,14 +123,16 @@ def path_along(time: Array, C: Array, omega: Array, f: Array, at: Array, C_n0n: 
     S = cumulative(time, C)
     Theta, Sigma = (np.concatenate([S, cumulative(time, _by_row(C, measured))], axis=-1)
                     for measured in (omega, f))
-    Gamma = cumulative(time, skew(force) @ Theta)
+    unit = np.broadcast_to(np.eye(3), C.shape)
+    H_v = np.concatenate([-skew(U), cumulative(time, skew(force) @ Theta), -Sigma, unit, 0 * C],
+                         axis=-1)
+    H_p = cumulative(time, H_v)
+    H_p[..., START_POSITION] = unit
     z = np.hstack([np.ones((len(time), 1)), U, time[:, None] * U - P])
     M = cumulative(time, z[:, :, None] * z[:, None, :])
     gravity = np.einsum('nij,nj->ni', C_n0n, g_n)
-    return Path(time[at], C[at], U[at], P[at], Theta[at], Gamma[at],
-                cumulative(time, Gamma)[at], Sigma[at], cumulative(time, Sigma)[at], M[at],
-                omega[at],
-                _rate_of_change(time, omega)[at], force[at] + gravity,
+    return Path(time[at], C[at], U[at], P[at], Theta[at], np.stack([H_v[at], H_p[at]], axis=1),
+                M[at], omega[at], _rate_of_change(time, omega)[at], force[at] + gravity,
                 np.einsum('nij,nj->ni', C_n0n, v_n), C_n0n)
 
 
@@ -185,11 +163,6 @@ def interpolated(stamps_ns: np.ndarray, values: Array, wanted_ns: np.ndarray) ->
 
     origin = stamps_ns[0]
     return CubicSpline((stamps_ns - origin) * 1e-9, values)((wanted_ns - origin) * 1e-9)
-
-
-def _true_epochs_ns(simulation: Simulation) -> np.ndarray:
-    """Instants of the measurements, which may be before their stamps."""
-    return simulation.gnss_stamps_ns - round(simulation.meta['gnss_delay'] * 1e9)
 
 
 def _true_path(simulation: Simulation, epochs_ns: np.ndarray) -> Path:
@@ -238,22 +211,15 @@ def lever_terms(path: Path, lever_b: Array) -> tuple[Array, Array]:
 
 def design_of(path: Path, lever_b: Array) -> Array:
     """Derive the measurements by the unknowns, shape (6 K, 37)."""
-    lever_v, lever_p = lever_terms(path, lever_b)
-    time = path.time[:, None, None]
-    H = np.zeros((len(path.time), 2, 3, SIZE))
+    H = np.concatenate([path.H, np.zeros((len(path.time), 2, 3, SIZE - path.H.shape[-1]))],
+                       axis=-1)
     velocity, position = H[:, 0], H[:, 1]
-    velocity[..., ATTITUDE] = -skew(path.U + lever_v)
-    position[..., ATTITUDE] = -skew(path.P + lever_p)
+    for rows, lever in zip((velocity, position), lever_terms(path, lever_b)):
+        rows[..., ATTITUDE] -= skew(lever)
+        rows[..., GYRO] += skew(lever) @ path.Theta
     C_lever = path.C @ skew(lever_b)
-    velocity[..., GYRO] = path.Gamma + skew(lever_v) @ path.Theta
     velocity[..., GYRO_BIAS] += C_lever
     velocity[..., GYRO_MATRIX] += _by_row(C_lever, path.omega)
-    position[..., GYRO] = path.int_Gamma + skew(lever_p) @ path.Theta
-    velocity[..., ACCEL] = -path.Sigma
-    position[..., ACCEL] = -path.int_Sigma
-    velocity[..., START_VELOCITY] = np.eye(3)
-    position[..., START_VELOCITY] = time * np.eye(3)
-    position[..., START_POSITION] = np.eye(3)
     velocity[..., LEVER_ARM] = path.C @ skew(path.omega)
     position[..., LEVER_ARM] = path.C
     swung = np.cross(path.omega_dot, lever_b) + np.cross(path.omega, np.cross(path.omega, lever_b))
@@ -269,32 +235,11 @@ def measurement_covariance(simulation: Simulation, path: Path) -> Array:
     return turn @ stated @ turn.swapaxes(-1, -2)
 
 
-def _turned_by_noise(path: Path) -> tuple[Array, Array]:
-    """
-    How an angle error at s turns a row: ``-[x x]`` with ``x = B z(s)``.
-
-    Velocity: ``x = U(t) - U(s)``; position: ``x = P(t) - P(s) - (t - s) U(s)``. The lever arm,
-    centimetres of motion per rad, is left out of the noise.
-
-    Returns
-    -------
-    B : ndarray, shape (2 K, 3, 7)
-    M : ndarray, shape (2 K, 7, 7)
-
-    """
-    B = np.zeros((len(path.time), 2, 3, 7))
-    B[:, 0, :, 0], B[:, 1, :, 0] = path.U, path.P
-    B[:, 0, :, 1:4] = -np.eye(3)
-    B[:, 1, :, 1:4] = -path.time[:, None, None] * np.eye(3)
-    B[:, 1, :, 4:] = np.eye(3)
-    return B.reshape(-1, 3, 7), np.repeat(path.M, 2, axis=0)
-
-
 def bias_walk(path: Path, noise: ImuNoise, lever_b: Array) -> Array:
     """Derive the measurements by the 3 J steps of the gyros' biases in sigmas, (6 K, 3 J)."""
     lever_v, lever_p = lever_terms(path, lever_b)
     C_lever = path.C @ skew(lever_b)
-    Theta, Gamma, int_Gamma = (a[..., :3] for a in (path.Theta, path.Gamma, path.int_Gamma))
+    Theta, Gamma, int_Gamma = path.Theta[..., :3], *np.moveaxis(path.H[..., GYRO_BIAS], 1, 0)
     n = len(path.time)
     steps = n if noise.rate_random_walk > 0 else 0
     to_rows = np.zeros((n, 2, 3, steps, 3))
@@ -312,22 +257,32 @@ def bias_walk(path: Path, noise: ImuNoise, lever_b: Array) -> Array:
 
 
 def noise_covariance(path: Path, noise: ImuNoise, walk: Array, measurement: Array) -> Array:
-    """Covariance of all rows: random walks of the IMU and GNSS noise, shape (6 K, 6 K)."""
-    B, M = _turned_by_noise(path)
-    n = len(B)
+    """
+    Covariance of all rows: random walks of the IMU and GNSS noise, shape (6 K, 6 K).
+
+    An angle error at s turns a row by ``-[x x]`` with ``x = B z(s)``. Velocity: ``x = U(t) -
+    U(s)``; position: ``x = P(t) - P(s) - (t - s) U(s)``. The lever arm, centimetres of motion per
+    rad, is left out of the noise.
+    """
+    n = 2 * len(path.time)
+    B = np.zeros((len(path.time), 2, 3, 7))
+    B[:, 0, :, 0], B[:, 1, :, 0] = path.U, path.P
+    B[:, 0, :, 1:4] = -np.eye(3)
+    B[:, 1, :, 1:4] = -path.time[:, None, None] * np.eye(3)
+    B[:, 1, :, 4:] = np.eye(3)
+    B, M = B.reshape(-1, 3, 7), np.repeat(path.M, 2, axis=0)
     # X[i, a, j, b]: integral of x_i[a] x_j[b] up to the earlier one, i <= j.
     X = ((B @ M).reshape(3 * n, 7) @ B.reshape(3 * n, 7).T).reshape(n, 3, n, 3)
     trace = np.einsum('iaja->ij', X)
     V = -noise.angle_random_walk ** 2 * X.transpose(0, 3, 2, 1)
     t = np.repeat(path.time, 2)
-    is_position = np.tile([0.0, 1.0], len(path.time))
     early, late = t[:, None], t[None]
     # An accelerometer error at s is worth 1 in a velocity, t - s in a position.
-    late_position = early * late - early ** 2 / 2
-    both = early ** 2 * late / 2 - early ** 3 / 6
-    first, second = is_position[:, None], is_position[None]
-    pushed = ((1 - first) * (1 - second) * early + (1 - first) * second * late_position
-              + first * (1 - second) * early ** 2 / 2 + first * second * both)
+    position = np.tile([False, True], len(path.time))
+    pushed = np.where(
+        position[:, None],
+        np.where(position, early ** 2 * late / 2 - early ** 3 / 6, early ** 2 / 2),
+        np.where(position, early * late - early ** 2 / 2, early))
     diagonal = (noise.angle_random_walk ** 2 * trace
                 + noise.velocity_random_walk ** 2 * pushed)
     for axis in range(3):

@@ -20,22 +20,24 @@ that is not counted; and what is declared all the same has to be right.
 
 from __future__ import annotations
 
+from itertools import pairwise
 import math
 from pathlib import Path
 import pickle
 import resource
 import traceback
-from types import SimpleNamespace
 from typing import Any
 import warnings
 
 from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
 from ins_align.experiments.common import (
-    BINS, combination, config_for, counted, error_of, GRADES, JsonDict, parallel, Report, setup)
-from ins_align.experiments.spoilt import FAULTS, SECOND, Stream, stream_of
-from ins_align.gnss.messages import fix_from_msg, imu_from_msg, MessageError, velocity_from_msg
-from ins_align.simulation.simulate import SCENARIOS, simulate, Simulation
+    BINS, combination, config_for, error_of, GRADES, groups_of, JsonDict, judged, most, parallel,
+    Report, setup, whose, without, worse)
+from ins_align.experiments.spoilt import FAULTS
+from ins_align.experiments.stream import payloads, Random, SECOND, Stream, stream_of
+from ins_align.gnss.messages import MessageError
+from ins_align.simulation.simulate import give, SCENARIOS, simulate, Simulation
 import numpy as np
 
 DURATION = 60.0
@@ -46,36 +48,26 @@ MAX_HELD = 8_000_000
 # Reasons for which a message is not used.
 REFUSED = {'fix': ('no_fix', 'nan', 'late', 'ahead', 'duplicate'),
            'velocity': ('nan', 'late', 'ahead', 'duplicate')}
-HEADER = ('fault', 'runs', 'exceptions', 'non-finite', 'miscounted', 'declared', 'within 3',
-          '3 to 5', 'beyond 5', 'worst, sigma', 'aligned beyond 5, s', 'held, MB')
 # `trial` draws the first three again from the index; the counts are only looked at.
 OMITTED = 'simulate', 'config', 'frame', 'counts'
 
 
 def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
     """Run the campaign and write its tables."""
-    trials = parallel(run_trial, [trial(index) for index in range(runs or 1000)], jobs, 'faults')
+    [trials] = parallel(run_trial, [[trial(index) for index in range(runs or 1000)]], jobs,
+                        'faults')
     write(out, trials)
 
 
 def trial(index: int) -> JsonDict:
-    """
-    Draw a run: what is simulated, which fault it gets and what the aligner is told.
-
-    Returns
-    -------
-    dict
-        ``index``, ``fault``, ``scenario``, the arguments of `simulate`, the ``frame`` of the
-        velocities and those parameters of `Config` that differ from what suits the simulation.
-
-    """
+    """Draw a run: its fault, what is simulated, the frame of the velocities, what is told."""
     fault, scenario, grade = combination(index, [3], FAULTS, SCENARIOS, GRADES)
     random = np.random.default_rng([4, index])
     arguments = {'imu_grade': grade, 'seed': index, 'duration': DURATION, **setup(random)}
     config = {'gnss_lateness': Config().gnss_lateness, 'velocity_type': str(random.choice(
         ['TwistWithCovarianceStamped', 'TwistStamped', 'Odometry']))}
-    return {'index': index, 'fault': fault, 'scenario': scenario, 'simulate': arguments,
-            'config': config, 'frame': str(random.choice(['enu', 'ned']))}
+    return {'index': index, 'fault': fault, 'scenario': scenario, 'imu': grade,
+            'simulate': arguments, 'config': config, 'frame': str(random.choice(['enu', 'ned']))}
 
 
 def run_trial(task: JsonDict) -> JsonDict:
@@ -101,40 +93,34 @@ def run_trial(task: JsonDict) -> JsonDict:
         status = aligner.status()
         result |= {'state': status.state.value, 'reason': status.reason, 'counts': status.counts,
                    'miscounted': miscounted(status.counts, stream),
-                   **judged(watch.epochs, stream, simulation)}
+                   **declarations(watch.epochs, stream, simulation)}
     return result
 
 
-# Feeding
-
-def feed(watch: 'Watch', random: np.random.Generator) -> None:
+def feed(watch: 'Watch', random: Random) -> None:
     """Give the messages to the aligner in the order of arrival, one by one or in blocks."""
     stream, aligner = watch.stream, watch.aligner
     one_by_one = random.random() < 0.5
-    sources = [('imu', stream.imu), ('fix', stream.fix), ('velocity', stream.velocity)]
-    arrivals = [rows['arrival'] for _, rows in sources]
-    arrivals += [update_times(stream, random), np.array(stream.resets, np.int64)]
-    order = np.argsort(np.concatenate(arrivals), kind='stable')
-    ends = np.cumsum([len(times) for times in arrivals])
-    kinds = np.searchsorted(ends, order, side='right')
-    places = order - (ends - [len(times) for times in arrivals])[kinds]
-    cuts = np.flatnonzero(np.diff(kinds)) + 1
-    for block in np.split(np.arange(len(order)), cuts) if len(order) else []:
-        kind, rows = kinds[block[0]], places[block]
-        if kind < 3:
-            name, messages = sources[kind]
-            _SEND[name](aligner, messages[rows], one_by_one)
+    for kind, rows in stream.sent(update_times(stream, random)):
+        if kind in ('update', 'reset'):
+            for _ in rows:
+                watch.update()
+                if kind == 'reset':
+                    aligner.reset()
             continue
-        for _ in rows:
-            watch.update()
-            if kind == 4:
-                aligner.reset()
+        for each in rows if one_by_one and kind == 'imu' else [rows]:
+            try:
+                for payload in payloads(aligner.config, kind, each):
+                    give(aligner, kind, payload)
+            except MessageError:
+                for _ in rows:
+                    aligner.reject('velocity_body_frame')
     watch.take(aligner.flush())
     watch.look()
     watch.weigh()
 
 
-def update_times(stream: Stream, random: np.random.Generator) -> np.ndarray:
+def update_times(stream: Stream, random: Random) -> np.ndarray:
     """When somebody looks for results."""
     end = max((int(rows['arrival'].max()) for rows in (stream.imu, stream.fix, stream.velocity)
                if len(rows)), default=stream.first)
@@ -145,56 +131,6 @@ def update_times(stream: Stream, random: np.random.Generator) -> np.ndarray:
         steps = random.exponential(stream.update_every,
                                    int(2 * duration / stream.update_every) + 1)
     return stream.first + np.rint(np.cumsum(steps) * SECOND).astype(np.int64)
-
-
-def _header(stamp_ns: int, frame_id: str = '') -> SimpleNamespace:
-    sec, nanosec = divmod(stamp_ns, SECOND)
-    return SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec), frame_id=frame_id)
-
-
-def _vector(values: np.ndarray) -> SimpleNamespace:
-    x, y, z = values.tolist()
-    return SimpleNamespace(x=x, y=y, z=z)
-
-
-def _send_imu(aligner: Aligner, rows: np.ndarray, one_by_one: bool) -> None:
-    if not one_by_one:
-        aligner.add_imu(rows['stamp'], rows['gyro'], rows['accel'])
-        return
-    for row in rows:
-        aligner.add_imu(*imu_from_msg(SimpleNamespace(
-            header=_header(int(row['stamp'])), angular_velocity=_vector(row['gyro']),
-            linear_acceleration=_vector(row['accel']))))
-
-
-def _send_fixes(aligner: Aligner, rows: np.ndarray, one_by_one: bool) -> None:
-    for row in rows:
-        latitude, longitude, altitude = row['lla'].tolist()
-        aligner.add_fix(fix_from_msg(SimpleNamespace(
-            header=_header(int(row['stamp'])), latitude=latitude, longitude=longitude,
-            altitude=altitude, position_covariance=row['covariance'].ravel(),
-            position_covariance_type=int(row['covariance_type']),
-            status=SimpleNamespace(status=int(row['status'])))))
-
-
-def _send_velocities(aligner: Aligner, rows: np.ndarray, one_by_one: bool) -> None:
-    config = aligner.config
-    for row in rows:
-        frame_id = str(row['frame_id'])
-        twist = SimpleNamespace(linear=_vector(row['velocity']))
-        message = SimpleNamespace(header=_header(int(row['stamp']), frame_id), twist=twist,
-                                  child_frame_id=frame_id)
-        if config.velocity_type != 'TwistStamped':
-            covariance = np.zeros((6, 6))
-            covariance[:3, :3] = row['covariance']
-            message.twist = SimpleNamespace(twist=twist, covariance=covariance.ravel())
-        try:
-            aligner.add_velocity(velocity_from_msg(message, config))
-        except MessageError:
-            aligner.reject('velocity_body_frame')
-
-
-_SEND = {'imu': _send_imu, 'fix': _send_fixes, 'velocity': _send_velocities}
 
 
 # What is looked at
@@ -265,63 +201,43 @@ class Watch:
 def miscounted(counts: dict[str, int], stream: Stream) -> list[str]:
     """Compare counters with what was sent; return what does not fit, in words."""
     wrong = [f'{name} is {count}' for name, count in counts.items() if count < 0]
-    counted = dict.fromkeys(stream.expected, 0) | counts
-    wrong += [f'{name} is {counted[name]}, not {number}'
-              for name, number in stream.expected.items() if counted[name] != number]
-    body_frame = counts.get('velocity_body_frame', 0)
-    for name, number in ('fix', len(stream.fix)), ('velocity', len(stream.velocity) - body_frame):
-        if counts.get(name, 0) != number:
-            wrong.append(f'{name} is {counts.get(name, 0)}, not {number}')
+    sent = {'fix': len(stream.fix),
+            'velocity': len(stream.velocity) - counts.get('velocity_body_frame', 0)}
+    wrong += [f'{name} is {counts.get(name, 0)}, not {number}'
+              for name, number in (stream.expected | sent).items()
+              if counts.get(name, 0) != number]
+    for name, number in sent.items():
         refused = sum(counts.get(f'{name}_{reason}', 0) for reason in REFUSED[name])
         if refused > number:
             wrong.append(f'{refused} of {number} {name} refused')
     # A sample that is late when it comes is not looked at any more, one that is found late later
     # is in both counters.
-    imu, sent = counts.get('imu', 0), len(stream.imu)
+    imu, samples = counts.get('imu', 0), len(stream.imu)
     left_out = counts.get('imu_late', 0) + counts.get('imu_ahead', 0)
-    if not imu <= sent <= imu + left_out:
-        wrong.append(f'imu is {imu}, late or ahead are {left_out} of {sent}')
+    if not imu <= samples <= imu + left_out:
+        wrong.append(f'imu is {imu}, late or ahead are {left_out} of {samples}')
     return wrong
 
 
-def judged(epochs: list[Epoch], stream: Stream, simulation: Simulation) -> JsonDict:
+def declarations(epochs: list[Epoch], stream: Stream, simulation: Simulation) -> JsonDict:
     """
-    Compare with the truth what was declared.
+    Judge each declaration and the last epoch if it is aligned.
 
-    Returns
-    -------
-    dict
-        ``declared``: errors at each declaration, as initial and current attitude, ``final``:
-        those of the last epoch if it is aligned, and ``wrong_s``, for how long the current
-        attitude was beyond the last of `BINS` while it was called aligned.
-
+    ``wrong_s`` is how long the current attitude was beyond the last of `BINS` and called aligned.
     """
-    first = [epoch for before, epoch in zip([None, *epochs], epochs)
-             if epoch.state is State.ALIGNED
-             and (before is None or before.state is not State.ALIGNED)]
-    aligned = [epoch.current for epoch in epochs
-               if epoch.state is State.ALIGNED and epoch.current is not None]
-    wrong = sum(max(pair) > BINS[1] for pair in _sigmas(aligned, stream, simulation))
-    return {'declared': [_both(epoch, stream, simulation) for epoch in first],
-            'final': (_both(epochs[-1], stream, simulation)
-                      if epochs and epochs[-1].state is State.ALIGNED else None),
+    def true(stamps: Any) -> Any:
+        return simulation.attitude_at(stream.true_stamps(stamps))
+
+    aligned = [epoch.state is State.ALIGNED for epoch in epochs]
+    first = [epoch for epoch, (before, now) in zip(epochs, pairwise([False, *aligned]))
+             if now and not before]
+    held = [epoch.current for epoch, now in zip(epochs, aligned)
+            if now and epoch.current is not None]
+    wrong = sum(error_of(attitude, C_true).worst_sigmas > BINS[1] for attitude, C_true in zip(
+        held, true([attitude.stamp_ns for attitude in held]))) if held else 0
+    return {'declared': [judged(epoch, true) for epoch in first],
+            'final': judged(epochs[-1], true) if any(aligned[-1:]) else None,
             'wrong_s': wrong / simulation.meta['gnss_rate']}
-
-
-def _both(epoch: Epoch, stream: Stream, simulation: Simulation) -> JsonDict:
-    assert epoch.initial is not None and epoch.current is not None  # it is aligned
-    initial, current = _sigmas([epoch.initial, epoch.current], stream, simulation)
-    return {'t_s': epoch.t_s, 'initial': initial, 'current': current}
-
-
-def _sigmas(attitudes: list[Attitude], stream: Stream,
-            simulation: Simulation) -> list[tuple[float, float]]:
-    """Errors of tilt and heading in stated sigmas."""
-    if not attitudes:
-        return []
-    truth = simulation.attitude_at(stream.true_stamps([a.stamp_ns for a in attitudes]))
-    errors = [error_of(*pair) for pair in zip(attitudes, truth)]
-    return [(error.tilt_sigmas, error.heading_sigmas) for error in errors]
 
 
 # Tables
@@ -329,28 +245,27 @@ def _sigmas(attitudes: list[Attitude], stream: Stream,
 def worst(result: JsonDict) -> float:
     """Largest error in sigmas at any declaration and at the end; nan if there was none."""
     moments = [*result.get('declared', ()), *filter(None, [result.get('final')])]
-    return max((max(*moment['initial'], *moment['current']) for moment in moments),
-               default=math.nan)
+    return max(map(worse, moments), default=math.nan)
 
 
-def row(name: str, trials: list[JsonDict]) -> list[Any]:
+def row(name: str, trials: list[JsonDict]) -> JsonDict:
     """Return a row of the table."""
-    sigmas = np.array([worst(t) for t in trials])
-    declared = np.isfinite(sigmas)
-    return [name, len(trials), sum(bool(t['exception']) for t in trials),
-            sum(bool(t['non_finite']) for t in trials),
-            sum(bool(t.get('miscounted')) for t in trials), int(np.sum(declared)),
-            *counted(sigmas),
-            f'{sigmas[declared].max():.1f}' if declared.any() else None,
-            f"{max(t.get('wrong_s', 0.0) for t in trials):.1f}",
-            f"{np.median([t['held'] for t in trials]) * 1e-6:.2f}"]
+    sigmas = [worst(t) for t in trials]
+    declared = np.array([value for value in sigmas if math.isfinite(value)])
+    bins = {f'beyond {limit:g}': int(np.sum(declared > limit)) for limit in BINS}
+    return {'fault': name, 'runs': len(trials),
+            'exceptions': sum(bool(t['exception']) for t in trials),
+            'non-finite': sum(bool(t['non_finite']) for t in trials),
+            'miscounted': sum(bool(t.get('miscounted')) for t in trials),
+            'declared': len(declared), **bins, 'worst, sigma': most(declared, '.1f'),
+            'aligned beyond 5, s': most((t.get('wrong_s', 0.0) for t in trials), '.1f'),
+            'held, MB': f"{np.median([t['held'] for t in trials]) * 1e-6:.2f}"}
 
 
 def write(out: Path, trials: list[JsonDict]) -> None:
     """Print tables and write them."""
     report = Report('faults', 'What drivers get wrong', out, f' --runs {len(trials)}')
     total = row('all', trials)
-    numbers = dict(zip(HEADER, total))
     report.text(
         f'{len(trials)} runs of {DURATION:g} s over {len(FAULTS)} faults, all scenarios '
         f'({", ".join(SCENARIOS)}) and grades of IMU, with random heading, latitude, mount, '
@@ -358,37 +273,32 @@ def write(out: Path, trials: list[JsonDict]) -> None:
         'the aligner but what the name of the fault says. Samples come one by one or many at a '
         'time.')
     report.text(
-        f"{numbers['exceptions']} runs ended with an exception, {numbers['non-finite']} gave a "
+        f"{total['exceptions']} runs ended with an exception, {total['non-finite']} gave a "
         'number that is not finite or an attitude that is no rotation, in '
-        f"{numbers['miscounted']} the counters do not fit what was sent, "
+        f"{total['miscounted']} the counters do not fit what was sent, "
         f"{sum(bool(t['warnings']) for t in trials)} made numpy warn (target: none). An aligner "
         f"never held more than {max(t['held'] for t in trials) * 1e-6:.2f} MB (pickled, every "
         f'{WEIGH_EVERY} updates; limit {MAX_HELD * 1e-6:g}); the processes that ran them grew to '
         f"{max(t['resident_kb'] for t in trials) / 1024:.0f} MB.")
-    share = numbers['3 to 5'] + numbers['beyond 5']
+    share = total['beyond 3']
     report.text(
-        f"{numbers['declared']} runs were declared ALIGNED at some time, {share} of them "
-        f"({share / max(numbers['declared'], 1):.1%}) beyond {BINS[0]:g} sigma, "
-        f"{numbers['beyond 5']} beyond {BINS[1]:g} (target: at most 1 % and none). The error is "
+        f"{total['declared']} runs were declared ALIGNED at some time, {share} of them "
+        f"({share / max(total['declared'], 1):.1%}) beyond {BINS[0]:g} sigma, "
+        f"{total['beyond 5']} beyond {BINS[1]:g} (target: at most 1 % and none). The error is "
         'the largest, in stated sigmas, of tilt and heading, of the attitude at t0 and the '
         'current one, at each declaration and at the end where that is still ALIGNED. The time '
         f'is that during which, within a run, the current attitude was beyond {BINS[1]:g} sigma '
         'and still called aligned, the longest.')
-    report.table('What became of it, by fault', HEADER, [
-        *(row(name, chosen) for name in FAULTS
-          if (chosen := [t for t in trials if t['fault'] == name])), total])
+    report.table('What became of it, by fault', [
+        row(*group) for group in groups_of(trials, FAULTS) if group[1]])
     report.table(f'Declared and beyond {BINS[0]:g} sigma', [
-        'index', 'fault', 'scenario', 'IMU', 'sigma', 'declared, sigma', 'end, sigma',
-        'aligned beyond 5, s'], [
-        [t['index'], t['fault'], t['scenario'], t['simulate']['imu_grade'], f'{worst(t):.1f}',
-         f"{worst(t | {'final': None}):.1f}",
-         None if t['final'] is None else f"{worst(t | {'declared': []}):.1f}",
-         f"{t['wrong_s']:.1f}"] for t in trials if worst(t) > BINS[0]])
-    broken = [[t['index'], t['fault'], t['scenario'], t['simulate']['imu_grade'], what]
-              for t in trials for what in (
-                  *t['exception'].strip().splitlines()[-1:], *sorted(set(t['non_finite'])),
-                  *t.get('miscounted', ()), *t['warnings'])]
+        {**whose(t), 'sigma': f'{worst(t):.1f}',
+         'declared, sigma': most(map(worse, t['declared']), '.1f'),
+         'end, sigma': None if t['final'] is None else f"{worse(t['final']):.1f}",
+         'aligned beyond 5, s': f"{t['wrong_s']:.1f}"} for t in trials if worst(t) > BINS[0]])
+    broken = [{**whose(t), 'what': what} for t in trials for what in (
+        *t['exception'].strip().splitlines()[-1:], *sorted(set(t['non_finite'])),
+        *t.get('miscounted', ()), *t['warnings'])]
     if broken:
-        report.table('What broke', ['index', 'fault', 'scenario', 'IMU', 'what'], broken)
-    report.write({'runs': len(trials), 'trials': [
-        {key: value for key, value in t.items() if key not in OMITTED} for t in trials]})
+        report.table('What broke', broken)
+    report.write({'runs': len(trials), 'trials': without(trials, *OMITTED)})

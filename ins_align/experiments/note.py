@@ -20,15 +20,16 @@ which it does not describe. Here: scenario `flight`, navigation grade, velocity 
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
 from ins_align.aligner import Aligner
 from ins_align.experiments import dense
-from ins_align.experiments.common import exact_config_for, parallel, Report, rms
+from ins_align.experiments.common import (
+    draw, exact_config_for, JsonDict, parallel, Report, rms)
 from ins_align.geometry.earth import EARTH_RATE, earth_rate_n, LocalLevel
 from ins_align.geometry.rotation import Array, cross, roll_pitch_yaw, skew
-from ins_align.report import new_figure
 from ins_align.simulation.simulate import epochs_of, simulate
 import numpy as np
 
@@ -36,10 +37,9 @@ DURATION = 100.0
 TABLE_TIMES = (10.0, 20.0, 50.0, 100.0)
 PEAK_FROM, PEAK_TO = 2.0, 20.0      # s, where the note's Fig. 1 has its lumps
 SHOWN_FROM = 3.0                    # s, larger errors before may lie outside of the figure
-LEVER = (1.0, 1.0, 1.0)
 REMARK_DURATION = 1000.0
 ANGLES = ('roll', 'pitch', 'heading')
-NO_LEVER = (0.0, 0.0, 0.0)
+LEVER, NO_LEVER = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 # Name, lever arm of the vehicle, what the aligner is told beside the grade.
 VARIANTS: dict[str, tuple[tuple[float, ...], dict[str, Any]]] = {
     'not compensated': (LEVER, {'method': 'vif', 'free_start': False, 'lever_arm': NO_LEVER}),
@@ -54,41 +54,31 @@ ADDED = ('compensated', 'compensated, free start', 'bank')
 COLOURS = {'not compensated': '#D55E00', 'compensated': '#0072B2', 'zero lever arm': '#009E73',
            'compensated, free start': '#E69F00', 'bank': '#CC79A7'}
 
+Errors = dict[str, dict[str, Array]]    # by grade and variant: (runs, K, 3), degrees
+
 
 def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
     """Run all variants, navigation grade; the note, its free start and bank with MEMS too."""
     runs = runs or 100
+    pairs = [*itertools.product(['navigation'], VARIANTS), *itertools.product(['mems'], ADDED)]
+    errors: Errors = {'navigation': {}, 'mems': {}}
+    for (grade, name), each in zip(pairs, parallel(run_one, [
+            [(*pair, seed) for seed in range(runs)] for pair in pairs], jobs, 'runs')):
+        errors[grade][name] = np.array(each)
+    time = np.arange(errors['navigation']['bank'].shape[1]) / 5.0
+    bounds = {grade: bound_of(grade) for grade in errors}
     report = Report('note', "The note's experiment", out, f' --runs {runs}')
     report.text(
         'Scenario `flight` (100 m/s, S-turns with 40 s period, oscillation of 2 to 3 deg about '
         f'all axes), IMU 100 Hz, GNSS velocity 5 Hz, 0.1 m/s; lever arm {list(LEVER)} m; {runs} '
         'runs. The note does not give its own set-up. Errors of the attitude at t0.')
-    tasks = [(grade, name, seed) for grade, names in (('navigation', tuple(VARIANTS)),
-                                                      ('mems', ADDED))
-             for name in names for seed in range(runs)]
-    results = parallel(run_one, tasks, jobs, 'runs')
-    errors: dict[str, dict[str, Array]] = {'navigation': {}, 'mems': {}}
-    for number in range(0, len(tasks), runs):
-        grade, name, _ = tasks[number]
-        errors[grade][name] = np.array(results[number:number + runs])
-    time = np.arange(errors['navigation']['bank'].shape[1]) / 5.0
-    bounds = {grade: bound_of(grade) for grade in errors}
-    numbers = {'rms_heading_deg': rms_table(report, errors, bounds, time),
-               'peak_deg': peak_table(report, errors['navigation'], time)}
+    numbers: JsonDict = {'rms_heading_deg': rms_table(report, errors, bounds, time),
+                         'peak_deg': peak_table(report, errors['navigation'], time)}
     report.figure(note_figure(errors['navigation'], time), '', f'Mean errors of {runs} runs, '
                   'method `vif` without free start, as in Fig. 1 of the note')
     report.figure(added_figure(errors, bounds, time), '_added', 'Root mean square errors: the '
                   'note, its free start, bank, and the Cramer-Rao bound')
-    seconds, remainder, limit, term, integral = remarks_of(REMARK_DURATION)
-    numbers['remark_2_1'] = {'largest_m_s': remainder.max(), 'limit_at_end_m_s': limit[-1],
-                             'largest_share_of_limit': np.max(remainder[1:] / limit[1:])}
-    report.text(
-        f'Remark 2.1: over {REMARK_DURATION:g} s the short form of (9) misses at most '
-        f'{remainder.max():.2g} m/s; the limit 2 W^2 t |l| is {limit[-1]:.2g} m/s at the end; the '
-        f'remainder is at most {np.max(remainder[1:] / limit[1:]):.2f} of it. Remark 2.2: after '
-        + ', '.join(f'{t:g} s the lever-arm term is {term[k]:.2g} m/s, the integral '
-                    f'{integral[k]:.3g} m/s' for t, k in (
-                        (t, np.searchsorted(seconds, t)) for t in (1.0, 10.0, 100.0))) + '.')
+    numbers['remark_2_1'] = remarks_text(report)
     report.write({'runs': runs, **numbers})
 
 
@@ -102,11 +92,10 @@ def run_one(task: tuple[str, str, int]) -> Array:
     errors = np.full((len(simulation.gnss_stamps_ns), 3), np.nan)
     for epoch in epochs_of(aligner, simulation):
         if epoch.initial is not None:
-            C_true = simulation.attitude_at(epoch.initial.stamp_ns)
-            rpy = roll_pitch_yaw(epoch.initial.C_nb)
-            difference = np.remainder(rpy - roll_pitch_yaw(C_true) + np.pi, 2 * np.pi) - np.pi
+            rpy, true_rpy = (roll_pitch_yaw(C) for C in (
+                epoch.initial.C_nb, simulation.attitude_at(epoch.initial.stamp_ns)))
             errors[np.searchsorted(simulation.gnss_stamps_ns, epoch.stamp_ns)] = np.degrees(
-                difference)
+                np.remainder(rpy - true_rpy + np.pi, 2 * np.pi) - np.pi)
     return errors
 
 
@@ -116,19 +105,19 @@ def bound_of(grade: str) -> Array:
     return np.degrees(np.sqrt(np.stack([(P[:, 0, 0] + P[:, 1, 1]) / 2, P[:, 2, 2]], axis=-1)))
 
 
-def rms_table(report: Report, errors: dict[str, dict[str, Array]], bounds: dict[str, Array],
-              time: Array) -> dict[str, list[float]]:
+def rms_table(report: Report, errors: Errors, bounds: dict[str, Array],
+              time: Array) -> dict[str, Array]:
     """Print the heading's rms over time."""
     places = [int(np.argmin(np.abs(time - t))) for t in TABLE_TIMES]
-    rows, numbers = [], {}
+    numbers = {}
     for grade, variants in errors.items():
-        columns = {name: rms(error[:, places, 2], axis=0) for name, error in variants.items()}
-        columns['Cramer-Rao bound'] = bounds[grade][places, 1]
-        for name, values in columns.items():
-            rows.append([f'{grade}: {name}', *(f'{value:.2g}' for value in values)])
-            numbers[f'{grade}: {name}'] = list(values)
+        for name, error in variants.items():
+            numbers[f'{grade}: {name}'] = rms(error[:, places, 2], axis=0)
+        numbers[f'{grade}: Cramer-Rao bound'] = bounds[grade][places, 1]
     report.table('Heading error, rms in deg. Without "free start" and bank: free_start false, '
-                 'the note to the letter', ['variant', *(f'{t:g} s' for t in TABLE_TIMES)], rows)
+                 'the note to the letter', [
+                     {'variant': name, **{f'{t:g} s': f'{value:.2g}' for t, value in zip(
+                         TABLE_TIMES, values)}} for name, values in numbers.items()])
     return numbers
 
 
@@ -141,13 +130,13 @@ def peak_table(report: Report, errors: dict[str, Array], time: Array) -> dict[st
         mean, apart = np.mean(errors[name], axis=0), np.mean(errors[name] - none, axis=0)
         numbers[name] = [*np.max(np.abs(mean[early]), axis=0), *np.abs(mean[-1]),
                          *np.max(np.abs(apart[early]), axis=0)]
-    chance = np.max(np.std(none, axis=0, ddof=1)[early], axis=0) / np.sqrt(len(none))
+    columns = [f'{angle}{when}' for when in ('', ', end', ', apart') for angle in ANGLES]
     report.table(
         f'Mean error, deg: largest from {PEAK_FROM:g} to {PEAK_TO:g} s, at {DURATION:g} s, and '
-        'largest difference early from that of zero lever arm with the same noise',
-        ['variant', *ANGLES, *(f'{angle}, end' for angle in ANGLES),
-         *(f'{angle}, apart' for angle in ANGLES)],
-        [[name, *(f'{value:.2g}' for value in values)] for name, values in numbers.items()])
+        'largest difference early from that of zero lever arm with the same noise', [
+            {'variant': name, **{column: f'{value:.2g}' for column, value in zip(
+                columns, values)}} for name, values in numbers.items()])
+    chance = np.max(np.std(none, axis=0, ddof=1)[early], axis=0) / np.sqrt(len(none))
     report.text(
         "The note's Fig. 1 shows early peaks without compensation, gone with it, and compensated "
         'like zero lever arm. What the noise alone leaves in these means (1 sigma): '
@@ -157,82 +146,76 @@ def peak_table(report: Report, errors: dict[str, Array], time: Array) -> dict[st
 
 def note_figure(errors: dict[str, Array], time: Array) -> Any:
     """Draw mean errors over time."""
-    picture = new_figure(8.0, 8.0)
-    axes = picture.subplots(3, 1, sharex=True)
     means = {name: np.mean(errors[name], axis=0) for name in SHOWN}
-    for column, (ax, angle) in enumerate(zip(axes, ANGLES)):
-        for name, mean in means.items():
-            ax.plot(time, mean[:, column], color=COLOURS[name], label=name,
-                    linestyle='--' if name == 'zero lever arm' else '-')
+    panels = []
+    for column, angle in enumerate(ANGLES):
         limit = 1.1 * max(np.nanmax(np.abs(mean[time >= SHOWN_FROM, column]))
                           for mean in means.values())
-        ax.set_ylim(-limit, limit)
-        ax.set_xlim(0.0, DURATION)
-        ax.set_ylabel(f'{angle} (deg)')
-        ax.grid(alpha=0.3)
-    axes[0].set_title(f'mean alignment error (scaled to what is seen after {SHOWN_FROM:g} s)')
-    axes[0].legend(fontsize=9)
-    axes[-1].set_xlabel('time since t0 (s)')
-    return picture
+        panels.append([{
+            'ylabel': f'{angle} (deg)', 'ylim': (-limit, limit), 'xlim': (0.0, DURATION),
+            'lines': [(time, mean[:, column], {
+                'color': COLOURS[name], 'label': name,
+                'linestyle': '--' if name == 'zero lever arm' else '-'})
+                for name, mean in means.items()]}])
+    panels[0][0]['title'] = f'mean alignment error (scaled to what is seen after {SHOWN_FROM:g} s)'
+    return draw(8.0, 8.0, panels, sharex=True)
 
 
-def added_figure(errors: dict[str, dict[str, Array]], bounds: dict[str, Array],
-                 time: Array) -> Any:
+def added_figure(errors: Errors, bounds: dict[str, Array], time: Array) -> Any:
     """Draw rms errors and bounds over time."""
-    picture = new_figure(11.0, 7.5)
-    axes = picture.subplots(2, 2, sharex=True, sharey='row')
     shown = time >= 1.0
-    for column, (grade, variants) in enumerate(errors.items()):
-        for line, angle in enumerate(('tilt, per axis', 'heading')):
-            ax = axes[line, column]
-            for name in ADDED:
-                chosen = slice(0, 2) if line == 0 else slice(2, 3)
-                ax.semilogy(time[shown], rms(variants[name][:, shown, chosen], axis=(0, 2)),
-                            color=COLOURS[name],
-                            label='the note' if name == 'compensated' else name)
-            ax.semilogy(time[shown], bounds[grade][shown, line], 'k--', label='Cramer-Rao bound')
-            ax.set_title(f'{grade} IMU: {angle}')
-            ax.grid(which='both', alpha=0.25)
-        axes[1, column].set_xlabel('time since t0 (s)')
-    for ax in axes[:, 0]:
-        ax.set_ylabel('rms error (deg)')
-    axes[0, 0].legend(fontsize=8)
-    return picture
+    return draw(11.0, 7.5, [[{
+        'title': f'{grade} IMU: {angle}', 'ylabel': 'rms error (deg)', 'yscale': 'log',
+        'lines': [
+            *((time[shown], rms(variants[name][:, shown, chosen], axis=(0, 2)), {
+                'color': COLOURS[name], 'label': 'the note' if name == 'compensated' else name})
+              for name in ADDED),
+            (time[shown], bounds[grade][shown, line],
+             {'color': 'k', 'linestyle': '--', 'label': 'Cramer-Rao bound'})]}
+        for grade, variants in errors.items()]
+        for line, (angle, chosen) in enumerate((('tilt, per axis', slice(0, 2)),
+                                                ('heading', slice(2, 3))))],
+        sharex=True, sharey='row')
+
+
+def remarks_text(report: Report) -> JsonDict:
+    """Print how large the terms of Remarks 2.1 and 2.2 are."""
+    seconds, remainder, limit, term, integral = remarks_of(REMARK_DURATION)
+    share = np.max(remainder[1:] / limit[1:])
+    moments = [(t, np.searchsorted(seconds, t)) for t in (1.0, 10.0, 100.0)]
+    report.text(
+        f'Remark 2.1: over {REMARK_DURATION:g} s the short form of (9) misses at most '
+        f'{remainder.max():.2g} m/s; the limit 2 W^2 t |l| is {limit[-1]:.2g} m/s at the end; the '
+        f'remainder is at most {share:.2f} of it. Remark 2.2: after '
+        + ', '.join(f'{t:g} s the lever-arm term is {term[k]:.2g} m/s, the integral '
+                    f'{integral[k]:.3g} m/s' for t, k in moments) + '.')
+    return {'largest_m_s': remainder.max(), 'limit_at_end_m_s': limit[-1],
+            'largest_share_of_limit': share}
 
 
 def remarks_of(duration: float) -> tuple[Array, Array, Array, Array, Array]:
     """
-    Terms of (9) on the true motion.
+    Terms of (9) on the true motion, five arrays (N,).
 
-    Returns
-    -------
-    time, remainder, limit, term, integral : ndarray, shape (N,)
-        Seconds; m/s: what the short form leaves out, its limit, the lever-arm term, the integral
-        of the specific force.
-
+    Time, s; then, m/s: what the short form leaves out, its limit, the lever-arm term, the integral
+    of the specific force.
     """
     truth = simulate('flight', ideal=True, duration=duration, gnss_rate=1.0)
     time = (truth.truth_stamps_ns - truth.truth_stamps_ns[0]) * 1e-9
     lever_b = np.array(LEVER)
     latitude, longitude = np.radians(truth.truth_lla[:, :2]).T
     C_nb = truth.truth_C_nb
-    C_n0n = LocalLevel(latitude[0], longitude[0]).matrix(time, latitude, longitude)
-    C_b0b = C_nb[0].T @ C_n0n @ C_nb
+    C_b0b = C_nb[0].T @ LocalLevel(latitude[0], longitude[0]).matrix(
+        time, latitude, longitude) @ C_nb
     omega_ie_n = earth_rate_n(latitude)
     omega_eb_b = truth.truth_gyro - np.einsum('nji,nj->ni', C_nb, omega_ie_n)
     remainder = exact_lever_remainder(time, C_b0b, omega_eb_b, C_nb[0].T @ omega_ie_n[0],
                                       lever_b)
     turned = np.einsum('nij,nj->ni', C_b0b, cross(truth.truth_gyro, lever_b))
-    force = np.einsum('nij,nj->ni', C_b0b, truth.truth_accel)
-    h = np.diff(time)[:, None]
-    integral = np.concatenate([np.zeros((1, 3)),
-                               np.cumsum(h / 2 * (force[1:] + force[:-1]), axis=0)])
-
-    def size(vectors: Array) -> Array:
-        return np.linalg.norm(vectors, axis=1)
-
-    return (time, size(remainder), 2 * EARTH_RATE ** 2 * time * np.linalg.norm(lever_b),
-            size(turned - turned[0]), size(integral))
+    integral = dense.cumulative(time, np.einsum('nij,nj->ni', C_b0b, truth.truth_accel))
+    return (time, np.linalg.norm(remainder, axis=1),
+            2 * EARTH_RATE ** 2 * time * np.linalg.norm(lever_b),
+            np.linalg.norm(turned - turned[0], axis=1), np.linalg.norm(integral, axis=1))
 
 
 def exact_lever_remainder(time: Array, C_b0b: Array, omega_eb_b: Array, omega_ie_b0: Array,
@@ -240,32 +223,12 @@ def exact_lever_remainder(time: Array, C_b0b: Array, omega_eb_b: Array, omega_ie
     """
     Difference of the exact form of (9) from the short one: the oracle of Remark 2.1.
 
-    Parameters
-    ----------
-    time : ndarray, shape (N,)
-        Seconds, starting at t0.
-    C_b0b : ndarray, shape (N, 3, 3)
-        Attitude relative to t0.
-    omega_eb_b : ndarray, shape (N, 3)
-        Angular rate to the Earth.
-    omega_ie_b0 : ndarray, shape (3,)
-        Earth rate in b0.
-    lever_b : ndarray, shape (3,)
-        Lever arm, metres.
-
-    Returns
-    -------
-    ndarray, shape (N, 3)
-        m/s; at most ``W^2 t |lever|``.
-
+    For times (N,) from t0 on, attitudes to t0 (N, 3, 3), rates to the Earth (N, 3), the Earth rate
+    in b0 and the lever arm (3,) in SI units; (N, 3), m/s, at most ``W^2 t |lever|``.
     """
     rate = skew(omega_eb_b)
-    swept = C_b0b @ rate
-    h = np.diff(time)[:, None, None]
-    integral = np.concatenate([np.zeros((1, 3, 3)),
-                               np.cumsum(h / 2 * (swept[1:] + swept[:-1]), axis=0)])
-    omega_ie_b = (C_b0b.transpose(0, 2, 1) @ omega_ie_b0)
-    exact = C_b0b @ rate - rate[0] + skew(omega_ie_b0) @ integral
+    omega_ie_b = C_b0b.transpose(0, 2, 1) @ omega_ie_b0
+    exact = C_b0b @ rate - rate[0] + skew(omega_ie_b0) @ dense.cumulative(time, C_b0b @ rate)
     omega_ib_b = omega_eb_b + omega_ie_b
     short = C_b0b @ skew(omega_ib_b) - skew(omega_ib_b[0])
     return (exact - short) @ lever_b

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 from ins_align.aligner import Aligner
 from ins_align.config import Config
 from ins_align.experiments import ExperimentError
-from ins_align.experiments.common import Error, error_of, parallel, Report
+from ins_align.experiments.common import draw, Error, error_of, JsonDict, most, parallel, Report
 from ins_align.geometry.earth import matrix_en, position_n
 from ins_align.geometry.rotation import apply, Array
 from ins_align.gnss.messages import Velocity
@@ -38,7 +38,6 @@ from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import ImuSamples, Orientations, Refused
 from ins_align.recordings.reader import choose_topics, read, Request
 from ins_align.recordings.replay import Reference
-from ins_align.report import new_figure
 from ins_align.results import Epoch, State
 from ins_align.simulation.simulate import give
 import numpy as np
@@ -59,7 +58,6 @@ METHODS: dict[str, dict[str, Any]] = {
     'centred': {'method': 'vif'},
     'bank': {'method': 'bank'},
 }
-WHILE_ALIGNED = 'epochs', '> 3 sigma, %', '> 5 sigma, %', 'worst, sigma'
 
 
 @dataclass(frozen=True)
@@ -146,7 +144,6 @@ class Window(NamedTuple):
     time: Array             # (K,), s since t0
     aligned: Array          # (K,) bool
     error_deg: Array        # (K, 3), of the current attitude about east, north, up
-    sigma_deg: Array        # (K, 3), stated
     sigmas: Array           # (K, 2), tilt and heading in sigmas, that of the reference included
     declared_s: float | None
     declared: Error | None  # with the reference's sigma
@@ -156,19 +153,7 @@ class Window(NamedTuple):
 
 
 def run_window(path: Path, start_s: float, duration: float, **told: Any) -> Window:
-    """
-    Align a part of a recording.
-
-    Parameters
-    ----------
-    path : Path
-        The recording.
-    start_s, duration : float
-        Seconds from the first IMU sample.
-    **told
-        Parameters of `Config`.
-
-    """
+    """Align so many seconds of a recording, with parameters of `Config` beside its lever arm."""
     recording = load(path)
     if recording.name in KNOWN_LEVER_ARMS:
         told = {'lever_arm': KNOWN_LEVER_ARMS[recording.name], **told}
@@ -186,9 +171,7 @@ def run_window(path: Path, start_s: float, duration: float, **told: Any) -> Wind
 
 def _judged(recording: Recording, start_s: float, duration: float, epochs: list[Epoch],
             messages: list[Any]) -> Window:
-    rows = []
-    declared = None
-    declared_s = None
+    rows, declared, declared_s = [], None, None
     stamps, velocities = _velocities(messages)
     for epoch in epochs:
         attitude = epoch.current
@@ -199,15 +182,15 @@ def _judged(recording: Recording, start_s: float, duration: float, epochs: list[
         aligned = epoch.state is State.ALIGNED
         if aligned and declared is None:
             declared, declared_s = error, epoch.t_s
-        rows.append([epoch.t_s, aligned, *error.angles_deg, *attitude.sigma_deg,
-                     error.tilt_sigmas, error.heading_sigmas,
+        rows.append([epoch.t_s, aligned, *error.angles_deg, error.tilt_sigmas,
+                     error.heading_sigmas,
                      _course_error(epoch.stamp_ns, C_true, stamps, velocities)])
-    table = np.array(rows).reshape(-1, 11)
+    table = np.array(rows).reshape(-1, 8)
     minute = velocities[stamps <= stamps[0] + round(MOTION_TIME * 1e9)] if len(stamps) else []
-    return Window(start_s, table[:, 0], table[:, 1] > 0, table[:, 2:5], table[:, 5:8],
-                  table[:, 8:10], declared_s, declared, _change(minute) >= MOTION_SPEED,
+    return Window(start_s, table[:, 0], table[:, 1] > 0, table[:, 2:5], table[:, 5:7],
+                  declared_s, declared, _change(minute) >= MOTION_SPEED,
                   recording.duration - start_s >= MOTION_TIME and duration >= MOTION_TIME,
-                  table[:, 10])
+                  table[:, 7])
 
 
 def _velocities(messages: list[Any]) -> tuple[np.ndarray, Array]:
@@ -266,28 +249,39 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
         'free_start false; centred: vif. A recording without velocities has no vif: there the '
         'two use pif. Errors are those of the current attitude against the reference, in sigmas '
         'with that of the reference in quadrature.')
-    windows = collect(paths, jobs)
+    groups = [(path, method) for path in paths for method in METHODS]
+    results = parallel(run_task, [
+        [(*group, start) for start in np.arange(
+            0.0, max(load(group[0]).duration - SHORTEST, 0.0) + 1e-6, STEP).tolist()]
+        for group in groups], jobs, 'windows')
+    windows: Windows = {load(path).name: {} for path in paths}
+    for (path, method), each in zip(groups, results):
+        windows[load(path).name][method] = each
     targets_text(report, windows)
-    declared_table(report, windows)
-    time_table(report, windows)
-    whole_table(report, paths, jobs)
+    by_method = [(name, method, each) for name, methods in windows.items()
+                 for method, each in methods.items()]
+    report.table(
+        'At the declaration: median / worst. in 60 s: windows with real motion (velocity changes '
+        f'by {MOTION_SPEED:g} m/s within {MOTION_TIME:g} s) that declare within '
+        f'{MOTION_TIME:g} s. Then all epochs while ALIGNED',
+        [declared_row(f'{name}, {method}', each) for name, method, each in by_method])
+    report.table(
+        'Errors in deg after so many seconds: median / worst, declared or not; sigmas: '
+        'of the heading; course: the course over ground, above 1 m/s, taken for the '
+        'heading. Windows with real motion (all of a recording that has none)', [
+            row for name, method, each in by_method
+            for row in time_rows(name, method, each, windows[name]['bank'])])
+    [whole] = parallel(run_whole, [paths], jobs, 'whole recordings')
+    report.table('Whole recordings, bank: every epoch while ALIGNED', [
+        {'recording': load(path).name, 'after, s': _median([window.declared_s or np.nan]),
+         'of all, %': f'{100 * np.mean(window.aligned):.0f}',
+         'at the end': bool(window.aligned[-1]), **_while_aligned([window])}
+        for path, window in zip(paths, whole)])
     report.figure(figure(windows), '', 'Heading error of the bank in all windows against time; '
                                        'declared parts drawn dark')
     report.write({name: {method: [window_json(window) for window in each]
                          for method, each in methods.items()}
                   for name, methods in windows.items()})
-
-
-def collect(paths: list[Path], jobs: int | None) -> Windows:
-    """Return the windows by recording and method."""
-    tasks = []
-    for path in paths:
-        starts = np.arange(0.0, max(load(path).duration - SHORTEST, 0.0) + 1e-6, STEP)
-        tasks += [(path, method, float(start)) for method in METHODS for start in starts]
-    windows: Windows = {}
-    for (path, method, _), window in zip(tasks, parallel(run_task, tasks, jobs, 'windows')):
-        windows.setdefault(load(path).name, {name: [] for name in METHODS})[method].append(window)
-    return windows
 
 
 def run_task(task: tuple[Path, str, float]) -> Window:
@@ -304,23 +298,12 @@ def run_whole(path: Path) -> Window:
     return run_window(path, 0.0, load(path).duration)
 
 
-def whole_table(report: Report, paths: list[Path], jobs: int | None) -> None:
-    """Print how right every epoch is that is called aligned, from end to end."""
-    rows = []
-    for path, window in zip(paths, parallel(run_whole, paths, jobs, 'whole recordings')):
-        rows.append([load(path).name, _median([window.declared_s or np.nan]),
-                     f'{100 * np.mean(window.aligned):.0f}', bool(window.aligned[-1]),
-                     *_while_aligned([window])])
-    report.table('Whole recordings, bank: every epoch while ALIGNED', [
-        'recording', 'after, s', 'of all, %', 'at the end', *WHILE_ALIGNED], rows)
-
-
 def targets_text(report: Report, windows: Windows) -> None:
     """Say of the bank how much of the declared was right and how much was declared soon."""
     every = [(name, window) for name, methods in windows.items() for window in methods['bank']]
     declared = [(name, window, window.declared) for name, window in every
                 if window.declared is not None]
-    sigmas = np.array([max(error.tilt_sigmas, error.heading_sigmas) for *_, error in declared])
+    sigmas = np.array([error.worst_sigmas for *_, error in declared])
     soon, moving = _soon([window for _, window in every])
     report.text(
         f'bank over all recordings: of {len(declared)} declared, {np.sum(sigmas <= 3)} are within '
@@ -330,59 +313,44 @@ def targets_text(report: Report, windows: Windows) -> None:
         'Target of the median heading error at the declaration: 1 deg (UAV, car), 3 deg '
         '(quadrotor).' if declared else 'the bank declared nothing.')
     report.table('bank: declared beyond 3 sigma', [
-        'recording', 'start, s', 'after, s', 'heading, deg', 'sigmas', 'tilt, deg', 'sigmas'], [
-        [name, f'{window.start_s:g}', f'{window.declared_s:.1f}', f'{error.angles_deg[2]:.2f}',
-         f'{error.heading_sigmas:.1f}', f'{np.hypot(*error.angles_deg[:2]):.2f}',
-         f'{error.tilt_sigmas:.1f}']
-        for (name, window, error), worst in zip(declared, sigmas) if worst > 3])
+        {'recording': name, 'start, s': f'{window.start_s:g}',
+         'after, s': f'{window.declared_s:.1f}', 'heading, deg': f'{error.angles_deg[2]:.2f}',
+         'heading, sigma': f'{error.heading_sigmas:.1f}', 'tilt, deg': f'{error.tilt_deg:.2f}',
+         'tilt, sigma': f'{error.tilt_sigmas:.1f}'}
+        for name, window, error in declared if error.worst_sigmas > 3])
 
 
-def declared_table(report: Report, windows: Windows) -> None:
-    """Print what was declared, when, and how well."""
-    rows = []
-    for name, method, each in _by_method(windows):
-        errors = [window.declared for window in each if window.declared is not None]
-        times = [window.declared_s for window in each if window.declared_s is not None]
-        tilt, heading = (np.array([error.tilt_sigmas for error in errors]),
-                         np.array([error.heading_sigmas for error in errors]))
-        worst = np.maximum(tilt, heading)
-        rows.append([
-            f'{name}, {method}', len(each), len(errors), _median(times),
-            '/'.join(map(str, _soon(each))), _both([abs(e.angles_deg[2]) for e in errors]),
-            _both(heading), _both([np.hypot(*e.angles_deg[:2]) for e in errors]), _both(tilt),
-            int(np.sum(worst > 3)), int(np.sum(worst > 5)), *_while_aligned(each)])
-    report.table(
-        'At the declaration: median / worst. in 60 s: windows with real motion (velocity changes '
-        f'by {MOTION_SPEED:g} m/s within {MOTION_TIME:g} s) that declare within '
-        f'{MOTION_TIME:g} s. Then all epochs while ALIGNED', [
-            'recording, method', 'windows', 'declared', 'after, s', 'in 60 s', 'heading, deg',
-            'sigmas', 'tilt, deg', 'sigmas', '> 3', '> 5', *WHILE_ALIGNED], rows)
+def declared_row(name: str, windows: list[Window]) -> JsonDict:
+    """Say what was declared, when, and how well."""
+    errors = [window.declared for window in windows if window.declared is not None]
+    times = [window.declared_s for window in windows if window.declared_s is not None]
+    worst = np.array([error.worst_sigmas for error in errors])
+    return {'recording, method': name, 'windows': len(windows), 'declared': len(errors),
+            'after, s': _median(times), 'in 60 s': '/'.join(map(str, _soon(windows))),
+            'heading, deg': _both([abs(error.angles_deg[2]) for error in errors]),
+            'heading, sigma': _both([error.heading_sigmas for error in errors]),
+            'tilt, deg': _both([error.tilt_deg for error in errors]),
+            'tilt, sigma': _both([error.tilt_sigmas for error in errors]),
+            '> 3': int(np.sum(worst > 3)), '> 5': int(np.sum(worst > 5)),
+            **_while_aligned(windows)}
 
 
-def time_table(report: Report, windows: Windows) -> None:
-    """Print errors after fixed times, of windows with real motion, and of the course."""
-    rows = []
-    for name, method, each in _by_method(windows):
-        moving = [window.moves for window in windows[name]['bank']]
-        chosen = [window for window, moves in zip(each, moving) if moves or not any(moving)]
-        row: list[Any] = [f'{name}, {method}', len(chosen)]
-        course: list[Any] = [f'{name}, course', len(chosen)]
-        for time in TIMES:
-            errors = np.array([error for window in chosen
-                               if (error := errors_at(window, time)) is not None]).reshape(-1, 5)
-            row += [_both(np.abs(errors[:, 2])), _both(np.hypot(errors[:, 0], errors[:, 1])),
-                    _both(errors[:, 4])]
-            off = np.array([np.abs(window.course_deg[_place(window, time)]) for window in chosen
-                            if errors_at(window, time) is not None])
-            course += [_both(off[np.isfinite(off)]), None, None]
-        rows += [row, course] if method == 'bank' else [row]
-    header = ['recording, method', 'windows']
+def time_rows(name: str, method: str, windows: list[Window],
+              bank: list[Window]) -> list[JsonDict]:
+    """Say errors after fixed times, of windows with real motion, and beside `bank` the course."""
+    moving = any(window.moves for window in bank)
+    chosen = [window for window, other in zip(windows, bank) if other.moves or not moving]
+    row: JsonDict = {'recording, method': f'{name}, {method}', 'windows': len(chosen)}
+    course: JsonDict = {'recording, method': f'{name}, course', 'windows': len(chosen)}
     for time in TIMES:
-        header += [f'heading at {time:g} s', 'tilt', 'sigmas']
-    report.table('Errors in deg after so many seconds: median / worst, declared or not; sigmas: '
-                 'of the heading; course: the course over ground, above 1 m/s, taken for the '
-                 'heading. Windows with real motion (all of a recording that has none)',
-                 header, rows)
+        there = [window for window in chosen if errors_at(window, time) is not None]
+        errors = np.array([errors_at(window, time) for window in there]).reshape(-1, 5)
+        off = np.array([np.abs(window.course_deg[_place(window, time)]) for window in there])
+        columns = f'heading at {time:g} s', f'tilt at {time:g} s', f'sigmas at {time:g} s'
+        row |= zip(columns, (_both(np.abs(errors[:, 2])), _both(np.hypot(*errors[:, :2].T)),
+                             _both(errors[:, 4])))
+        course |= zip(columns, (_both(off[np.isfinite(off)]), None, None))
+    return [row, course] if method == 'bank' else [row]
 
 
 def errors_at(window: Window, time: float) -> np.ndarray | None:
@@ -397,12 +365,6 @@ def _place(window: Window, time: float) -> int:
     return max(int(np.searchsorted(window.time, time + 1e-6)) - 1, 0)
 
 
-def _by_method(windows: Windows) -> Iterator[tuple[str, str, list[Window]]]:
-    for name, methods in windows.items():
-        for method, each in methods.items():
-            yield name, method, each
-
-
 def _soon(windows: list[Window]) -> tuple[int, int]:
     """Count the windows with real motion that declare within a minute, and all of them."""
     moving = [window for window in windows if window.moves and window.covers_minute]
@@ -410,12 +372,12 @@ def _soon(windows: list[Window]) -> tuple[int, int]:
                for window in moving), len(moving)
 
 
-def _while_aligned(windows: list[Window]) -> list[Any]:
-    """Return the cells of `WHILE_ALIGNED`."""
+def _while_aligned(windows: list[Window]) -> JsonDict:
     held = np.concatenate([window.sigmas[window.aligned].max(axis=1, initial=0.0)
                            for window in windows])
-    return [len(held), *(f'{100 * np.mean(held > limit):.1f}' if len(held) else None
-                         for limit in (3, 5)), f'{held.max():.1f}' if len(held) else None]
+    return {'epochs': len(held), **{
+        f'> {limit} sigma, %': f'{100 * np.mean(held > limit):.1f}' if len(held) else None
+        for limit in (3, 5)}, 'worst, sigma': most(held, '.1f')}
 
 
 def _median(values: Any) -> str | None:
@@ -428,26 +390,25 @@ def _both(values: Any) -> str | None:
 
 def figure(windows: Windows) -> Any:
     """Draw heading errors of the bank over time, window by window."""
-    picture = new_figure(12.0, 3.4 * len(windows) + 0.4)
-    axes = picture.subplots(len(windows), squeeze=False)[:, 0]
-    for (name, methods), ax in zip(windows.items(), axes):
+    panels = []
+    for name, methods in windows.items():
+        lines = []
         for window in methods['bank']:
             # Two a second are enough to see, ten make a large file.
             step = max(1, len(window.time) // max(1, int(2 * np.ptp(window.time)))
                        if len(window.time) else 1)
             time, aligned = window.time[::step], window.aligned[::step]
             error = np.abs(window.error_deg[::step, 2])
-            ax.semilogy(time, error, color='#bbbbbb', linewidth=0.5)
-            ax.semilogy(time, np.where(aligned, error, np.nan), color='#CC79A7', linewidth=0.7)
-        ax.set_title(f'{name}: bank, every window (declared: dark)')
-        ax.set_ylabel('heading error (deg)')
-        ax.set_ylim(0.02, 200.0)
-        ax.grid(which='both', alpha=0.2)
-        ax.set_xlabel('time since t0 (s)')
-    return picture
+            lines += [(time, error, {'color': '#bbbbbb', 'linewidth': 0.5}),
+                      (time, np.where(aligned, error, np.nan),
+                       {'color': '#CC79A7', 'linewidth': 0.7})]
+        panels.append([{
+            'title': f'{name}: bank, every window (declared: dark)', 'lines': lines,
+            'ylabel': 'heading error (deg)', 'yscale': 'log', 'ylim': (0.02, 200.0)}])
+    return draw(12.0, 3.4 * len(windows) + 0.4, panels)
 
 
-def window_json(window: Window) -> dict[str, Any]:
+def window_json(window: Window) -> JsonDict:
     """Return the numbers of a window that the tables are made of."""
     return {
         'start_s': window.start_s, 'moves': window.moves, 'declared_s': window.declared_s,

@@ -22,13 +22,13 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ins_align.aligner import Aligner
 from ins_align.experiments import recordings
-from ins_align.experiments.common import config_for, JsonDict, parallel, Report
-from ins_align.experiments.spoilt import stream_of
-from ins_align.experiments.weak_spots import follow, HEADER, messages, row, truth
+from ins_align.experiments.common import BINS, config_for, JsonDict, parallel, Report
+from ins_align.experiments.stream import stream_of
+from ins_align.experiments.weak_spots import follow, messages, row, truth
 from ins_align.simulation.simulate import simulate
 import numpy as np
 
@@ -80,9 +80,9 @@ CASES = (
 def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
     """Run every case; the recorded car too if it is there."""
     runs = runs or RUNS
-    tasks = [(number, seed) for number in range(len(CASES)) for seed in range(runs)]
-    results = parallel(run_case, tasks, jobs, 'vehicle')
-    found = {case.name: results[k * runs:(k + 1) * runs] for k, case in enumerate(CASES)}
+    results = parallel(run_case, [[(number, seed) for seed in range(runs)]
+                                  for number in range(len(CASES))], jobs, 'vehicle')
+    found = {case.name: each for case, each in zip(CASES, results)}
     paths = sorted(data_dir.glob(f'{RECORDING}*')) if data_dir else []
     report = Report('vehicle', 'What a vehicle knows of its motion', out,
                     f' --runs {runs}' + (' --data DIR' if paths else ''))
@@ -92,14 +92,15 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
         'case says otherwise, `trust_imu_axes` and a heading threshold of 2 deg. Columns as in '
         'weak-spots; "not used": the runs at whose end the reason says that the motion '
         'contradicts `vehicle`.')
-    report.table('Simulated', [*HEADER, 'not used'], [
-        [*row(name, of_case), sum(result['not_used'] for result in of_case)]
+    report.table('Simulated', [
+        row(name, of_case) | {'not used': sum(result['not_used'] for result in of_case)}
         for name, of_case in found.items()])
     if paths:
+        starts = np.arange(0.0, max(recordings.load(paths[0]).duration - EVERY, 0.0), EVERY)
+        windows = parallel(run_recorded, [[(paths[0], told, start) for start in starts.tolist()]
+                                          for told in RECORDED], jobs, 'recorded car')
         report.table('The recorded car, started anew every 10 s', [
-            'parameters', 'windows', 'declared', 'median, s', 'heading, deg', 'beyond 3',
-            'beyond 5', 'ALIGNED at the end'], [_recorded(paths[0], told, jobs)
-                                                for told in RECORDED])
+            recorded_row(told, each) for told, each in zip(RECORDED, windows)])
     report.write({'runs': runs, 'cases': found})
 
 
@@ -113,26 +114,26 @@ def run_case(task: tuple[int, int]) -> JsonDict:
         'mount_rpy_deg': case.mount_deg or mount.tolist(), **case.simulate})
     stream = stream_of(simulation)
     aligner = Aligner(config_for(simulation, **{**CONFIG, **stream.config, **case.config}))
-    result = follow(aligner, messages(stream, LOT), partial(truth, simulation, stream))
+    result = follow(aligner, messages(stream, aligner.config, LOT),
+                    partial(truth, simulation, stream))
     return {**result, 'seed': seed,
             'not_used': 'contradicts vehicle' in aligner.status().reason}
 
 
-def _recorded(path: Path, told: JsonDict, jobs: int | None) -> list[Any]:
-    """Align windows of a recording, and return a row of the table."""
-    duration = recordings.load(path).duration
-    starts = np.arange(0.0, max(duration - EVERY, 0.0), EVERY).tolist()
-    windows = parallel(partial(_window, path, told), starts, jobs, 'recorded car')
-    declared = [window for window in windows if window.declared is not None]
-    sigmas = np.array([max(window.declared.heading_sigmas, window.declared.tilt_sigmas)
-                       for window in declared])
-    return [', '.join(f'{name}: {value}' for name, value in told.items()) or 'none',
-            len(windows), len(declared),
-            f'{np.median([window.declared_s for window in declared]):.0f}',
-            f'{np.median([abs(window.declared.angles_deg[2]) for window in declared]):.2f}',
-            int(np.sum(sigmas > 3)), int(np.sum(sigmas > 5)),
-            sum(bool(len(window.aligned) and window.aligned[-1]) for window in windows)]
-
-
-def _window(path: Path, told: JsonDict, start: float) -> Any:
+def run_recorded(task: tuple[Path, JsonDict, float]) -> recordings.Window:
+    """Align a window of a recording."""
+    path, told, start = task
     return recordings.run_window(path, start, 120.0, **told)
+
+
+def recorded_row(told: JsonDict, windows: list[recordings.Window]) -> JsonDict:
+    """Return a row of the table of windows of a recording."""
+    declared = [window for window in windows if window.declared is not None]
+    errors = [window.declared for window in declared]
+    return {'parameters': ', '.join(f'{name}: {value}' for name, value in told.items()) or 'none',
+            'windows': len(windows), 'declared': len(declared),
+            'median, s': f'{np.median([window.declared_s for window in declared]):.0f}',
+            'heading, deg': f'{np.median([abs(e.angles_deg[2]) for e in errors]):.2f}',
+            **{f'beyond {limit:g}': sum(error.worst_sigmas > limit for error in errors)
+               for limit in BINS},
+            'ALIGNED at the end': sum(bool(window.aligned[-1:].any()) for window in windows)}

@@ -64,16 +64,10 @@ _imu, _motion, _gnss = (partial(_argument, group=group) for group in ('IMU', 'mo
 @dataclass(frozen=True)
 class Arguments:
     """
-    Everything that `simulate` can be asked for, checked.
+    Everything that `simulate` can be asked for; SimulationError where an argument makes no sense.
 
     Each field's metadata holds ``text``, ``unit``, ``minimum`` and ``maximum`` (inclusive),
     ``choices``, ``names`` of its numbers where it has several, and its ``group`` of options.
-
-    Raises
-    ------
-    SimulationError
-        If an argument makes no sense.
-
     """
 
     scenario: str
@@ -202,10 +196,6 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _are_numbers(values: Any, count: int) -> bool:
-    return hasattr(values, '__len__') and len(values) == count and all(map(_is_number, values))
-
-
 def _require(name: str, value: Any, expected: str, fits: bool) -> None:
     if not fits:
         raise SimulationError(f'{name} must be {expected}, got {reprlib.repr(value)}')
@@ -228,6 +218,7 @@ def _check(field: dataclasses.Field[Any], value: Any) -> None:
         expected += f' from {line["minimum"]:g} to {line["maximum"]:g}'
     elif line['minimum'] > -math.inf:
         expected += f', {line["minimum"]:g} or above'
-    fits = _are_numbers(value, count) if count else _is_number(value)
-    _require(field.name, value, expected, fits and all(
-        line['minimum'] <= number <= line['maximum'] for number in (value if count else [value])))
+    numbers = value if count else [value]
+    fits = hasattr(numbers, '__len__') and len(numbers) == (count or 1) and all(
+        _is_number(number) and line['minimum'] <= number <= line['maximum'] for number in numbers)
+    _require(field.name, value, expected, fits)

@@ -20,6 +20,7 @@ FLU, axes ENU, angles radians, yaw counter-clockwise from east.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 from ins_align.geometry.rotation import Array, matrix_from_rpy
@@ -59,26 +60,10 @@ class Scenario(NamedTuple):
 def motion_function(name: str, duration: float, heading: float = 0.0, crab: float = 0.0,
                     stand_still: float = 0.0) -> Callable[[Array], Motion]:
     """
-    Motion of a scenario as a function of time.
+    Return the motion of one of `SCENARIOS` as a function of times (n,), for so many seconds.
 
-    Parameters
-    ----------
-    name : str
-        One of `SCENARIOS`.
-    duration : float
-        Seconds that the motion is asked for.
-    heading : float
-        Turns the whole trajectory about the vertical.
-    crab : float
-        Angle of the vehicle's nose from where its course would have it.
-    stand_still : float
-        Seconds at rest before the motion begins.
-
-    Returns
-    -------
-    callable
-        Takes times (n,) in seconds, gives a `Motion`.
-
+    Heading turns the whole trajectory about the vertical, crab the nose alone; the motion begins
+    after some seconds at rest.
     """
     scenario = SCENARIOS[name]
     motion = scenario.motion(duration)
@@ -108,15 +93,7 @@ def _step_integral(time: Array, start: float, width: float) -> Array:
 
 
 def _profile(durations: Sequence[float], values: Sequence[float], width: float) -> Any:
-    """
-    Piecewise constant with a smooth step of `width` at the start of every piece.
-
-    Returns
-    -------
-    scipy.interpolate.PPoly
-        Twice continuously differentiable, with exact antiderivatives.
-
-    """
+    """Make a PPoly that steps smoothly, within `width`, to each of the values in turn."""
     from scipy.interpolate import PPoly
 
     ends = np.cumsum(durations)
@@ -173,6 +150,7 @@ def _flight(duration: float) -> Callable[[Array], Motion]:
 
 
 def _road(first: _Rows, duration: float) -> Callable[[Array], Motion]:
+    """Drive through streets, corners, bends and traffic lights, after what comes first."""
     acceleration, rate = _course(first, _CITY, duration, 0.8)
     speed_along, heading = acceleration.antiderivative(), rate.antiderivative()
     distance = speed_along.antiderivative()
@@ -187,16 +165,6 @@ def _road(first: _Rows, duration: float) -> Callable[[Array], Motion]:
         return Motion(_along(speed, yaw, slope), np.stack([roll, pitch, yaw], axis=-1))
 
     return motion
-
-
-def _car(duration: float) -> Callable[[Array], Motion]:
-    """Drive through streets: corners, bends, traffic lights."""
-    return _road((), duration)
-
-
-def _reverse(duration: float) -> Callable[[Array], Motion]:
-    """Back out of a parking space, then drive through streets."""
-    return _road(_BACK_OUT, duration)
 
 
 def _launch(duration: float) -> Callable[[Array], Motion]:
@@ -240,50 +208,31 @@ def _hover(duration: float) -> Callable[[Array], Motion]:
     return motion
 
 
-def _straight(duration: float) -> Callable[[Array], Motion]:
-    """Hold speed, course and attitude: heading cannot be observed."""
+def _steady(speed: float, waves: Sequence[tuple[int, float, float, float]],
+            duration: float) -> Callable[[Array], Motion]:
+    """Hold speed and course; waves (axis, amplitude, period, phase) swing the attitude alone."""
     def motion(time: Array) -> Motion:
-        zero = np.zeros_like(time)
-        return Motion(_along(zero + 30.0, zero, zero), np.zeros((len(time), 3)))
+        rpy = np.zeros((len(time), 3))
+        for axis, *wave in waves:
+            rpy[:, axis] += _wave(time, *wave)
+        return Motion(np.tile([speed, 0.0, 0.0], (len(time), 1)), rpy)
 
     return motion
 
 
-def _highway(duration: float) -> Callable[[Array], Motion]:
-    """Drive straight on at a constant 10 m/s; gusts push the nose off the course by a degree."""
-    def motion(time: Array) -> Motion:
-        zero = np.zeros_like(time)
-        roll, pitch = _wave(time, 0.005, 2.3) + _wave(time, 0.01, 17.0), _wave(time, 0.005, 1.7)
-        slip = _wave(time, 0.017, 3.1) + _wave(time, 0.017, 7.3, 1.0)
-        return Motion(_along(zero + 10.0, zero, zero), np.stack([roll, pitch, slip], axis=-1))
-
-    return motion
-
-
-def _static(duration: float) -> Callable[[Array], Motion]:
-    """Stand."""
-    return lambda time: Motion(np.zeros((len(time), 3)), np.zeros((len(time), 3)))
-
-
-def _swing(duration: float) -> Callable[[Array], Motion]:
-    """Hold a course as a boat does in waves, the heading swinging about it."""
-    def motion(time: Array) -> Motion:
-        zero = np.zeros_like(time)
-        rpy = np.stack([_wave(time, 0.05, 4.7), _wave(time, 0.03, 6.1),
-                        _wave(time, np.radians(20.0), 11.0)], axis=-1)
-        return Motion(_along(zero + 5.0, zero, zero), rpy)
-
-    return motion
-
-
+# Gusts push the nose of a car on a highway off its course, by a degree.
+_GUSTS = ((0, 0.005, 2.3, 0.0), (0, 0.01, 17.0, 0.0), (1, 0.005, 1.7, 0.0), (2, 0.017, 3.1, 0.0),
+          (2, 0.017, 7.3, 1.0))
+# A boat in waves.
+_SEA = ((0, 0.05, 4.7, 0.0), (1, 0.03, 6.1, 0.0), (2, np.radians(20.0), 11.0, 0.0))
 SCENARIOS = {
     'flight': Scenario(_flight, 100.0, 40.0),
-    'car': Scenario(_car, 100.0, 1.0),
-    'straight': Scenario(_straight, 100.0, 15.0),
-    'static': Scenario(_static, 60.0, 1.0),
+    'car': Scenario(partial(_road, ()), 100.0, 1.0),
+    'straight': Scenario(partial(_steady, 30.0, ()), 100.0, 15.0),
+    'static': Scenario(partial(_steady, 0.0, ()), 60.0, 1.0),
     'hover': Scenario(_hover, 60.0, 2.0),
     'launch': Scenario(_launch, 60.0, 2.0),
-    'reverse': Scenario(_reverse, 100.0, 1.0),
-    'swing': Scenario(_swing, 100.0, 5.0),
-    'highway': Scenario(_highway, 60.0, 5.0),
+    'reverse': Scenario(partial(_road, _BACK_OUT), 100.0, 1.0),
+    'swing': Scenario(partial(_steady, 5.0, _SEA), 100.0, 5.0),
+    'highway': Scenario(partial(_steady, 10.0, _GUSTS), 60.0, 5.0),
 }

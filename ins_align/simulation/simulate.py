@@ -29,6 +29,7 @@ from operator import itemgetter
 import os
 from pathlib import Path
 import tempfile
+from types import SimpleNamespace
 from typing import Any
 
 from ins_align.config import Config, ImuNoise, PRESETS
@@ -46,6 +47,7 @@ TOPICS = {'/imu/data_raw': 'sensor_msgs/msg/Imu', '/reference/imu': 'sensor_msgs
           '/fix': 'sensor_msgs/msg/NavSatFix',
           '/fix_velocity': 'geometry_msgs/msg/TwistWithCovarianceStamped',
           '/tf_static': 'tf2_msgs/msg/TFMessage'}
+PACKAGES = ('builtin_interfaces/', 'std_msgs/', 'geometry_msgs/', 'sensor_msgs/', 'tf2_msgs/')
 
 _TRUTH_STD = 1e-6  # rad, stated on the reference topic: zero would mean unknown
 
@@ -86,19 +88,7 @@ class Simulation:
     _C_vb: Array
 
     def attitude_at(self, stamps_ns: int | np.ndarray) -> Array:
-        """
-        Return the true ``C_nb`` at any stamps, exact between the samples.
-
-        Parameters
-        ----------
-        stamps_ns : int or ndarray, shape (...)
-            Within the recording.
-
-        Returns
-        -------
-        ndarray, shape (..., 3, 3)
-
-        """
+        """Return the true ``C_nb`` at stamps (...), exact between samples, shape (..., 3, 3)."""
         stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
         time = (stamps_ns.ravel() - START_NS) * 1e-9
         C_nb = matrix_from_rpy(self._trajectory.motion(time).rpy) @ self._C_vb
@@ -108,28 +98,19 @@ class Simulation:
         """
         Yield what a subscriber gets, in the order of arrival.
 
-        Yields
-        ------
-        kind : str
-            'imu', 'fix' or 'velocity'.
-        payload : tuple
-            For 'imu' the samples since the message before: stamps (n,), gyro (n, 3),
-            accel (n, 3). Otherwise a `Fix` or a `Velocity`.
-
+        Each is 'imu' with the samples since the message before (stamps (n,), gyro (n, 3), accel
+        (n, 3)), 'fix' with a `Fix`, or 'velocity' with a `Velocity`.
         """
         upto = np.searchsorted(self.imu_stamps_ns, self.gnss_arrival_ns, side='right')
         start = 0
-        for k, end in enumerate(upto):
+        for k, end in enumerate([*upto, len(self.imu_stamps_ns)]):
             if end > start:
-                yield 'imu', self._imu(start, end)
+                yield 'imu', (self.imu_stamps_ns[start:end], self.gyro[start:end],
+                              self.accel[start:end])
                 start = end
-            yield 'fix', self.fix(k)
-            yield 'velocity', self.velocity_measurement(k)
-        if start < len(self.imu_stamps_ns):
-            yield 'imu', self._imu(start, len(self.imu_stamps_ns))
-
-    def _imu(self, start: int, end: int) -> tuple[np.ndarray, Array, Array]:
-        return self.imu_stamps_ns[start:end], self.gyro[start:end], self.accel[start:end]
+            if k < len(upto):
+                yield 'fix', self.fix(k)
+                yield 'velocity', self.velocity_measurement(k)
 
     def fix(self, k: int) -> Fix:
         """Return the position of GNSS epoch k as a message."""
@@ -175,25 +156,10 @@ def give(aligner: Any, kind: str, payload: Any) -> None:
 
 def simulate(scenario: str, **options: Any) -> Simulation:
     """
-    Simulate the sensors of a moving vehicle.
+    Simulate the sensors of a vehicle that moves as one of `SCENARIOS`.
 
-    Parameters
-    ----------
-    scenario : str
-        One of `SCENARIOS`.
-    options
-        The fields of `Arguments`, whose defaults hold for the rest; units are SI, but where the
-        name says degrees.
-
-    Returns
-    -------
-    Simulation
-
-    Raises
-    ------
-    SimulationError
-        If an argument makes no sense.
-
+    The options are the fields of `Arguments`, in SI units but where the name says degrees; what
+    makes no sense raises SimulationError.
     """
     asked = Arguments(scenario, **options)
     trajectory = trajectory_of(scenario, *(float(getattr(asked, name)) for name in (
@@ -256,8 +222,11 @@ def _gnss(asked: Arguments, trajectory: Trajectory, C_vb: Array, lever_b: Array,
     scale = 0.0 if asked.ideal else 1.0
     stamps, time = _gnss_epochs(asked)
     lla, velocity = trajectory.antenna(time, C_vb, lever_b)
-    velocity_sigma = _per_axis(asked.velocity_std, asked.velocity_std_vertical, 1.0)
-    position_sigma = _per_axis(asked.position_std, asked.position_std_vertical, 2.0)
+    velocity_sigma, position_sigma = (
+        np.array([level, level, ratio * level if vertical is None else vertical])
+        for level, vertical, ratio in (
+            (asked.velocity_std, asked.velocity_std_vertical, 1.0),
+            (asked.position_std, asked.position_std_vertical, 2.0)))
     outlier = streams[4].random(len(time)) < asked.outlier_rate
     direction = streams[4].standard_normal((len(time), 3))
     direction *= (outlier / np.linalg.norm(direction, axis=1))[:, None]
@@ -280,10 +249,6 @@ def _gnss(asked: Arguments, trajectory: Trajectory, C_vb: Array, lever_b: Array,
             'gnss_arrival_ns': gnss_stamps_ns + round(asked.gnss_latency * 1e9),
             'lla_deg': lla, 'velocity': velocity, 'velocity_covariance': velocity_covariance,
             'position_covariance': np.diag(position_sigma ** 2), 'outlier': outlier}
-
-
-def _per_axis(horizontal: float, vertical: float | None, ratio: float) -> Array:
-    return np.array([horizontal, horizontal, ratio * horizontal if vertical is None else vertical])
 
 
 def _gnss_epochs(asked: Arguments) -> tuple[np.ndarray, Array]:
@@ -323,23 +288,9 @@ def write_bag(simulation: Simulation, path: str | os.PathLike, storage: str = 'm
     bag's directory gets ``ins_align.yaml``, the parameters that suit the recording; the arguments
     of the simulation and the drawn biases are in the bag's custom data.
 
-    Parameters
-    ----------
-    simulation : Simulation
-        What to write.
-    path : path
-        Directory to be made; written whole or not at all.
-    storage : str
-        One of `STORAGES`.
-    tf : bool
-        Write how IMU and antenna are mounted on the vehicle to `/tf_static`: frames base_link,
-        imu and gnss.
-
-    Raises
-    ------
-    SimulationError
-        If the path exists or the storage is not known.
-
+    The path becomes a directory, written whole or not at all; SimulationError says that it is
+    there, or that storage is none of `STORAGES`. `tf` writes to `/tf_static`, too, how IMU and
+    antenna are mounted: frames base_link, imu and gnss.
     """
     path = Path(path)
     if storage not in STORAGES:
@@ -359,14 +310,16 @@ def _write_messages(simulation: Simulation, path: Path, storage: str, tf: bool) 
     from rosbags.typesys import get_typestore, Stores
 
     typestore = get_typestore(Stores.ROS2_JAZZY)
+    ros = SimpleNamespace(**{name.split('/')[-1]: kind for name, kind in typestore.types.items()
+                             if name.startswith(PACKAGES)})
+    streams = [_imu_messages(simulation, ros), _gnss_messages(simulation, ros)]
+    if tf:
+        streams.insert(0, _static_transforms(simulation, ros))
     with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
         writer.set_custom_data('ins_align', json.dumps(
             {**simulation.meta, 'gyro_bias': simulation.gyro_bias,
              'accel_bias': simulation.accel_bias}, default=lambda value: value.tolist()))
         connections = {}
-        streams = _ros_messages(simulation, typestore.types)
-        if tf:
-            streams.insert(0, _static_transforms(simulation, typestore.types))
         for arrival, topic, message in heapq.merge(*streams, key=itemgetter(0)):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, TOPICS[topic],
@@ -375,70 +328,59 @@ def _write_messages(simulation: Simulation, path: Path, storage: str, tf: bool) 
                          typestore.serialize_cdr(message, TOPICS[topic]))
 
 
-def _static_transforms(simulation: Simulation, types: Any) -> Iterator[tuple[int, str, Any]]:
-    """Yield what a robot publishes of its model: time, topic and message."""
-    start = int(simulation.imu_stamps_ns[0])
-    vector, turn = types['geometry_msgs/msg/Vector3'], types['geometry_msgs/msg/Quaternion']
-    header = types['std_msgs/msg/Header'](
-        types['builtin_interfaces/msg/Time'](*divmod(start, 1_000_000_000)), 'base_link')
-    C_vb = simulation._C_vb
-    yield start, '/tf_static', types['tf2_msgs/msg/TFMessage']([
-        types['geometry_msgs/msg/TransformStamped'](
-            header, child, types['geometry_msgs/msg/Transform'](
-                vector(*translation.tolist()), turn(*quaternion_from_matrix(C).tolist())))
+def _header(ros: SimpleNamespace, stamp_ns: int, frame: str) -> Any:
+    return ros.Header(ros.Time(*divmod(stamp_ns, 1_000_000_000)), frame)
+
+
+# Time of arrival, topic and message.
+_Messages = Iterator[tuple[int, str, Any]]
+
+
+def _static_transforms(simulation: Simulation, ros: SimpleNamespace) -> _Messages:
+    """Yield what a robot publishes of its model."""
+    start, C_vb = int(simulation.imu_stamps_ns[0]), simulation._C_vb
+    yield start, '/tf_static', ros.TFMessage([
+        ros.TransformStamped(_header(ros, start, 'base_link'), child, ros.Transform(
+            ros.Vector3(*translation.tolist()),
+            ros.Quaternion(*quaternion_from_matrix(C).tolist())))
         for child, translation, C in (('imu', np.zeros(3), C_vb),
                                       ('gnss', C_vb @ simulation.lever_arm, np.eye(3)))])
 
 
-def _ros_messages(simulation: Simulation, types: Any) -> list[Iterator[tuple[int, str, Any]]]:
-    """Return times of arrival, topics and messages: one iterator for IMU, one for GNSS."""
-    make_imu, make_fix, make_velocity = (
-        types[TOPICS[topic]] for topic in ('/imu/data_raw', '/fix', '/fix_velocity'))
-    make_vector, make_quaternion, make_twist, make_covariance = (
-        types[f'geometry_msgs/msg/{name}']
-        for name in ('Vector3', 'Quaternion', 'Twist', 'TwistWithCovariance'))
-    make_status = types['sensor_msgs/msg/NavSatStatus']
-    make_header, make_time = types['std_msgs/msg/Header'], types['builtin_interfaces/msg/Time']
+def _imu_messages(simulation: Simulation, ros: SimpleNamespace) -> _Messages:
+    unknown, exact = np.array([-1.0] + 8 * [0.0]), np.zeros(9)
+    truth, gyro_covariance, accel_covariance = (
+        (std ** 2 * np.eye(3)).ravel()
+        for std in (_TRUTH_STD, simulation.gyro_std, simulation.accel_std))
+    level = ros.Quaternion(0.0, 0.0, 0.0, 1.0)
+    for stamp, attitude, gyro, accel, true_gyro, true_accel in zip(*(
+            values.tolist() for values in (
+                simulation.imu_stamps_ns, quaternion_from_matrix(simulation.truth_C_nb),
+                simulation.gyro, simulation.accel, simulation.truth_gyro,
+                simulation.truth_accel)), strict=True):
+        header = _header(ros, stamp, 'imu')
+        yield stamp, '/imu/data_raw', ros.Imu(
+            header, level, unknown, ros.Vector3(*gyro), gyro_covariance, ros.Vector3(*accel),
+            accel_covariance)
+        yield stamp, '/reference/imu', ros.Imu(
+            header, ros.Quaternion(*attitude), truth, ros.Vector3(*true_gyro), exact,
+            ros.Vector3(*true_accel), exact)
 
-    def header(stamp: int, frame: str) -> Any:
-        return make_header(make_time(*divmod(stamp, 1_000_000_000)), frame)
 
-    def diagonal(std: float) -> Array:
-        return (std ** 2 * np.eye(3)).ravel()
-
-    def imu() -> Iterator[tuple[int, str, Any]]:
-        unknown, exact, truth = np.array([-1.0] + 8 * [0.0]), np.zeros(9), diagonal(_TRUTH_STD)
-        gyro_covariance, accel_covariance = map(diagonal,
-                                                (simulation.gyro_std, simulation.accel_std))
-        no_attitude = make_quaternion(0.0, 0.0, 0.0, 1.0)
-        for stamp, attitude, gyro, accel, true_gyro, true_accel in zip(*(
-                values.tolist() for values in (
-                    simulation.imu_stamps_ns, quaternion_from_matrix(simulation.truth_C_nb),
-                    simulation.gyro, simulation.accel, simulation.truth_gyro,
-                    simulation.truth_accel)), strict=True):
-            yield stamp, '/imu/data_raw', make_imu(
-                header(stamp, 'imu'), no_attitude, unknown, make_vector(*gyro), gyro_covariance,
-                make_vector(*accel), accel_covariance)
-            yield stamp, '/reference/imu', make_imu(
-                header(stamp, 'imu'), make_quaternion(*attitude), truth, make_vector(*true_gyro),
-                exact, make_vector(*true_accel), exact)
-
-    def gnss() -> Iterator[tuple[int, str, Any]]:
-        covariance = np.zeros((6, 6))
-        covariance[:3, :3] = simulation.velocity_covariance
-        position_covariance = simulation.position_covariance.ravel()
-        for stamp, arrival, lla, velocity in zip(*(values.tolist() for values in (
-                simulation.gnss_stamps_ns, simulation.gnss_arrival_ns, simulation.lla_deg,
-                simulation.velocity)), strict=True):
-            yield arrival, '/fix', make_fix(
-                header(stamp, 'gnss'), make_status(0, 1), *lla, position_covariance,
-                make_fix.COVARIANCE_TYPE_KNOWN)
-            yield arrival, '/fix_velocity', make_velocity(
-                header(stamp, simulation.meta['velocity_frame']), make_covariance(
-                    make_twist(make_vector(*velocity), make_vector(0.0, 0.0, 0.0)),
-                    covariance.ravel()))
-
-    return [imu(), gnss()]
+def _gnss_messages(simulation: Simulation, ros: SimpleNamespace) -> _Messages:
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = simulation.velocity_covariance
+    position_covariance = simulation.position_covariance.ravel()
+    for stamp, arrival, lla, velocity in zip(*(values.tolist() for values in (
+            simulation.gnss_stamps_ns, simulation.gnss_arrival_ns, simulation.lla_deg,
+            simulation.velocity)), strict=True):
+        yield arrival, '/fix', ros.NavSatFix(
+            _header(ros, stamp, 'gnss'), ros.NavSatStatus(0, 1), *lla, position_covariance,
+            ros.NavSatFix.COVARIANCE_TYPE_KNOWN)
+        yield arrival, '/fix_velocity', ros.TwistWithCovarianceStamped(
+            _header(ros, stamp, simulation.meta['velocity_frame']), ros.TwistWithCovariance(
+                ros.Twist(ros.Vector3(*velocity), ros.Vector3(0.0, 0.0, 0.0)),
+                covariance.ravel()))
 
 
 def _parameter_file(simulation: Simulation) -> str:
@@ -454,13 +396,13 @@ def _parameter_file(simulation: Simulation) -> str:
     if preset is None:
         values['angle_random_walk'] = math.degrees(noise.angle_random_walk) * 60
         values['velocity_random_walk'] = noise.velocity_random_walk * 60
-    if preset is None or noise[:4] != preset[:4]:
+        preset = ImuNoise(0.0, 0.0, 0.0, 0.0)
+    if noise[:4] != preset[:4]:
         values['gyro_bias_std'] = math.degrees(noise.gyro_bias_std)
         values['accel_bias_std'] = float(noise.accel_bias_std)
-    usual = preset or ImuNoise(0.0, 0.0, 0.0, 0.0)
-    if noise.gyro_scale_std > usual.gyro_scale_std and not meta['ideal']:
+    if noise.gyro_scale_std > preset.gyro_scale_std and not meta['ideal']:
         values['gyro_scale_std'] = float(noise.gyro_scale_std)
-    if noise.rate_random_walk > usual.rate_random_walk and not meta['ideal']:
+    if noise.rate_random_walk > preset.rate_random_walk and not meta['ideal']:
         values['rate_random_walk'] = math.degrees(noise.rate_random_walk) * 60
     return ''.join(['ins_align:\n  ros__parameters:\n',
                     *(f'    {name}: {value}\n' for name, value in values.items())])
