@@ -27,7 +27,7 @@ from ins_align.config import Config, ImuNoise, PRESETS
 from ins_align.estimation.filter import Filters
 from ins_align.estimation.linearised import (
     DELAY, FIRST, GYRO, LEVER_ARM, OF_VEHICLE, triads)
-from ins_align.estimation.vehicle import AMBIGUOUS, known_of_vehicle, Vehicle
+from ins_align.estimation.vehicle import AMBIGUOUS, known_of_vehicle, UNCONFIRMED, Vehicle
 from ins_align.geometry.rotation import Array, log_so3
 from ins_align.geometry.transform import Transform
 import numpy as np
@@ -46,6 +46,8 @@ ALIKE = 2.0
 # A wrong rival has to be less likely by this (log likelihood) or to give the same attitude, to so
 # many sigmas.
 MARGIN, HARMLESS = 6.0, 1.0
+# What is assumed of a vehicle must be likelier by this than nothing: some seconds of motion.
+CONFIRMED = 9.0
 # Share of the IMU's measured noise beyond the stated one that is believed at first: vibration
 # looks white from sample to sample and is less than that over seconds.
 SHARE = 1 / 27
@@ -256,7 +258,10 @@ class Rivals:
             Whether the data fit better with one of them.
 
         """
-        wrong = self._wrong[filters.ids]
+        wrong, free = self._wrong[filters.ids], self._free[filters.ids]
+        if free.any() and (np.max(self.of_levels(filters))
+                           < np.max(self._posterior(filters)[free]) + CONFIRMED):
+            return UNCONFIRMED, False
         if not wrong.any():
             return '', False
         # How much likelier each of them is than all levels.

@@ -52,6 +52,7 @@ MOST = 4.0
 NOT_USED = ('; the motion contradicts vehicle: {vehicle}, which is not used (a drift, a tow, a '
             'ferry, or x of base_frame does not point forward: raise mount_yaw_std or '
             'vehicle_velocity_std?)')
+UNCONFIRMED = 'the motion does not confirm yet that the vehicle moves along x of its base: wait'
 AMBIGUOUS = '; forwards and backwards are both possible: change speed'
 
 
