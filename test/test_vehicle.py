@@ -117,6 +117,14 @@ def test_direction_of_a_slow_car_is_said_to_be_ambiguous_until_its_speed_changes
     assert abs(np.remainder(error + 180.0, 360.0) - 180.0) < 3 * epochs[-1].current.sigma_deg[2]
 
 
+def test_vehicle_at_rest_has_no_direction():
+    """The noise of its speed says nothing of the heading."""
+    simulation = simulate('static', seed=1, duration=20.0)
+    known, unknown = (aligned(simulation, vehicle=vehicle)[0].status().current.sigma_deg[2]
+                      for vehicle in ('car', 'none'))
+    assert known == pytest.approx(unknown, rel=0.01)
+
+
 @pytest.mark.parametrize('method', ['vif', 'pif'])
 def test_published_methods_know_no_vehicle(method):
     with pytest.raises(ConfigError, match='vehicle is car: set it to none'):
