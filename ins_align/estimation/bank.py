@@ -29,8 +29,7 @@ from ins_align.estimation.filter import Filters, Track
 from ins_align.estimation.linearised import (
     DELAY, FIRST, GYRO, Linearised, linearised, MAX_DELAY, MIN_DELAY, PHI, PHI0, triads)
 from ins_align.estimation.receiver import ReceiverNoise
-from ins_align.estimation.rivals import (
-    level_in_words, Parameters, Rivals, SHARE)
+from ins_align.estimation.rivals import level_in_words, Parameters, Rivals, SHARE
 from ins_align.estimation.start import all_headings, HEADINGS, OPEN_POSITION, RoughAttitude, Start
 from ins_align.estimation.track import InertialTrack
 from ins_align.estimation.vehicle import NOT_USED
@@ -242,8 +241,7 @@ class Bank:
     def _step(self, filters: Filters, model: Linearised, k: int, track: Track) -> None:
         self._mixed = None
         filters.propagate(model, k)
-        vehicle = self._rivals.vehicle
-        look = vehicle is not None and vehicle.is_due(model.duration[k])
+        vehicle = self._rivals.vehicle_after(model.duration[k])
         self._nis, self._innovation = math.nan, NOTHING_NEW
         if not any(track.present[k]):
             return
@@ -268,7 +266,7 @@ class Bank:
         self._rejected[2] += bad
         self._in_a_row = self._in_a_row + 1 if astray else 0
         self._nis, self._innovation = sum(nis) / len(nis), first
-        if vehicle is not None and look:
+        if vehicle is not None:
             filters.hold(vehicle.look(filters, model, k, track))
         self._rivals.select(filters)
 

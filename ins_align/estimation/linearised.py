@@ -18,6 +18,7 @@ The errors of `filter` are the body's, so what is linearised here holds no attit
 means of a rival (docs, "Theory").
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 from ins_align.geometry.rotation import apply, Array, by_row, cross, exp_so3, skew
@@ -139,17 +140,7 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool,
         H[:, 1], expected[:, 1] = seen.position()
     return Linearised(point.copy(), interval.duration.tolist(), R, moved, J, F,
                       turn @ Q @ turn.swapaxes(-1, -2), H, expected,
-                      None if base is None else _seen_of_base(point, interval, base))
-
-
-def _seen_of_base(point: Array, interval: Intervals, base: Array) -> tuple[Array, Array, Array]:
-    """See the base as a receiver whose antenna is there would."""
-    point = point.copy()
-    point[:, LEVER_ARM] = base
-    seen = _Seen(point, interval)
-    H, expected = seen.velocity()
-    H[..., FIRST:][..., LEVER_ARM] = 0.0
-    return H, expected, seen.back
+                      None if base is None else seen.base(base))
 
 
 class _Seen:
@@ -159,7 +150,6 @@ class _Seen:
         """Lead back from the epochs to the moments that were measured."""
         self.shape = interval.R.shape[:2] + (3, FIRST + point.shape[1])
         gyro, accel = (point[:, triad] for triad in triads(point.shape[1]))
-        self.lever = np.broadcast_to(point[:, LEVER_ARM], interval.omega.shape)
         self.delay = delay = float(point[0, DELAY])
         force, self.gained, self.gained_p = exact(interval.gained, delay)
         rate, self.turned, _ = exact(interval.turned, delay)
@@ -179,14 +169,29 @@ class _Seen:
         self.rate = rate + vibration
         self.omega = calm + corrected(vibration, gyro, 0.0)
         self.back = exp_so3(-turn)
-        self.swing = apply(self.back, cross(self.omega, self.lever))
         self.fallen = corrected(self.gained, accel, delay)
         self.fallen_p = corrected(self.gained_p, accel, delay ** 2 / 2)
         # Vibration is no use in a derivative. The rate changes with time as it does not with age.
-        calm_force = corrected(smooth(interval.gained, delay)[0], accel, 1.0)
-        change = corrected(smooth(interval.turned, delay)[1], gyro, 0.0)
-        whirled = cross(calm, cross(self.omega, self.lever)) - cross(change, self.lever)
-        self.acceleration = calm_force + apply(self.back, whirled)
+        self._calm = calm
+        self._calm_force = corrected(smooth(interval.gained, delay)[0], accel, 1.0)
+        self._change = corrected(smooth(interval.turned, delay)[1], gyro, 0.0)
+        self._carry(point[:, LEVER_ARM])
+
+    def _carry(self, lever: Array) -> None:
+        """Let the antenna be at the end of a lever arm."""
+        self.lever = np.broadcast_to(lever, self.omega.shape)
+        swing = cross(self.omega, self.lever)
+        self.swing = apply(self.back, swing)
+        whirled = cross(self._calm, swing) - cross(self._change, self.lever)
+        self.acceleration = self._calm_force + apply(self.back, whirled)
+
+    def base(self, position: Array) -> tuple[Array, Array, Array]:
+        """See the vehicle's base as an antenna there would; see `Linearised.base`."""
+        other = copy(self)
+        other._carry(position)
+        H, expected = other.velocity()
+        H[..., FIRST:][..., LEVER_ARM] = 0.0        # it is not that of the antenna
+        return H, expected, self.back
 
     def velocity(self) -> tuple[Array, Array]:
         """Return its derivatives, shape (K, M, 3, n), and what u lacks of it, (K, M, 3)."""

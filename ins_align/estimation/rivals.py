@@ -178,6 +178,11 @@ class Rivals:
         """Return where the base of the vehicle is in the frame of the IMU, m."""
         return None if self.vehicle is None else self.vehicle.position
 
+    def vehicle_after(self, duration: float) -> Vehicle | None:
+        """Return the vehicle, where there is one, if it is due when these seconds are over."""
+        vehicle = self.vehicle
+        return vehicle if vehicle is not None and vehicle.is_due(duration) else None
+
     def best(self, filters: Filters) -> int:
         """Return the place of the likeliest level."""
         return int(np.argmax(self.of_levels(filters)))

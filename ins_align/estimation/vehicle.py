@@ -107,9 +107,7 @@ class Vehicle:
         open_ = np.bincount(q) > 1
         fast = np.linalg.norm(v_n0[lead], axis=1)
         moves = fast > MOVES * np.sqrt(np.trace(filters.P[:, XI, XI], axis1=1, axis2=2) / 3)
-        speed = np.where(open_, fast, np.abs(v[lead, 0]))
-        direction = np.where(open_, along, np.sign(v[lead, 0]) * (along != 0))
-        speed = direction * speed
+        speed = np.where(open_, along * fast, v[lead, 0] * (along != 0))
         self.against[filters.ids] = np.maximum(
             self.against[filters.ids], 0.5 * (np.minimum(speed, 0.0) / BACKWARDS_SPEED) ** 2)
         H = to_base[:, 1:] @ H_v
@@ -118,7 +116,7 @@ class Vehicle:
         x[..., MOUNT], x[..., DRIFT] = -speed[:, None, None] * np.eye(2), -np.eye(2)
         sideways = v[:, 1:] - v[:, :1] * filters.x[:, MOUNT] - filters.x[:, DRIFT]
         return Look(moves & (along != 0), H, NOISE ** 2 + (self._slip * speed) ** 2, -sideways,
-                    np.maximum(-direction[q] * v[:, 0], 0.0),
+                    np.maximum(-np.sign(speed)[q] * v[:, 0], 0.0),
                     apply(filters.C, self._axes[:, 2])[:, 2] < 0)
 
     def forward(self, C: Array) -> Array:

@@ -26,9 +26,9 @@ from typing import NamedTuple
 
 from ins_align.aligner import Aligner
 from ins_align.experiments import recordings
-from ins_align.experiments.common import BINS, config_for, JsonDict, parallel, Report
+from ins_align.experiments.common import config_for, JsonDict, parallel, Report
 from ins_align.experiments.stream import stream_of
-from ins_align.experiments.weak_spots import follow, messages, row, truth
+from ins_align.experiments.weak_spots import follow, messages, RECORDING, row, truth
 from ins_align.simulation.simulate import simulate
 import numpy as np
 
@@ -37,7 +37,7 @@ MOUNT_STD_DEG = 1.0
 LOT = 50                # IMU samples given at once
 CONFIG: JsonDict = {'vehicle': 'car', 'mount_yaw_std': MOUNT_STD_DEG, 'trust_imu_axes': True,
                     'heading_std_threshold': 2.0}
-RECORDING, EVERY = 'car_drive0708', 10.0        # s from start to start
+EVERY = 10.0            # s from start to start of the recorded car
 RECORDED: tuple[JsonDict, ...] = ({}, {'vehicle': 'car'},
                                   {'vehicle': 'car', 'heading_std_threshold': 2.0})
 
@@ -100,7 +100,9 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
         windows = parallel(run_recorded, [[(paths[0], told, start) for start in starts.tolist()]
                                           for told in RECORDED], jobs, 'recorded car')
         report.table('The recorded car, started anew every 10 s', [
-            recorded_row(told, each) for told, each in zip(RECORDED, windows)])
+            recordings.declared_row(
+                ', '.join(f'{name}: {value}' for name, value in told.items()) or 'none', each)
+            for told, each in zip(RECORDED, windows)])
     report.write({'runs': runs, 'cases': found})
 
 
@@ -124,16 +126,3 @@ def run_recorded(task: tuple[Path, JsonDict, float]) -> recordings.Window:
     """Align a window of a recording."""
     path, told, start = task
     return recordings.run_window(path, start, 120.0, **told)
-
-
-def recorded_row(told: JsonDict, windows: list[recordings.Window]) -> JsonDict:
-    """Return a row of the table of windows of a recording."""
-    declared = [window for window in windows if window.declared is not None]
-    errors = [window.declared for window in declared]
-    return {'parameters': ', '.join(f'{name}: {value}' for name, value in told.items()) or 'none',
-            'windows': len(windows), 'declared': len(declared),
-            'median, s': f'{np.median([window.declared_s for window in declared]):.0f}',
-            'heading, deg': f'{np.median([abs(e.angles_deg[2]) for e in errors]):.2f}',
-            **{f'beyond {limit:g}': sum(error.worst_sigmas > limit for error in errors)
-               for limit in BINS},
-            'ALIGNED at the end': sum(bool(window.aligned[-1:].any()) for window in windows)}
