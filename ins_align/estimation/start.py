@@ -24,8 +24,8 @@ from typing import NamedTuple
 
 from ins_align.config import Config
 from ins_align.estimation.formula import AttitudeMoments
-from ins_align.estimation.linearised import FIRST, PHI, PHI0, RHO, XI
 from ins_align.estimation.receiver import LEAST_NOISE, LOUD
+from ins_align.estimation.states import FIRST, PHI, PHI0, RHO, XI
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.rotation import apply, Array, cross, cumulative_rotations, exp_so3, Index
 from ins_align.gnss.messages import AntennaEpoch, velocities_of
