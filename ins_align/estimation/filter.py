@@ -190,7 +190,8 @@ class Filters:
         rows = F @ P
         P[:, :9, 9:] = rows[:, :, 9:]
         P[:, 9:, :9] = rows[:, :, 9:].swapaxes(1, 2)
-        P[:, :9, :9] = rows @ F.swapaxes(1, 2) + Q
+        block = rows @ F.swapaxes(1, 2) + Q
+        P[:, :9, :9] = 0.5 * (block + block.swapaxes(1, 2))     # or rounding grows
         M, n = self.walk.shape
         P.reshape(M, -1)[:, ::n + 1] += duration * self.walk
         T = F[:, PHI, PHI]
@@ -305,8 +306,10 @@ class Filters:
         left = 1 - np.clip(np.einsum('ijj', gain[:, :, XI]) / 3, 0.0, 1.0)
         self.feigned = (left ** 2)[:, None, None] * V
         if not self.single:
+            # Which mean is the likeliest stays, even where nothing is left to tell them apart.
             self.weight *= (1 - np.minimum(feigned, 1.0))[self.place]
-            self._weigh(np.zeros(len(self.C)))
+            total = np.add.reduceat(np.exp(self.weight), self.first)
+            self.weight -= np.log(total)[self.place]
 
     def _move(self, test: _Test, use: np.ndarray) -> None:
         """Correct the means, and turn the covariances' frames with the likeliest of them."""
