@@ -296,7 +296,7 @@ class Aligner:
 
     def _judge(self, epoch: AntennaEpoch, method: Bank | NoteMethod) -> None:
         """Decide what is declared after an epoch, and yield it."""
-        # 6. The rivals are heard: what they object is a part of the fit.
+        # 6. The rivals have been heard: what they object is a part of the fit.
         fit = method.fit()
         # 7. The declaration decides the state and the words.
         verdict = self._decide(epoch, method, fit)

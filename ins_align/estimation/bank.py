@@ -79,6 +79,8 @@ class Bank:
 
     """
 
+    _inertial: InertialTrack                        # up to the last epoch, since n0 is frozen
+
     def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals, use_position: bool,
                  prior: Learnt | None = None, base: Transform | None = None) -> None:
         """Start at t0."""

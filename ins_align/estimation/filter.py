@@ -41,9 +41,9 @@ GATE = 25.0
 # Log likelihood ratio of a motion that fits a vehicle, to one whose slips are so much larger that
 # a normalised innovation squared of twice this, of two rows, is as likely.
 FITS = 3.0
-# What is less likely than this is no part of a mixture; attitudes are close when they differ by
-# less than the second (rad).
-NEGLIGIBLE, CLOSE = 1e-6, 0.01
+# What is less likely than the first is no part of a mixture. Its mean is found when all attitudes
+# are so close to it (rad) that rotations add up like vectors, or it moves no more (rad).
+NEGLIGIBLE, CLOSE, SETTLED = 1e-6, 0.01, 1e-8
 # Turns so small (rad) leave the axes of the errors as they are.
 NO_TURN = 1e-4
 _EYE = np.eye(3)
@@ -275,8 +275,8 @@ class Filters:
 
     def _test(self, H: Array, noise: Array, innovation: Array) -> _Test:
         HP = H @ self.P
-        S = (HP @ H.swapaxes(1, 2))[self.place] + noise
-        inverse = np.linalg.inv(S)
+        S: Array = (HP @ H.swapaxes(1, 2))[self.place] + noise
+        inverse = np.asarray(np.linalg.inv(S), float)
         weighted = apply(inverse, innovation)
         return _Test(HP, S, inverse, weighted, np.einsum('ij,ij->i', innovation, weighted))
 
@@ -321,8 +321,9 @@ class Filters:
             return
         start = apply(C[self.lead].swapaxes(1, 2) @ C0[self.lead], phi0)
         G = np.zeros((len(turn), FIRST, FIRST))
-        G[:, PHI, PHI], G[:, PHI0, PHI0] = exp_so3(0.5 * start - phi), exp_so3(-0.5 * phi0)
-        G[:, XI, XI] = G[:, RHO, RHO] = exp_so3(-phi)
+        G[:, PHI, PHI], G[:, XI, XI], G[:, PHI0, PHI0] = exp_so3(
+            np.stack([0.5 * start - phi, -phi, -0.5 * phi0]))
+        G[:, RHO, RHO] = G[:, XI, XI]
         rows = G @ self.P[:, :FIRST]
         self.P[:, :FIRST] = rows
         self.P[:, FIRST:, :FIRST] = rows[:, :, FIRST:].swapaxes(1, 2)
@@ -412,7 +413,7 @@ class Filters:
                 shift = share @ away
                 mean = exp_so3(shift) @ mean
                 away = away - shift[:, None]
-                if np.abs(away).max() < CLOSE:      # the rotations add up like vectors
+                if np.abs(away).max() < CLOSE or np.abs(shift).max() < SETTLED:
                     break
             covariance = covariance + away[..., :, None] * away[..., None, :]
         return mean, (share @ covariance.reshape(2, -1, 9)).reshape(2, 3, 3)
