@@ -36,7 +36,7 @@ from ins_align.estimation.vehicle import NOT_USED
 from ins_align.geometry.rotation import Array, exp_so3, log_so3
 from ins_align.geometry.transform import Transform
 from ins_align.gnss.messages import AntennaEpoch, velocities_of
-from ins_align.imu.intervals import Intervals, SensorErrors
+from ins_align.imu.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
 import numpy as np
 
