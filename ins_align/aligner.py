@@ -30,8 +30,7 @@ from ins_align.config import Config, ConfigError, parameters
 from ins_align.estimation.bank import Bank, Learnt
 from ins_align.estimation.declaration import Declaration, Fit
 from ins_align.estimation.formula import NoteMethod
-from ins_align.geometry.rotation import Array
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import Array, Transform
 from ins_align.gnss.antenna import Antenna
 from ins_align.gnss.buffer import GnssBuffer, GnssEpoch, PAIR_NS
 from ins_align.gnss.messages import AntennaEpoch, Fix, Velocity

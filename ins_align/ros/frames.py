@@ -20,7 +20,7 @@ from importlib import import_module
 from typing import Any
 
 from ins_align.config import Config, ConfigError
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import Transform
 from ins_align.gnss.messages import Fix, Velocity
 from ins_align.mounting import find_mounting, Mounting, transform_from_msg
 from ins_align.ros.inputs import ImuSample
