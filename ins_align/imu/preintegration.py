@@ -168,20 +168,11 @@ class Steps(NamedTuple):
 
 def split_at_epochs(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Steps:
     """
-    Cut a run of samples into the intervals between epochs.
+    Cut a run of samples, (N, 6), rad/s and m/s^2, into the K intervals between K + 1 epochs.
 
     Values at an epoch are interpolated with the cubic of the neighbouring samples and their
-    central differences.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray of int, shape (N,)
-        Strictly increasing, first <= epochs_ns[0], last >= epochs_ns[-1].
-    samples : ndarray, shape (N, 6)
-        Angular rate, rad/s, and specific force, m/s^2.
-    epochs_ns : ndarray of int, shape (K + 1,)
-        Increasing; two equal ones make an interval of no length.
-
+    central differences. Stamps increase strictly and hold all epochs between them; two epochs that
+    are equal make an interval of no length.
     """
     samples = samples.T
     slopes = _slopes(samples, np.diff(stamps_ns) * 1e-9)
@@ -227,15 +218,6 @@ def preintegrate(steps: Steps, noise: Noise, recent: Recent) -> Intervals:
     Angle and velocity increments come from the cubic through both ends of a step (trapezoid with
     end correction, whose noise telescopes); coning and sculling terms are of second order [1]_,
     [2]_, in the form that rates at instants allow.
-
-    Parameters
-    ----------
-    steps : Steps
-        The samples, cut at the epochs.
-    noise : Noise
-        Of the sensors, in each step.
-    recent : Recent
-        Motion before the end of each interval.
 
     References
     ----------
