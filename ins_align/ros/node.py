@@ -80,7 +80,7 @@ class AlignmentNode(Node):
 
     The executor's thread puts messages into an inbox. Each one of the IMU it answers on `~/imu`
     with the attitude that the worker knew last, carried on with the gyros since: at once while
-    somebody listens, otherwise it takes them several times a second, which costs a third. The
+    somebody listens, otherwise it takes them several times a second, which costs half. The
     worker, a thread of its own that no callback waits for, aligns several times a second.
 
     Attributes
