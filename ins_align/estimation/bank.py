@@ -33,10 +33,9 @@ from ins_align.estimation.rivals import level_in_words, Parameters, Rivals, SHAR
 from ins_align.estimation.start import all_headings, HEADINGS, OPEN_POSITION, RoughAttitude, Start
 from ins_align.estimation.track import InertialTrack
 from ins_align.estimation.vehicle import NOT_USED
-from ins_align.geometry.rotation import Array, exp_so3, log_so3
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import Array, exp_so3, log_so3, Transform
 from ins_align.gnss.messages import AntennaEpoch, velocities_of
-from ins_align.imu.intervals import Intervals, SensorErrors
+from ins_align.imu.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
 import numpy as np
 

@@ -22,7 +22,7 @@ from copy import copy
 from dataclasses import dataclass
 
 from ins_align.geometry.rotation import apply, Array, by_row, cross, exp_so3, skew
-from ins_align.imu.intervals import Intervals
+from ins_align.imu.preintegration import Intervals
 from ins_align.imu.recent import AGES, exact, smooth
 import numpy as np
 

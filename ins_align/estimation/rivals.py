@@ -28,8 +28,7 @@ from ins_align.estimation.filter import Filters
 from ins_align.estimation.linearised import (
     DELAY, FIRST, GYRO, LEVER_ARM, OF_VEHICLE, triads)
 from ins_align.estimation.vehicle import AMBIGUOUS, known_of_vehicle, UNCONFIRMED, Vehicle
-from ins_align.geometry.rotation import Array, log_so3
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import Array, log_so3, Transform
 import numpy as np
 
 # Over the error of the gyros' scale factors: their misalignment; scale factors and misalignment of

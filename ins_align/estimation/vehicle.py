@@ -30,8 +30,7 @@ from ins_align.config import Config
 from ins_align.estimation.filter import Filters, Look, Track
 from ins_align.estimation.linearised import (
     DRIFT, FIRST, Linearised, MOUNT, OF_VEHICLE, PHI, XI)
-from ins_align.geometry.rotation import apply, Array, Index, skew
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import apply, Array, Index, skew, Transform
 import numpy as np
 
 # Velocity sideways and upwards that lasts (m/s: tyres' slip, leeway and current, wind), and how
