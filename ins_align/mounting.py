@@ -20,8 +20,7 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from ins_align.config import Config, ConfigError
-from ins_align.geometry.rotation import Array, matrix_from_quaternion
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import Array, matrix_from_quaternion, Transform
 from ins_align.results import Attitude, Event, Severity
 import numpy as np
 

@@ -22,8 +22,7 @@ from typing import Any, TYPE_CHECKING, Union
 from ins_align.aligner import Aligner
 from ins_align.checks import InputChecks
 from ins_align.config import Config, config_from_mapping
-from ins_align.geometry.rotation import Array, Index
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import Array, Index, Transform
 from ins_align.gnss import messages
 from ins_align.gnss.messages import Fix, Velocity
 from ins_align.results import Epoch, Result, State, Status

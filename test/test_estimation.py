@@ -31,9 +31,7 @@ from ins_align.geometry.rotation import exp_so3, log_so3, skew
 from ins_align.gnss.antenna import Antenna
 from ins_align.gnss.buffer import GnssBuffer
 from ins_align.imu.buffer import ImuBuffer
-from ins_align.imu.cutter import ImuCutter
-from ins_align.imu.intervals import SensorErrors
-from ins_align.imu.preintegration import Noise
+from ins_align.imu.preintegration import Noise, SensorErrors
 from ins_align.imu.recent import recent_motion
 from ins_align.results import Attitude
 import numpy as np
@@ -194,7 +192,7 @@ def prepared(s, *, velocity=True, **changes):
     """Return a bank at its t0, the epochs behind it and the IMU intervals before each."""
     config = config_for(s, **changes)
     counts = Counter()
-    samples, messages = ImuBuffer(0, counts), GnssBuffer(0, counts)
+    samples, messages = ImuBuffer(0, counts, config.imu_noise), GnssBuffer(0, counts)
     delay_ns = round(config.gnss_delay * 1e9)
     for k in range(len(s.gnss_stamps_ns)):
         fix, measured = s.fix(k), s.velocity_measurement(k)
@@ -204,9 +202,8 @@ def prepared(s, *, velocity=True, **changes):
     samples.add_many(s.imu_stamps_ns, s.gyro, s.accel)
     antenna = Antenna(config, counts)
     first, *epochs = map(antenna.epoch, messages.release(samples.settled_ns(True), True))
-    cutter = ImuCutter(config.imu_noise, samples, counts)
-    bank = Bank(config, first, cutter.start(first.stamp_ns).integrated(), not velocity)
-    steps = cutter.cut([epoch.stamp_ns for epoch in epochs], [0.0] * len(epochs))
+    bank = Bank(config, first, samples.start(first.stamp_ns).integrated(), not velocity)
+    steps = samples.cut([epoch.stamp_ns for epoch in epochs], [0.0] * len(epochs))
     return bank, epochs, steps.integrated()
 
 

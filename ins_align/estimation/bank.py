@@ -34,10 +34,9 @@ from ins_align.estimation.states import (
     DELAY, FIRST, GYRO, Linearised, Measured, OF_VEHICLE, triads)
 from ins_align.estimation.track import InertialTrack
 from ins_align.estimation.vehicle import NOT_USED, Vehicle
-from ins_align.geometry.rotation import Array
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import Array, Transform
 from ins_align.gnss.messages import AntennaEpoch
-from ins_align.imu.intervals import Intervals, SensorErrors
+from ins_align.imu.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
 import numpy as np
 

@@ -28,7 +28,7 @@ from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.earth import earth_rate_n, gravity_n, LocalLevel
 from ins_align.geometry.rotation import Array, cross, matrix_from_quaternion, orthonormalized
 from ins_align.gnss.messages import AntennaEpoch
-from ins_align.imu.intervals import Intervals, SensorErrors
+from ins_align.imu.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
 import numpy as np
 

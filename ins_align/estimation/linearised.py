@@ -23,7 +23,7 @@ from copy import copy
 from ins_align.estimation.states import (
     DELAY, FIRST, LEVER_ARM, Linearised, PHI, RHO, triads, XI)
 from ins_align.geometry.rotation import apply, Array, by_row, cross, exp_so3, skew
-from ins_align.imu.intervals import Intervals
+from ins_align.imu.preintegration import Intervals
 from ins_align.imu.recent import AGES, exact, smooth
 import numpy as np
 

@@ -30,8 +30,7 @@ from ins_align.config import Config
 from ins_align.estimation.filter import Filters, log_sum
 from ins_align.estimation.states import (
     DRIFT, FIRST, Linearised, MARGIN, Measured, MOUNT, OF_VEHICLE, PHI, XI)
-from ins_align.geometry.rotation import apply, Array, Index, skew
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import apply, Array, Index, skew, Transform
 import numpy as np
 
 # How far the motion is off x without lasting (rad: bends, yawing in waves, gusts).

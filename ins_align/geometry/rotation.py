@@ -12,13 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Rotations: vectors, matrices, quaternions; every function works over leading axes.
+Rotations: vectors, matrices, quaternions, over leading axes; transforms between fixed frames.
 
 Matrices are ``C_xy`` (components in y to components in x), quaternions are (x, y, z, w) of the
 same rotation with w >= 0, angles are radians.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -265,3 +267,19 @@ def cumulative_rotations(steps: Array) -> Array:
 def running_sum(start: Array, steps: Array) -> Array:
     """Return ``start + steps[0] + ... + steps[k]`` for every k, to the bit as one by one."""
     return np.cumsum(np.concatenate([start[None], steps]), axis=0)[1:]
+
+
+class Transform(NamedTuple):
+    """Takes vectors of a source frame to a target frame: rotate, then add."""
+
+    rotation: Array  # (3, 3)
+    translation: Array  # (3,), m
+
+    def after(self, other: Transform) -> Transform:
+        """Return the transform that does the other one first."""
+        return Transform(self.rotation @ other.rotation,
+                         self.rotation @ other.translation + self.translation)
+
+    def inverse(self) -> Transform:
+        """Return the transform from target to source."""
+        return Transform(self.rotation.T, -self.rotation.T @ self.translation)

@@ -28,7 +28,7 @@ from ins_align.checks import (
 from ins_align.config import Config, config_from_mapping, parse_override
 from ins_align.geometry.earth import normal_gravity
 from ins_align.gnss.buffer import MAX_AHEAD_NS
-from ins_align.gnss.messages import NED_ORDER, NED_SIGNS
+from ins_align.gnss.messages import enu_from_ned
 from ins_align.gnss.motion import (
     differences, EMPTY, find_manoeuvres, heading_in_words, MANOEUVRE_SPEED, MANOEUVRE_TIME,
     Manoeuvres, on_grid, Series, track, velocity_frame, velocity_from_positions,
@@ -305,7 +305,7 @@ def _look_at_imu(data: Recorded, motion: Series, gravity: float, alone: bool) ->
 def _in_enu(velocity: Recorded) -> Series:
     series = velocity.series()
     if velocity.frame is not None and velocity.frame.frame == 'ned':
-        return Series(series.times, series.vectors[:, NED_ORDER] * NED_SIGNS)
+        return Series(series.times, enu_from_ned(series.vectors))
     return series
 
 

@@ -25,7 +25,7 @@ import os
 from typing import NamedTuple
 
 from ins_align.config import Config
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import Transform
 from ins_align.gnss.drivers import (
     DRIVER_TYPES, imu_from_driver, INERTIAL_UNITS, LIVE_TYPES, NoTimeError, receiver_from_msg,
     RECEIVERS, type_in_words)

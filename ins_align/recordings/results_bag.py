@@ -138,8 +138,8 @@ class _Results:
         if epoch.state is not State.ALIGNED or epoch.current is None:
             return None
         noise = self._result.config.imu_noise
-        return Prediction.of(epoch.current, epoch.gyro_bias, np.zeros((3, 3)),
-                             noise.gyro_bias_std, noise.angle_random_walk, rate)
+        return Prediction(epoch.current, epoch.gyro_bias, np.zeros((3, 3)),
+                          noise.gyro_bias_std, noise.angle_random_walk, rate)
 
     def _of_epoch(self, epoch: Epoch, time_ns: int) -> Iterator[Record]:
         declared = epoch.state is State.ALIGNED and self._state is not State.ALIGNED

@@ -53,15 +53,7 @@ class ReasonLog:
         """
         Return the parts to log, and whether they were there before; they are taken for logged.
 
-        Parameters
-        ----------
-        parts : sequence of str
-            Other numbers in a part make no other kind.
-        now : float
-            s.
-        again : bool
-            Whether what stays is logged again and again.
-
+        Other numbers in a part make no other kind; `again`: what stays is logged again and again.
         """
         self._logged = {kind: when for kind, when in self._logged.items()
                         if now - when < LOG_AGAIN}
@@ -101,17 +93,8 @@ def topic_faults(node: Node, inputs: Mapping[str, type], expected: Iterable[str]
     """
     Look at the publishers of the topics that a node reads, and say what is wrong with them.
 
-    Parameters
-    ----------
-    node : Node
-        That reads them.
-    inputs : mapping
-        Message types by topic, as they are named in the node.
-    expected : iterable of str
-        Topics that are worth a word where nobody publishes them.
-    velocity_types : mapping
-        Message types that the parameter velocity_type can name.
-
+    `inputs` and `velocity_types` are message types by topic and by the parameter velocity_type;
+    topics that are `expected` are worth a word where nobody publishes them.
     """
     for topic, msg_type in inputs.items():
         name = node.resolve_topic_name(topic)
