@@ -23,7 +23,7 @@ import math
 from typing import NamedTuple
 
 from ins_align.config import Config
-from ins_align.estimation.formula import AttitudeMoments
+from ins_align.estimation.moments import AttitudeMoments
 from ins_align.estimation.receiver import LEAST_NOISE, LOUD
 from ins_align.estimation.states import FIRST, PHI, PHI0, RHO, XI
 from ins_align.estimation.track import InertialTrack
