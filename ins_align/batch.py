@@ -29,14 +29,15 @@ import multiprocessing
 from pathlib import Path
 from typing import Any
 
+from ins_align.offline import replay
 from ins_align.outputs import PAGE_SUFFIX, write_whole
 from ins_align.page import page
 from ins_align.processes import pool
 from ins_align.recordings import BagError
 from ins_align.recordings.reader import Request
-from ins_align.recordings.replay import replay, ReplayResult
 from ins_align.recordings.results_bag import write_results
 from ins_align.report import plot, save_figure, summary
+from ins_align.results import Result
 
 CONNECT_TIMEOUT = 10.0  # s, to the scheduler of a Dask cluster
 
@@ -93,7 +94,7 @@ def process(task: Task, read_ahead: bool = False,
     return Outcome(result.to_json(), summary(result), warnings)
 
 
-def _write_picture(result: ReplayResult, path: str) -> None:
+def _write_picture(result: Result, path: str) -> None:
     suffix = Path(path).suffix
     if suffix.lower() == PAGE_SUFFIX:
         html = page(result).encode()

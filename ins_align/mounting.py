@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from ins_align.config import Config, ConfigError
 from ins_align.geometry.rotation import Array, matrix_from_quaternion
 from ins_align.geometry.transform import Transform
-from ins_align.results import Attitude, Event, Severity
+from ins_align.results import Event, Severity
 import numpy as np
 
 ROUNDING = 1e-6  # m: numbers of a robot's model that differ less are the same
@@ -74,13 +74,6 @@ class Mounting(NamedTuple):
     base: Transform | None  # from the configured base to the IMU
     words: Sequence[Event] = ()  # what was taken from TF, what contradicts it
     missing: Sequence[str] = ()  # transforms that are wanted and not there, in words
-
-
-def base_attitude(attitude: Attitude | None, base: Transform | None) -> Attitude | None:
-    """Return the attitude of the base; None where it or that of the IMU is not known."""
-    if attitude is None or base is None:
-        return None
-    return dataclasses.replace(attitude, C_nb=attitude.C_nb @ base.rotation)
 
 
 def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Config) -> Mounting:

@@ -24,13 +24,10 @@ from typing import Any
 
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.imu.prediction import Prediction
-from ins_align.mounting import Mounting
 from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import decode_imu, deserialize
-from ins_align.recordings.replay import ReplayResult
-from ins_align.results import Epoch, State, Status
-from ins_align.status_values import base_values, level_of, status_values
+from ins_align.results import Epoch, level_of, Result, State, Status, status_values
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
@@ -47,7 +44,7 @@ MAX_AGE_NS = 2_500_000_000
 Record = tuple[str, int, Any]  # topic without its namespace, recorded time, message
 
 
-def write_results(result: ReplayResult, path: str | os.PathLike[str]) -> None:
+def write_results(result: Result, path: str | os.PathLike[str]) -> None:
     """
     Write the results of a recording as a rosbag2 (mcap) with the topics of the node.
 
@@ -55,7 +52,7 @@ def write_results(result: ReplayResult, path: str | os.PathLike[str]) -> None:
 
     Parameters
     ----------
-    result : ReplayResult
+    result : Result
         What came of a recording, which is read once more for its IMU messages.
     path : path
         Directory to be made; written whole or not at all.
@@ -87,9 +84,8 @@ def write_results(result: ReplayResult, path: str | os.PathLike[str]) -> None:
 class _Results:
     """Makes the messages of a result."""
 
-    def __init__(self, result: ReplayResult, types: Any) -> None:
+    def __init__(self, result: Result, types: Any) -> None:
         self._result, self._types = result, types
-        self._mounting = Mounting(result.config, result.topics.base)
         self._state: State | None = None  # of the epoch before
         self._status_ns = -STATUS_PERIOD_NS
 
@@ -175,7 +171,7 @@ class _Results:
 
     def _status(self, status: Status) -> Any:
         make = self._types
-        values = [*status_values(status), *base_values(status, self._mounting)]
+        values = status_values(status, self._result.config.base_frame, self._result.topics.base)
         return make[STATUS](self._header(status.stamp_ns or 0), [
             make['diagnostic_msgs/msg/DiagnosticStatus'](
                 level_of(status.state), 'ins_align: alignment',

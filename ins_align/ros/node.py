@@ -35,7 +35,7 @@ from ins_align.config import (
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
 from ins_align.mounting import Mounting
-from ins_align.results import Severity
+from ins_align.results import level_of, Severity, WARN
 from ins_align.ros.diagnostics import (
     diagnostic_status, inputs_in_words, parameter_descriptor, ReasonLog, topic_faults, vector_msg)
 from ins_align.ros.frames import frame_id_of, MountingSearch, open_buffer
@@ -44,7 +44,6 @@ from ins_align.ros.gnss_inputs import (
 from ins_align.ros.imu_bytes import ImuSample, read_imu, with_orientation
 from ins_align.ros.on_demand import OnDemand, queued
 from ins_align.ros.worker import Worker
-from ins_align.status_values import level_of, WARN
 import numpy as np
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
