@@ -117,7 +117,7 @@ def test_parameter_files(tmp_path_factory, data):
 LIMITED = """
 import resource, sys
 from ins_align.cli import main
-import ins_align.batch
+import ins_align.offline, ins_align.recordings.reader, ins_align.report
 resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[1]),) * 2)
 sys.exit(main(['replay', *sys.argv[2:]]))
 """
