@@ -109,20 +109,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """
-    Run the command line.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        By default that of the process.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the command line, by default that of the process; return the exit status."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # of any encoding
             stream.reconfigure(errors='backslashreplace')

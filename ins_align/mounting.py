@@ -78,17 +78,10 @@ class Mounting(NamedTuple):
 
 def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Config) -> Mounting:
     """
-    Look up lever arm and mounting.
+    Look up lever arm and mounting, as ``lever_arm_from_tf`` and ``base_frame`` want them.
 
-    Parameters
-    ----------
-    lookup : callable
-        Returns the transform from its second argument to its first, or None.
-    imu_frame, antenna_frame : str
-        The frame_id of the IMU's and of the position messages.
-    config : Config
-        Says with ``lever_arm_from_tf`` and ``base_frame`` what is wanted.
-
+    `lookup` returns the transform from its second argument to its first, or None; the frames are
+    the frame_id of the IMU's and of the position messages.
     """
     words: list[Event] = []
     missing: list[str] = []

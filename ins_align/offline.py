@@ -58,18 +58,9 @@ class _Run:
         """
         Take consecutive messages.
 
-        Parameters
-        ----------
-        stamps_ns : ndarray of int, shape (N,)
-            Of IMU samples.
-        gyro, accel : ndarray, shape (N, 3)
-            rad/s, m/s^2.
-        gnss : sequence of (int, Fix or Velocity or (str, str))
-            How many of the samples come before each message; of one that cannot be used the
-            arguments of `Aligner.reject`.
-        undecodable : int
-            How many IMU messages hold no sample.
-
+        IMU samples, shapes (N,), ns, and (N, 3), rad/s and m/s^2, and how many messages hold none.
+        Each GNSS message comes with how many of the samples are before it; of one that cannot be
+        used the arguments of `Aligner.reject` stand in its place.
         """
         aligner, position = self._aligner, 0
         for _ in range(undecodable):

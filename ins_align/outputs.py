@@ -127,17 +127,9 @@ def survey(bag: str) -> Outcome:
 
 def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any]) -> None:
     """
-    Write a file whole or not at all.
-
-    Parameters
-    ----------
-    path : path
-        To be made or replaced.
-    write : callable
-        Gets the open file. If it raises, `path` is as it was before.
+    Write a file whole or not at all, with a function that gets it open.
 
     A link stays one, to a file that is replaced. What is there and is no file is not replaced.
-
     """
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():

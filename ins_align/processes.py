@@ -108,16 +108,10 @@ def run_all(function: Callable[..., T], tasks: Sequence[Any], jobs: int,
 def run_on_cluster(function: Callable[..., T], tasks: Sequence[Any], address: str,
                    progress: Callable[[float], None]) -> Iterator[T | Exception]:
     """
-    Do tasks on a Dask cluster, otherwise as `run_all`.
+    Do tasks on a Dask cluster, otherwise as `run_all`; a ClusterError says what is missing.
 
-    The workers read and write the files: they need the same folders as this machine. What a
-    worker that dies had in hand, another one does again; files are replaced as a whole.
-
-    Raises
-    ------
-    ClusterError
-        If Dask is not installed or there is no cluster at this address.
-
+    The workers read and write the files: they need the same folders as this machine. What a worker
+    that dies had in hand, another one does again; files are replaced as a whole.
     """
     try:
         from distributed import Client
@@ -170,19 +164,12 @@ def run_ahead(function: Callable[..., Generator[T, None, None]], *arguments: Any
     """
     Yield what a generator yields in another process, which is some items ahead.
 
-    Parameters
-    ----------
-    function : callable
-        Gives the generator; it, the arguments and what is yielded must be picklable.
-    *arguments
-        Of the function.
+    The function that gives the generator, its arguments and what is yielded must be picklable.
 
     Raises
     ------
     BrokenProcessPool
-        If that process is killed.
-    Exception
-        Whatever the generator raises.
+        If that process is killed; otherwise whatever the generator raises.
 
     """
     with pool(1) as executor:

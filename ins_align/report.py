@@ -37,20 +37,8 @@ def format_table(rows: Sequence[Sequence[Any]], header: Sequence[str] = (),
     """
     Align columns of text: the first to the left, all others to the right.
 
-    Parameters
-    ----------
-    rows : sequence of rows
-        Cells are text; floats get four significant digits, None is a dash.
-    header : sequence of str, optional
-        Names of the columns.
-    indent : str, optional
-        In front of every line.
-
-    Returns
-    -------
-    str
-        Without a newline at the end.
-
+    Cells are text; floats get four significant digits, None is a dash. An indent is in front of
+    every line; there is no newline at the end.
     """
     cells = [[_cell(cell) for cell in row] for row in rows]
     if header:

@@ -238,12 +238,8 @@ class Reference:
     """
     The attitude that a recording carries to compare with.
 
-    Parameters
-    ----------
-    *parts : tuple of ndarray
-        Stamps, ns, and quaternions as from `Orientations.known`, at least one part, in any order;
-        of one stamp the first counts.
-
+    Made of stamps, ns, and quaternions as from `Orientations.known`, at least one part, in any
+    order; of one stamp the first counts.
     """
 
     def __init__(self, *parts: tuple[np.ndarray, np.ndarray]) -> None:
@@ -267,15 +263,10 @@ class Reference:
 
     def errors_deg(self, attitude: Attitude) -> tuple[Array, Array] | None:
         """
-        Compare an attitude with the reference.
+        Return attitude and reference compared, degrees; None where there is no reference.
 
-        Returns
-        -------
-        rotation_deg : ndarray, shape (3,)
-            Small rotation about east, north, up that takes the attitude to the reference.
-        rpy_deg : ndarray, shape (3,)
-            Differences of roll, pitch, yaw, attitude less reference.
-
+        The small rotation about east, north, up that takes the attitude to the reference, shape
+        (3,), and the differences of roll, pitch, yaw, attitude less reference, shape (3,).
         """
         C_reference = self.attitude_at(attitude.stamp_ns)
         if C_reference is None:

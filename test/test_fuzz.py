@@ -30,9 +30,8 @@ from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from ins_align.config import Config, config_from_mapping, ConfigError, load_params
 from ins_align.offline import replay
-from ins_align.recordings import BagError
+from ins_align.recordings import BagError, ZSTD_MODULE
 from ins_align.recordings.bag import Bag
-from ins_align.recordings.limits import ZSTD_MODULE
 import lz4.frame
 import numpy as np
 import pytest

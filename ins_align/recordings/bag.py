@@ -29,10 +29,9 @@ import sqlite3
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from ins_align.recordings import BagError, one_line, Topic
-from ins_align.recordings.limits import (
-    MAX_CHUNK_BYTES, MAX_HELD_BYTES, MAX_MESSAGE_BYTES, MAX_METADATA_BYTES, MAX_TOPICS,
-    max_unpacked_bytes, unpack, ZSTD_MAGIC, ZSTD_MODULE)
+from ins_align.recordings import (
+    BagError, MAX_CHUNK_BYTES, MAX_HELD_BYTES, MAX_MESSAGE_BYTES, MAX_METADATA_BYTES, MAX_TOPICS,
+    max_unpacked_bytes, one_line, Topic, unpack, ZSTD_MAGIC, ZSTD_MODULE)
 from ins_align.recordings.salvage import MAGIC as MCAP_MAGIC
 from ins_align.recordings.salvage import SalvagedMcap
 import numpy as np
@@ -117,13 +116,7 @@ class Bag:
         """
         Yield the messages of some topics in recorded order, many at a time.
 
-        Parameters
-        ----------
-        topics : sequence of Topic
-            What to read.
-        start_ns, stop_ns : int, optional
-            First recorded time and the one to stop before.
-
+        They are recorded from one time on, to before another one.
         """
         numbers = {key: topics.index(topic) for key, topic in self._topics.items()
                    if topic in topics}

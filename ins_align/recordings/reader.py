@@ -87,12 +87,8 @@ def read(request: Request) -> Iterator[Part]:
     """
     Read a recording; the last part has no messages and all warnings.
 
-    Raises
-    ------
-    BagError
-        If the recording cannot be read or lacks a topic, or if a part was asked for that holds no
-        message of these topics.
-
+    A BagError says that the recording cannot be read or lacks a topic, or that a part was asked
+    for that holds no message of these topics.
     """
     with Bag(request.path) as bag:
         try:
