@@ -405,6 +405,12 @@ def test_wrong_signs_are_named_and_not_declared(scenario, rival):
     assert rival.better in status.reason and rival.advice in status.reason
 
 
+@pytest.mark.parametrize('coarse', [{'quantum': (0.01, 0.0)}, {'dead_band': (0.0087, 0.0)}])
+def test_coarse_gyros_are_no_wrong_axes(coarse):
+    _, epochs = aligned(simulated('flight', seed=7, duration=60.0, stand_still=20.0, **coarse))
+    assert not [epoch for epoch in epochs if 'reversed' in epoch.reason]
+
+
 @pytest.mark.parametrize('scenario', ('flight', 'car', 'hover'))
 @pytest.mark.parametrize('options, changes, words', [
     ({'lever_arm': (2.0, 1.0, 1.0)}, {'lever_arm': (0.0, 1.0, 1.0)}, 'a lever arm of ['),

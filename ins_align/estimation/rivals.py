@@ -281,7 +281,10 @@ class Rivals:
         worst = int(np.argmax(np.where(harm > HARMLESS, ahead, -np.inf)))
         if harm[worst] <= HARMLESS or ahead[worst] <= -MARGIN:
             return '', False
-        if ahead[worst] > MARGIN:
+        # A sensor worse than configured is unlikely before the data, and no error of the user's:
+        # who accuses has to fit better than any level does.
+        ahead = self._posterior(filters) - np.max(filters.evidence[~self._aside[filters.ids]])
+        if ahead[worst] > MARGIN * max(misfit, 1.0):
             return in_words(self.table[filters.ids[worst]], filters.x[filters.lead[worst]],
                             self._gnss_delay), True
         return 'the signs of the IMU axes are not confirmed by the motion yet: turn', False
