@@ -212,9 +212,9 @@ class Nuisance:
                    config.gnss_delay, config.gnss_delay_std)
 
 
-@dataclass(frozen=True)
-class Status:
-    """The aligner's state in numbers; see the attributes' names and units."""
+@dataclass(frozen=True, kw_only=True)
+class Status(Nuisance):
+    """The aligner's state in numbers: stamps and times, attitudes, estimates, counts."""
 
     state: State
     reason: str
@@ -223,14 +223,6 @@ class Status:
     time_to_align_s: float | None
     initial: Attitude | None
     current: Attitude | None
-    gyro_bias: Array
-    gyro_bias_std: Array
-    accel_bias: Array
-    accel_bias_std: Array
-    lever_arm: Array
-    lever_arm_std: Array
-    gnss_delay: float
-    gnss_delay_std: float
     counts: dict[str, int]
 
 

@@ -123,12 +123,12 @@ class Bag:
         with _bag_errors(self.path):
             records = self._records(numbers, start_ns, stop_ns)
             while group := list(itertools.islice(records, BLOCK)):
-                connections, times_ns, messages = zip(*group)
-                places = np.array([numbers[id(connection)] for connection in connections])
-                yield Block(np.array(times_ns, np.int64), places, [
-                    _without_compression([messages[place] for place in chosen.tolist()])
-                    for chosen in (np.flatnonzero(places == number)
-                                   for number in range(len(topics)))])
+                messages: list[list[bytes]] = [[] for _ in topics]
+                for connection, _, data in group:
+                    messages[numbers[id(connection)]].append(data)
+                yield Block(np.array([time_ns for _, time_ns, _ in group], np.int64),
+                            np.array([numbers[id(connection)] for connection, _, _ in group]),
+                            [*map(_without_compression, messages)])
 
     def _records(self, chosen: Container[int], start_ns: int | None, stop_ns: int | None,
                  ) -> Iterator[tuple[Any, int, bytes]]:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+import dataclasses
 import math
 import os
 from pathlib import Path
@@ -87,6 +88,11 @@ class _Results:
         self._topic, self._base = result.topics.imu, result.topics.base
         self._state: State | None = None  # of the epoch before
         self._status_ns = -STATUS_PERIOD_NS
+        nan = np.full(3, math.nan)  # of what an epoch does not tell
+        self._unknown = dataclasses.replace(
+            result.status, gyro_bias_std=nan, accel_bias_std=nan, lever_arm=nan,
+            lever_arm_std=nan, gnss_delay=math.nan, gnss_delay_std=math.nan, counts={},
+            time_to_align_s=None)
 
     def records(self) -> Iterator[Record]:
         """Go through the recording's IMU messages, epochs between them."""
@@ -145,11 +151,10 @@ class _Results:
                     VECTOR, self._header(now.stamp_ns), self._make(XYZ, *values))
         if epoch.state is not self._state or epoch.stamp_ns >= self._status_ns + STATUS_PERIOD_NS:
             self._status_ns = epoch.stamp_ns
-            unknown = np.full(3, math.nan)
-            yield 'status', time_ns, self._status(Status(
-                epoch.state, epoch.reason, epoch.stamp_ns, first and first.stamp_ns, None, first,
-                now, epoch.gyro_bias, unknown, epoch.accel_bias, unknown, unknown, unknown,
-                math.nan, math.nan, {}))
+            yield 'status', time_ns, self._status(dataclasses.replace(
+                self._unknown, state=epoch.state, reason=epoch.reason, stamp_ns=epoch.stamp_ns,
+                t0_ns=first and first.stamp_ns, initial=first, current=now,
+                gyro_bias=epoch.gyro_bias, accel_bias=epoch.accel_bias))
         self._state = epoch.state
 
     def _imu(self, prediction: Prediction, data: bytes, gyro: Any, accel: Any) -> Any:
