@@ -467,9 +467,10 @@ class Aligner:
         """Return the state, the reason for it, the estimates and the counts."""
         method = self._method
         nuisance = Nuisance.configured(self.config) if method is None else method.nuisance()
-        return Status(self._verdict.state, self._verdict.reason, self._last_ns,
-                      None if method is None else method.t0_ns, self._time_to_align_s,
-                      self._initial, self._current, **vars(nuisance), counts=dict(self.counts))
+        return Status(**vars(nuisance), **vars(self._verdict), stamp_ns=self._last_ns,
+                      t0_ns=None if method is None else method.t0_ns, initial=self._initial,
+                      current=self._current, time_to_align_s=self._time_to_align_s,
+                      counts=dict(self.counts))
 
 
 def _epoch_counts(method: Bank | NoteMethod | None) -> Counter[str]:

@@ -37,8 +37,7 @@ from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import ImuSamples, Orientations, Refused
 from ins_align.recordings.reader import choose_topics, read, Request
-from ins_align.recordings.replay import Reference
-from ins_align.results import Epoch, State
+from ins_align.results import Epoch, Reference, State
 from ins_align.simulation.simulate import give
 import numpy as np
 

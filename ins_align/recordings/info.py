@@ -36,8 +36,8 @@ from ins_align.gnss.motion import (
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings import BagError, printable
 from ins_align.recordings.bag import Bag
-from ins_align.recordings.imu_survey import ImuFacts, Resolution, survey_imu
-from ins_align.recordings.motion_fit import fit_motion, MotionFit
+from ins_align.recordings.imu_survey import (
+    fit_motion, ImuFacts, MotionFit, Resolution, survey_imu)
 from ins_align.recordings.reader import choose_topics
 from ins_align.recordings.topic_survey import (
     Gap, MAX_ASTRAY, read_candidates, Recorded, TopicInfo)
@@ -83,15 +83,7 @@ class Info:
 
 
 def inspect(path: str | os.PathLike[str]) -> Info:
-    """
-    Tell what a recording holds.
-
-    Raises
-    ------
-    BagError
-        If it cannot be read at all.
-
-    """
+    """Tell what a recording holds; a BagError says that it cannot be read at all."""
     with Bag(path) as bag:
         return _Survey(bag).info()
 

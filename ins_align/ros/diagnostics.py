@@ -16,7 +16,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-import itertools
 import re
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -24,8 +23,7 @@ from geometry_msgs.msg import Vector3Stamped
 from ins_align.config import Config, Parameter, parameters
 from ins_align.gnss.drivers import type_in_words
 from ins_align.mounting import Mounting
-from ins_align.results import Status
-from ins_align.status_values import base_values, status_values
+from ins_align.results import Status, status_values
 import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.node import Node
@@ -142,5 +140,5 @@ def diagnostic_status(name: str, hardware_id: str, level: int, status: Status,
     return DiagnosticStatus(
         level=bytes([level]), name=f'{name.lstrip("/")}: alignment', hardware_id=hardware_id,
         message=f'{status.state.value}: {status.reason}',
-        values=[KeyValue(key=key, value=value) for key, value in itertools.chain(
-            status_values(status), base_values(status, mounting))])
+        values=[KeyValue(key=key, value=value) for key, value in status_values(
+            status, *((mounting.config.base_frame, mounting.base) if mounting else ()))])

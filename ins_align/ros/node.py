@@ -37,14 +37,13 @@ from ins_align.config import (
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
 from ins_align.mounting import Mounting
-from ins_align.results import Severity
+from ins_align.results import level_of, Severity, WARN
 from ins_align.ros.diagnostics import (
     diagnostic_status, inputs_in_words, parameter_descriptor, ReasonLog, topic_faults, vector_msg)
 from ins_align.ros.frames import MountingSearch, open_buffer
 from ins_align.ros.inputs import (
     FIX_TOPIC, Gate, gnss_from_msg, gnss_topics, ImuSample, queued, read_imu, REJECTED_AS,
     VELOCITY_TOPIC, VELOCITY_TYPES, with_orientation)
-from ins_align.status_values import level_of, WARN
 import numpy as np
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
