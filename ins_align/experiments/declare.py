@@ -49,6 +49,9 @@ SILENT_SEED, TIME_SEED = 100_000, 200_000
 # A run of the second and the third part for so many of the first.
 SILENT_PART, TIME_PART = 80, 10
 SILENT = 'straight', 'static'
+ERRORS = ('Errors against truth in stated sigmas: of the tilt the worse of two axes, and the worse '
+          f'of the attitude at t0 and the current one. Target: at most 1 % beyond {BINS[0]:g} '
+          f'sigma, none beyond {BINS[1]:g}.')
 DRAWN = 'simulate', 'config', 'declared'    # drawn again from the index; `aligned` is the first
 
 
@@ -82,10 +85,6 @@ def _outages(random: np.random.Generator) -> JsonDict:
     return {'outages': [[start, start + random.uniform(2.0, 15.0)] for start in starts]}
 
 
-def _delay(random: np.random.Generator) -> JsonDict:
-    return {'gnss_delay': random.uniform(0.02, 0.2)}
-
-
 def _lever(random: np.random.Generator) -> JsonDict:
     direction = random.standard_normal(3)
     return {'lever_arm': (random.uniform(0.1, 2.0) * direction
@@ -94,10 +93,11 @@ def _lever(random: np.random.Generator) -> JsonDict:
 
 # What each draws to change of the arguments of `simulate`.
 FAULTS: dict[str, Callable[[np.random.Generator], JsonDict]] = {
-    'none': lambda random: {}, 'outliers': _outliers, 'outages': _outages, 'delay': _delay,
+    'none': lambda random: {}, 'outliers': _outliers, 'outages': _outages,
+    'delay': lambda random: {'gnss_delay': random.uniform(0.02, 0.2)},
     'lever arm left out': _lever,
     'several of these': lambda random: (
-        _outliers(random) | _outages(random) | _delay(random) | _lever(random)),
+        _outliers(random) | _outages(random) | FAULTS['delay'](random) | _lever(random)),
     'NED taken for ENU': lambda random: {'velocity_frame': 'ned'},
     'one IMU axis flipped': lambda random: {'flip_axis': str(random.choice(['x', 'y', 'z']))},
     'one gyro flipped': lambda random: {'flip_gyro': str(random.choice(['x', 'y', 'z']))},
@@ -174,10 +174,8 @@ def aligned_tables(report: Report, trials: list[JsonDict]) -> list[JsonDict]:
     """Print what ALIGNED was worth; return what was declared beyond the first bin."""
     report.text(
         f'{len(trials)} runs of {DURATION:g} s over all scenarios ({", ".join(SCENARIOS)}), '
-        'grades of IMU and faults, with random heading, latitude, mount and lever arm. Errors '
-        'against truth in stated sigmas: of the tilt the worse of two axes, and the worse of the '
-        'attitude at t0 and the current one. None of the faults is told to the aligner. Target, '
-        f'with 1000 runs: at most 1 % beyond {BINS[0]:g} sigma and none beyond {BINS[1]:g}.')
+        'grades of IMU and faults, none of which is configured, with random heading, latitude, '
+        f'mount and lever arm. {ERRORS}')
     groups = groups_of(trials, FAULTS)
     moment_table(report, 'When ALIGNED was declared first', groups, 'aligned')
     moment_table(report, 'At the end, where still ALIGNED', groups, 'final')
@@ -187,10 +185,9 @@ def aligned_tables(report: Report, trials: list[JsonDict]) -> list[JsonDict]:
 def levelled_tables(report: Report, trials: list[JsonDict]) -> None:
     """Print what LEVELLED was worth, which claims the tilt alone."""
     report.text(
-        'LEVELLED is counted apart. It claims the tilt alone, and a vehicle at rest, or in steady '
-        'straight motion, cannot show a wrong sign: the data of an IMU with its z axis or all '
-        'accelerations reversed are those of one that is mounted upside down. Such a vehicle is '
-        'levelled wrongly until it turns or changes speed.')
+        'LEVELLED claims the tilt alone. At rest and in steady straight motion an IMU with its z '
+        'axis or all accelerations reversed cannot be told from one that is mounted upside down: '
+        'it is levelled wrongly until the vehicle turns or changes speed.')
     moment_table(report, 'When LEVELLED (or ALIGNED at once) was declared first',
                  groups_of(trials, FAULTS), 'levelled')
     gross = [t for t in trials if worse(t['levelled'], 'tilt') > BINS[1]]
@@ -240,20 +237,17 @@ def time_to_heading(runs: int, jobs: int | None) -> list[JsonDict]:
         [(*pair, HORIZON, THRESHOLD_DEG, nuisance) for nuisance in ({}, unknown)]
         for pair in pairs], jobs, 'bounds')
     reachable = [each for each in zip(pairs, crossings) if each[1][0] is not None]
-    times = iter(parallel(run_time, [
+    times = parallel(run_time, [
         [(*pair, TIME_SEED + seed, exact) for seed in range(runs)]
-        for pair, _ in reachable for exact in (True, False)], jobs, 'times'))
+        for pair, _ in reachable for exact in (True, False)], jobs, 'times')
+    # What was not declared took for ever.
+    medians = [float(np.median([np.inf if t is None else t for t in each])) for each in times]
     return [{'scenario': scenario, 'grade': grade, 'bound_s': bound_s,
-             'bound_unknown_s': unknown_s, 'median_s': _median(exact),
-             'ratio': _median(exact) / bound_s, 'declared_s': exact,
-             'default_median_s': _median(by_default), 'default_declared_s': by_default}
-            for ((scenario, grade), (bound_s, unknown_s)), exact, by_default in zip(
-                reachable, times, times)]
-
-
-def _median(times: list[float | None]) -> float:
-    """Median; what was not declared took for ever."""
-    return float(np.median([np.inf if t is None else t for t in times]))
+             'bound_unknown_s': unknown_s, 'median_s': medians[k],
+             'ratio': medians[k] / bound_s, 'declared_s': times[k],
+             'default_median_s': medians[k + 1], 'default_declared_s': times[k + 1]}
+            for k, ((scenario, grade), (bound_s, unknown_s)) in zip(itertools.count(0, 2),
+                                                                    reachable)]
 
 
 def crossing_time(task: tuple[str, str, float, float, dict[str, float]]) -> float | None:
@@ -295,12 +289,11 @@ def time_table(report: Report, waits: list[JsonDict]) -> None:
                 'the axes of the IMU are right; the aligner waits for motion that shows it.')
     report.table(
         f'Time to a declared heading of {THRESHOLD_DEG:g} deg: median of '
-        f"{len(waits[0]['declared_s']) if waits else 0} runs, and the "
-        'time at which the Cramer-Rao bound crosses it. First with lever arm and delay known to '
-        'both and a threshold of 1 deg for the tilt too; then with all parameters at their '
-        f'defaults, against the bound with lever arm and delay unknown ({default.lever_arm_std:g} '
-        f'm, {default.gnss_delay_std:g} s). A declaration has to hold for {default.hold_time:g} s '
-        'before it is made.', waits, [
+        f"{len(waits[0]['declared_s']) if waits else 0} runs, and when the Cramer-Rao bound "
+        'crosses it. First with lever arm and delay known, and a threshold of 1 deg for the tilt '
+        f'too; then with the defaults, lever arm ({default.lever_arm_std:g} m) and delay '
+        f'({default.gnss_delay_std:g} s) unknown to the bound too. A declaration has to hold for '
+        f'{default.hold_time:g} s before it is made.', waits, [
             ('scenario', '', lambda w: w['scenario']), ('IMU', '', lambda w: w['grade']),
             *columns('', 'bound_s', 'median_s', 'declared_s'),
             *columns('default ', 'bound_unknown_s', 'default_median_s', 'default_declared_s')])
@@ -361,10 +354,8 @@ def write_worse(out: Path, trials: list[JsonDict]) -> None:
     report.text(
         f'{len(trials)} runs of {DURATION:g} s over all scenarios ({", ".join(SCENARIOS)}), half '
         f'of them with {STAND_STILL:g} s at rest first, with random heading, latitude, mount and '
-        'lever arm. All are configured as `mems` with the right lever arm. Errors against truth '
-        'in stated sigmas: the worse of the attitude at t0 and the current one, and of the two '
-        'axes of the tilt. A fault has the runs in which it is alone and those of its pairs. '
-        'Target: at most 1 % beyond 3 sigma, none beyond 5.')
+        'lever arm, configured as `mems` with the right lever arm. A fault has the runs in which '
+        f'it is alone and those of its pairs. {ERRORS}')
     groups: Groups = [('none', [t for t in trials if not t['faults']])]
     for name in WORSE:
         groups += [(label, [t for t in trials if name in t['faults'] and len(t['faults']) == size])

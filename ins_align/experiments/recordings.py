@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 import itertools
+import math
 from pathlib import Path
 from typing import Any, NamedTuple, TYPE_CHECKING
 
@@ -49,9 +50,9 @@ if TYPE_CHECKING:
 KNOWN_LEVER_ARMS = {'car_drive0708': (0.0, 0.05, 0.0)}
 REFERENCE_STD_DEG = {'uav_thor75': (0.6, 1.0), 'car_drive0708': (0.2, 0.5),
                      'quad_dot08': (1.0, 2.0)}
-SUFFIXES = ('.bag', '.mcap', '.db3')
 MOTION_SPEED, MOTION_TIME = 5.0, 60.0       # m/s of change within so many s is real motion
 STEP, LENGTH = 10.0, 120.0      # s
+REFERENCE = '/reference/imu'
 SHORTEST = 10.0                 # s of data that a window has to have
 TIMES = (30.0, 60.0, 120.0)
 METHODS: dict[str, JsonDict] = {
@@ -101,17 +102,11 @@ class Recording:
 
 def recordings_in(folder: Path) -> list[Path]:
     """Return the recordings in a folder that carry a reference."""
-    from ins_align.recordings.bag import Bag
-    from ins_align.recordings.reader import choose_topics
-
     paths = []
     for path in sorted(folder.iterdir()):
-        if path.suffix not in SUFFIXES and not (path / 'metadata.yaml').is_file():
-            continue
         try:
-            with Bag(path) as bag:
-                if choose_topics(bag, Config()).reference is not None:
-                    paths.append(path)
+            load(path)
+            paths.append(path)
         except BagError as error:
             print(f'{path.name}: left out: {error}')
     return paths
@@ -126,7 +121,7 @@ def load(path: Path) -> Recording:
 
     parts = list(read(Request(path)))
     if parts[0].topics.reference is None:
-        raise BagError(f'{path} has no reference')
+        raise BagError(f'it has no reference attitude on {REFERENCE}')
     imu = ImuSamples(*map(np.concatenate, zip(*(part.imu for part in parts))))
     orientations = Orientations(
         *map(np.concatenate, zip(*(part.orientations for part in parts))))
@@ -167,17 +162,17 @@ def run_window(task: tuple[Path, float, float, JsonDict]) -> Window:
     stamps, velocities = _velocities([message for _, kind, message in sent if kind != 'imu'])
     rows, declared, declared_s = [], None, None
     for look in follow(Aligner(Config(**config)), sent, 0.0):
-        attitude = look.current
-        C_true = None if attitude is None else recording.reference.attitude_at(attitude.stamp_ns)
-        if attitude is None or C_true is None or look.t_s is None:
+        if look.t_s is None or look.current is None:
             continue
-        error = error_of(attitude, C_true, recording.reference_std_deg)
-        aligned = look.state is State.ALIGNED
-        if aligned and declared is None:
+        C_true = recording.reference.attitude_at(look.current.stamp_ns)
+        if C_true is None:
+            continue
+        error = error_of(look.current, C_true, recording.reference_std_deg)
+        if look.state is State.ALIGNED and declared is None:
             declared, declared_s = error, look.t_s
-        rows.append([look.t_s, aligned, *error.angles_deg, error.tilt_sigmas,
-                     error.heading_sigmas, _course_error(look.stamp_ns, C_true, stamps,
-                                                         velocities)])
+        rows.append([look.t_s, look.state is State.ALIGNED, *error.angles_deg, error.tilt_sigmas,
+                     error.heading_sigmas,
+                     _course_error(look.stamp_ns, C_true, stamps, velocities)])
     table = np.array(rows).reshape(-1, 8)
     minute = velocities[stamps <= stamps[0] + round(MOTION_TIME * 1e9)] if len(stamps) else []
     return Window(start_s, table[:, 0], table[:, 1] > 0, table[:, 2:5], table[:, 5:7],
@@ -207,20 +202,17 @@ def _velocities(messages: list[Any]) -> tuple[np.ndarray, Array]:
 
 def _change(velocities: Any) -> float:
     """Largest difference of two velocities, shape (N, 2), m/s, to 1 %."""
-    if len(velocities) < 2:
-        return 0.0
     angles = np.radians(np.arange(0.0, 180.0, 15.0))
-    extents = np.ptp(np.asarray(velocities) @ [np.cos(angles), np.sin(angles)], axis=0)
-    return float(np.max(extents))
+    extents = np.asarray(velocities).reshape(-1, 2) @ [np.cos(angles), np.sin(angles)]
+    return float(np.max(np.ptp(extents, axis=0))) if len(extents) else 0.0
 
 
 def _course_error(stamp_ns: int, C_true: Array, stamps: np.ndarray, velocities: Array) -> float:
     """Error of taking the course over ground for the heading, degrees; nan below 1 m/s."""
-    if not len(stamps):
-        return float('nan')
-    v = velocities[min(int(np.searchsorted(stamps, stamp_ns)), len(stamps) - 1)]
+    v = velocities[min(int(np.searchsorted(stamps, stamp_ns)), len(stamps) - 1)] \
+        if len(stamps) else np.zeros(2)
     if np.hypot(*v) < 1.0:
-        return float('nan')
+        return math.nan
     error = np.arctan2(C_true[1, 0], C_true[0, 0]) - np.arctan2(v[1], v[0])
     return float(np.degrees((error + np.pi) % (2 * np.pi) - np.pi))
 
@@ -233,14 +225,13 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
     assert data_dir is not None
     paths = recordings_in(data_dir)
     if not paths:
-        raise ExperimentError(f'no recording with /reference/imu in {data_dir}')
+        raise ExperimentError(f'no recording with {REFERENCE} in {data_dir}')
     report = Report('recordings', 'Real recordings', out, ' --data DIR')
     report.text(
-        f'An alignment starts every {STEP:g} s and runs for up to {LENGTH:g} s; everything but '
-        'the method is the default (preset mems), only the car has its lever arm. note: vif with '
-        'free_start false; centred: vif. A recording without velocities has no vif: there the '
-        'two use pif. Errors are those of the current attitude against the reference, in sigmas '
-        'with that of the reference in quadrature.')
+        f'An alignment starts every {STEP:g} s and runs for up to {LENGTH:g} s with the defaults '
+        '(preset mems), the car with its lever arm. note: vif with free_start false; centred: '
+        'vif; both are pif where there are no velocities. Errors of the current attitude against '
+        'the reference, in sigmas with that of the reference in quadrature.')
     groups = [(path, method) for path in paths for method in METHODS]
     results = parallel(run_window, [
         [(path, start, LENGTH, _config_of(path, method)) for start in np.arange(
@@ -251,15 +242,13 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
         windows[load(path).name][method] = each
     targets_text(report, windows)
     report.table(
-        'At the declaration: median / worst. in 60 s: windows with real motion (velocity changes '
-        f'by {MOTION_SPEED:g} m/s within {MOTION_TIME:g} s) that declare within '
-        f'{MOTION_TIME:g} s. Then all epochs while ALIGNED', [
+        f'At the declaration: median / worst. in {MOTION_TIME:g} s: windows with real motion '
+        f'(by {MOTION_SPEED:g} m/s within that time) that declare. Then all epochs while ALIGNED', [
             (f'{name}, {method}', each) for name, methods in windows.items()
             for method, each in methods.items()], DECLARED_COLUMNS)
     report.table(
-        'Errors in deg after so many seconds: median / worst, declared or not; sigmas: '
-        'of the heading; course: the course over ground, above 1 m/s, taken for the '
-        'heading. Windows with real motion (all of a recording that has none)', [
+        'Errors in deg: median / worst, declared or not; sigmas: of the heading; course: that over '
+        'ground, above 1 m/s, taken for it. Windows with real motion, or all if there is none', [
             (f'{name}, {shown}', _moving(methods, shown), shown == 'course')
             for name, methods in windows.items() for shown in (*methods, 'course')], [
                 ('recording, method', '', lambda r: r[0]), ('windows', '', lambda r: len(r[1])),
@@ -303,12 +292,11 @@ def targets_text(report: Report, windows: Windows) -> None:
     sigmas = np.array([error.worst_sigmas for *_, error in declared])
     soon, moving = _soon([window for _, window in every])
     report.text(
-        f'bank over all recordings: of {len(declared)} declared, {np.sum(sigmas <= 3)} are within '
-        f'3 sigma ({100 * np.mean(sigmas <= 3):.0f} %, target 99 %) and {np.sum(sigmas > 5)} '
-        f'beyond 5 (target none); of {moving} windows with real motion, {soon} declare '
-        f'within {MOTION_TIME:g} s ({100 * soon / max(moving, 1):.0f} %, target 90 %). '
-        'Target of the median heading error at the declaration: 1 deg (UAV, car), 3 deg '
-        '(quadrotor).' if declared else 'the bank declared nothing.')
+        f'bank: of {len(declared)} declared, {np.sum(sigmas <= 3)} are within 3 sigma '
+        f'({100 * np.mean(sigmas <= 3):.0f} %, target 99 %), {np.sum(sigmas > 5)} beyond 5 (target '
+        f'none); of {moving} windows with real motion, {soon} declare within {MOTION_TIME:g} s '
+        f'({100 * soon / max(moving, 1):.0f} %, target 90 %). Target of the median heading error '
+        'then: 1 deg (UAV, car), 3 deg (quadrotor).' if declared else 'The bank declared nothing.')
     report.table('bank: declared beyond 3 sigma', [
         each for each in declared if each[2].worst_sigmas > BINS[0]], [
             ('recording', '', lambda d: d[0]), ('start, s', 'g', lambda d: d[1].start_s),
@@ -387,22 +375,19 @@ def _epochs_at(windows: list[Window], time: float) -> list[tuple[Window, int]]:
 
 def figure(windows: Windows) -> Any:
     """Draw heading errors of the bank over time, window by window."""
-    panels = []
-    for name, methods in windows.items():
-        lines = []
-        for window in methods['bank']:
-            # Two a second are enough to see, ten make a large file.
-            step = max(1, len(window.time) // max(1, int(2 * np.ptp(window.time)))
-                       if len(window.time) else 1)
-            time, aligned = window.time[::step], window.aligned[::step]
-            error = np.abs(window.error_deg[::step, 2])
-            lines += [(time, error, {'color': '#bbbbbb', 'linewidth': 0.5}),
-                      (time, np.where(aligned, error, np.nan),
-                       {'color': '#CC79A7', 'linewidth': 0.7})]
-        panels.append([{
-            'title': f'{name}: bank, every window (declared: dark)', 'lines': lines,
-            'ylabel': 'heading error (deg)', 'yscale': 'log', 'ylim': (0.02, 200.0)}])
-    return draw(12.0, 3.4 * len(windows) + 0.4, panels)
+    def lines_of(window: Window) -> list[tuple[Any, ...]]:
+        # Two a second are enough to see, ten make a large file.
+        k = np.flatnonzero(np.diff(np.floor(2.0 * window.time), prepend=-1.0))
+        error = np.abs(window.error_deg[k, 2])
+        return [(window.time[k], error, {'color': '#bbbbbb', 'linewidth': 0.5}),
+                (window.time[k], np.where(window.aligned[k], error, np.nan),
+                 {'color': '#CC79A7', 'linewidth': 0.7})]
+
+    return draw(12.0, 3.4 * len(windows) + 0.4, [[{
+        'title': f'{name}: bank, every window (declared: dark)',
+        'lines': itertools.chain(*map(lines_of, methods['bank'])),
+        'ylabel': 'heading error (deg)', 'yscale': 'log', 'ylim': (0.02, 200.0)}]
+        for name, methods in windows.items()])
 
 
 def window_json(window: Window) -> JsonDict:
