@@ -49,9 +49,9 @@ SILENT_SEED, TIME_SEED = 100_000, 200_000
 # A run of the second and the third part for so many of the first.
 SILENT_PART, TIME_PART = 80, 10
 SILENT = 'straight', 'static'
-ERRORS = ('Errors against truth in stated sigmas: of the tilt the worse of two axes, and the worse '
-          f'of the attitude at t0 and the current one. Target: at most 1 % beyond {BINS[0]:g} '
-          f'sigma, none beyond {BINS[1]:g}.')
+ERRORS = ('Errors against truth in stated sigmas: of the tilt the worse of two axes, and the '
+          'worse of the attitude at t0 and the current one. Target: at most 1 % beyond '
+          f'{BINS[0]:g} sigma, none beyond {BINS[1]:g}.')
 DRAWN = 'simulate', 'config', 'declared'    # drawn again from the index; `aligned` is the first
 
 

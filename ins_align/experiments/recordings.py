@@ -243,12 +243,12 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
     targets_text(report, windows)
     report.table(
         f'At the declaration: median / worst. in {MOTION_TIME:g} s: windows with real motion '
-        f'(by {MOTION_SPEED:g} m/s within that time) that declare. Then all epochs while ALIGNED', [
+        f'(by {MOTION_SPEED:g} m/s in that time) that declare. Then all epochs while ALIGNED', [
             (f'{name}, {method}', each) for name, methods in windows.items()
             for method, each in methods.items()], DECLARED_COLUMNS)
     report.table(
-        'Errors in deg: median / worst, declared or not; sigmas: of the heading; course: that over '
-        'ground, above 1 m/s, taken for it. Windows with real motion, or all if there is none', [
+        'Errors in deg: median / worst, declared or not; sigmas: of the heading; course: that '
+        'over ground, above 1 m/s, taken for it. Windows with real motion; all if none has', [
             (f'{name}, {shown}', _moving(methods, shown), shown == 'course')
             for name, methods in windows.items() for shown in (*methods, 'course')], [
                 ('recording, method', '', lambda r: r[0]), ('windows', '', lambda r: len(r[1])),
@@ -293,10 +293,11 @@ def targets_text(report: Report, windows: Windows) -> None:
     soon, moving = _soon([window for _, window in every])
     report.text(
         f'bank: of {len(declared)} declared, {np.sum(sigmas <= 3)} are within 3 sigma '
-        f'({100 * np.mean(sigmas <= 3):.0f} %, target 99 %), {np.sum(sigmas > 5)} beyond 5 (target '
-        f'none); of {moving} windows with real motion, {soon} declare within {MOTION_TIME:g} s '
-        f'({100 * soon / max(moving, 1):.0f} %, target 90 %). Target of the median heading error '
-        'then: 1 deg (UAV, car), 3 deg (quadrotor).' if declared else 'The bank declared nothing.')
+        f'({100 * np.mean(sigmas <= 3):.0f} %, target 99 %), {np.sum(sigmas > 5)} beyond 5 '
+        f'(target none); of {moving} windows with real motion, {soon} declare within '
+        f'{MOTION_TIME:g} s ({100 * soon / max(moving, 1):.0f} %, target 90 %). Target of the '
+        'median heading error then: 1 deg (UAV, car), 3 deg (quadrotor).'
+        if declared else 'The bank declared nothing.')
     report.table('bank: declared beyond 3 sigma', [
         each for each in declared if each[2].worst_sigmas > BINS[0]], [
             ('recording', '', lambda d: d[0]), ('start, s', 'g', lambda d: d[1].start_s),

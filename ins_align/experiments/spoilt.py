@@ -27,8 +27,8 @@ from typing import Any
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.messages import ENU_FROM_NED, fixes, MessageError, velocities
+from ins_align.simulation.scenarios import displaced
 from ins_align.simulation.simulate import Simulation
-from ins_align.simulation.trajectory import displaced
 import numpy as np
 
 Random = np.random.Generator
