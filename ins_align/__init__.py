@@ -46,9 +46,8 @@ if TYPE_CHECKING:
     from ins_align.aligner import Aligner
     from ins_align.config import Config, ConfigError
     from ins_align.gnss.messages import Fix, Velocity
-    from ins_align.offline import align
+    from ins_align.offline import align, replay
     from ins_align.recordings.info import inspect
-    from ins_align.recordings.replay import replay
     from ins_align.results import Attitude, Epoch, State, Status
     from ins_align.simulation.simulate import simulate
 
@@ -57,7 +56,7 @@ if TYPE_CHECKING:
 _MODULES = {
     'align': 'offline', 'Aligner': 'aligner', 'Attitude': 'results', 'Config': 'config',
     'ConfigError': 'config', 'Epoch': 'results', 'Fix': 'gnss.messages',
-    'inspect': 'recordings.info', 'replay': 'recordings.replay',
+    'inspect': 'recordings.info', 'replay': 'offline',
     'simulate': 'simulation.simulate', 'State': 'results', 'Status': 'results',
     'Velocity': 'gnss.messages'}
 __all__ = ['Aligner', 'Attitude', 'Config', 'ConfigError', 'Epoch', 'Fix', 'State', 'Status',

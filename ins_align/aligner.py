@@ -15,7 +15,7 @@
 The aligner: messages in, attitudes and states out.
 
 A message's way, in eight steps: 1 the caller turns it into numbers (`gnss.messages`,
-`ros.imu_bytes`, `recordings.decode`); 2 it waits in a queue until nothing late can precede it;
+`ros.inputs`, `recordings.decode`); 2 it waits in a queue until nothing late can precede it;
 3 queue and antenna give an epoch; 4 preintegration gives the IMU's interval before it; 5 the bank
 propagates and updates; 6 the rivals are heard; 7 the declaration decides; 8 an `Epoch` goes out.
 
@@ -30,13 +30,11 @@ from ins_align.config import Config, ConfigError, parameters
 from ins_align.estimation.bank import Bank, Learnt
 from ins_align.estimation.declaration import Declaration, Fit
 from ins_align.estimation.formula import NoteMethod
-from ins_align.geometry.rotation import Array
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import Array, Transform
 from ins_align.gnss.antenna import Antenna
 from ins_align.gnss.buffer import GnssBuffer, GnssEpoch, PAIR_NS
 from ins_align.gnss.messages import AntennaEpoch, Fix, Velocity
-from ins_align.imu.buffer import ImuBuffer
-from ins_align.imu.cutter import ImuCutter, NO_SAMPLE
+from ins_align.imu.buffer import ImuBuffer, NO_SAMPLE
 from ins_align.imu.noise import ForceCheck
 from ins_align.imu.prediction import Prediction
 from ins_align.results import Attitude, Epoch, Event, Nuisance, Severity, State, Status, Verdict
@@ -88,10 +86,9 @@ class Aligner:
     def _forget_all(self) -> None:
         """Forget everything but the counts."""
         lateness_ns = round(self.config.gnss_lateness * 1e9) + max(self._delay_ns, 0)
-        self._imu = ImuBuffer(lateness_ns, self._counts)
+        self._imu = ImuBuffer(lateness_ns, self._counts, self.config.imu_noise)
         self._gnss = GnssBuffer(lateness_ns, self._counts,
                                 0 if self.config.use_velocity is False else PAIR_NS)
-        self._cutter = ImuCutter(self.config.imu_noise, self._imu, self._counts)
         self._refusal = ''                          # why velocities cannot be used
         self._first_t0_ns: int | None = None
         self._forget(None)
@@ -236,7 +233,7 @@ class Aligner:
             if left_out := self._imu.left_out(self._counts_before):
                 self._wait(State.WAITING_FOR_IMU, f'no IMU sample of use yet: {left_out}')
             return
-        self._cutter.check(upto_ns)
+        self._imu.check(upto_ns)
         for message in self._gnss.release(upto_ns, last):
             self._bridge_outage(message.stamp_ns)
             self._line_up(message)
@@ -247,7 +244,7 @@ class Aligner:
             self._counts['imu_gap'] += 1
             self._lose(NO_SAMPLE)
         if self._last_ns is None:
-            self._cutter.forget_before(upto_ns)
+            self._imu.forget_before(upto_ns)
             if self._imu.silent:
                 self._wait(State.WAITING_FOR_IMU, NO_SAMPLE)
             elif self._first_fix_ns is None:
@@ -270,7 +267,7 @@ class Aligner:
                 self._start(epoch)
             self._counts['epochs_before_start'] += self._last_ns is None
         elif epoch is not None:
-            if silence := self._cutter.silence(self._last_ns, epoch.stamp_ns):
+            if silence := self._imu.silence(self._last_ns, epoch.stamp_ns):
                 self._counts[silence.counter] += 1
                 self._counts['epochs_before_start'] += not epoch.dry
                 self._lose(silence.why)
@@ -284,10 +281,10 @@ class Aligner:
         method = self._method
         if method is None or not epochs:
             return
-        for part in self._cutter.parts([epoch.stamp_ns for epoch in epochs]):
+        for part in self._imu.parts([epoch.stamp_ns for epoch in epochs]):
             # 4. Preintegration gives the IMU's interval before each.
-            imu = self._cutter.cut([epoch.stamp_ns for epoch in epochs[part]],
-                                   [epoch.gravity_drift for epoch in epochs[part]])
+            imu = self._imu.cut([epoch.stamp_ns for epoch in epochs[part]],
+                                [epoch.gravity_drift for epoch in epochs[part]])
             # 5. The bank propagates and updates; each epoch comes when the estimates are its.
             taken = method.advance(epochs[part], imu.integrated())
             for epoch, force in zip(taken, imu.forces):
@@ -296,7 +293,7 @@ class Aligner:
 
     def _judge(self, epoch: AntennaEpoch, method: Bank | NoteMethod) -> None:
         """Decide what is declared after an epoch, and yield it."""
-        # 6. The rivals are heard: what they object is a part of the fit.
+        # 6. The rivals have been heard: what they object is a part of the fit.
         fit = method.fit()
         # 7. The declaration decides the state and the words.
         verdict = self._decide(epoch, method, fit)
@@ -373,14 +370,14 @@ class Aligner:
             return
         if self._imu.stamps[0] > epoch.stamp_ns:
             return
-        if silence := self._cutter.silence(epoch.stamp_ns, epoch.stamp_ns):
+        if silence := self._imu.silence(epoch.stamp_ns, epoch.stamp_ns):
             self._wait(State.WAITING_FOR_IMU, silence.why)
             return
         self._last_ns = self._start_ns = epoch.stamp_ns
         if self._first_t0_ns is None:
             self._first_t0_ns = epoch.stamp_ns
         self._without_velocity = no_velocity if wanted and epoch.v_n is None else ''
-        imu = self._cutter.start(epoch.stamp_ns).integrated()
+        imu = self._imu.start(epoch.stamp_ns).integrated()
         if config.method == 'bank':
             self._method = Bank(config, epoch, imu, bool(use_position), self._learnt,
                                 self._base)
@@ -452,7 +449,7 @@ class Aligner:
         stamps, rates, rate = since
         if self._prediction is None:
             sensors = method.sensor_errors()
-            self._prediction = Prediction.of(
+            self._prediction = Prediction(
                 current, sensors.gyro_bias, sensors.gyro_matrix,
                 float(np.max(method.nuisance().gyro_bias_std)),
                 self.config.imu_noise.angle_random_walk, rate)
@@ -470,9 +467,10 @@ class Aligner:
         """Return the state, the reason for it, the estimates and the counts."""
         method = self._method
         nuisance = Nuisance.configured(self.config) if method is None else method.nuisance()
-        return Status(self._verdict.state, self._verdict.reason, self._last_ns,
-                      None if method is None else method.t0_ns, self._time_to_align_s,
-                      self._initial, self._current, **vars(nuisance), counts=dict(self.counts))
+        return Status(**vars(nuisance), **vars(self._verdict), stamp_ns=self._last_ns,
+                      t0_ns=None if method is None else method.t0_ns, initial=self._initial,
+                      current=self._current, time_to_align_s=self._time_to_align_s,
+                      counts=dict(self.counts))
 
 
 def _epoch_counts(method: Bank | NoteMethod | None) -> Counter[str]:

@@ -56,17 +56,8 @@ def turn_ratio(times: Array, gyro: Array, up: Array, velocities: Series) -> floa
     """
     Return the rate about the vertical over the turn of the course; None: nothing to tell.
 
-    Parameters
-    ----------
-    times : ndarray, shape (N,)
-        s, increasing.
-    gyro : ndarray, shape (N, 3)
-        Rates, rad/s, averaged over GRID s.
-    up : ndarray, shape (3,)
-        Unit vector of the mean specific force.
-    velocities : Series
-        As from `on_grid`.
-
+    Of rates, rad/s, shape (N, 3), averaged over GRID s, at increasing times, s; `up` is the unit
+    vector of the mean specific force, shape (3,); velocities are as from `on_grid`.
     """
     if velocities.times.size < 5:
         return None
@@ -89,13 +80,7 @@ def exchange_fault(positions_deg: Series, velocities: Series) -> str:
     """
     Say that latitude and longitude are exchanged; empty where they are not.
 
-    Parameters
-    ----------
-    positions_deg : Series
-        Latitude and longitude, degrees, altitude, m.
-    velocities : Series
-        As if they were ENU, m/s.
-
+    Of positions, degrees and m, and velocities as if they were ENU, m/s.
     """
     vectors = positions_deg.vectors
     if vectors.shape[0] < 2 or np.abs(vectors[:, 1]).max() > 90.0:
@@ -130,15 +115,7 @@ def lateness_advice(lateness: float) -> tuple[str, str]:
 
 
 class InputChecks:
-    """
-    Looks at messages as they arrive, in bounded memory.
-
-    Parameters
-    ----------
-    config : Config
-        ``gnss_lateness``.
-
-    """
+    """Looks at messages as they arrive, in bounded memory."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -154,15 +131,8 @@ class InputChecks:
         """
         Take messages in the order of their arrival.
 
-        Parameters
-        ----------
-        stamps_ns : ndarray of int, shape (N,)
-            Of IMU samples.
-        gyro, accel : ndarray, shape (N, 3)
-            rad/s, m/s^2, as sent.
-        gnss : sequence of (int, message)
-            How many of the samples come before each.
-
+        Stamps of IMU samples, ns, shape (N,), their rates, rad/s, and forces, m/s^2, shape (N, 3),
+        as sent; GNSS messages, each with how many of the samples come before it.
         """
         before = np.array([] if self._newest_ns is None else [self._newest_ns], np.int64)
         newest = np.maximum.accumulate(np.concatenate([before, stamps_ns]))

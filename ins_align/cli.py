@@ -16,8 +16,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import fields
+from functools import partial
 import gc
 import io
 import json
@@ -27,12 +28,12 @@ import sys
 from typing import Any, NoReturn, TYPE_CHECKING
 
 from ins_align.outputs import (
-    about, absolute, check_plot, check_writable, labels, STANDARD_OUTPUT, UsageError, with_label,
-    write_whole)
-from ins_align.processes import keep_to_one, processors
+    check_plot, check_writable, labels, Outcome, process, STANDARD_OUTPUT, survey, Task,
+    UsageError, with_label, write_whole)
+from ins_align.processes import (
+    ClusterError, keep_to_one, processors, run_all, run_on_cluster)
 
 if TYPE_CHECKING:
-    from ins_align.batch import Outcome, Task
     from ins_align.config import Config
 
 # Everything else is imported where it is used: --help must not wait for numpy.
@@ -44,6 +45,8 @@ PACKAGES = {'backports': 'backports.zstd', 'PIL': 'pillow', 'pyins': 'python-ins
             'yaml': 'pyyaml'}
 
 SCENARIOS = 'flight, car, straight, static, hover, launch, reverse, swing, highway'
+
+BAG_HELP = 'rosbag2 directory or file (.mcap, .db3), or ROS 1 .bag'
 
 DESCRIPTION = """\
 Finds roll, pitch and true heading of a moving IMU with a GNSS receiver.
@@ -106,20 +109,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """
-    Run the command line.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        By default that of the process.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the command line, by default that of the process; return the exit status."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # of any encoding
             stream.reconfigure(errors='backslashreplace')
@@ -136,7 +126,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sentence, status = str(_missing(error)), UNUSABLE
     except BrokenPipeError:  # whoever reads the output has left, as "head" does
         sentence, status = '', NO_READER
-    except (UsageError, OSError) as error:
+    except (UsageError, ClusterError, OSError) as error:
         sentence, status = str(error), UNUSABLE
         if isinstance(error, OSError):
             sentence = f'{error.filename or "output"}: {error.strerror}'
@@ -185,42 +175,31 @@ def _version() -> str:
         return 'is not installed: its version is in package.xml'
 
 
-def _seconds(text: str) -> float:
+def _number(kind: type, least: float, text: str) -> Any:
     try:
-        value = float(text)
+        value = kind(text)
     except ValueError:
-        value = -1.0
-    if not 0.0 <= value < 1e9:
-        raise argparse.ArgumentTypeError(f'must be a number of seconds, 0 or above, got {text!r}')
+        value = least - 1
+    if not least <= value < 1e9:
+        what = 'whole number' if kind is int else 'number of seconds'
+        raise argparse.ArgumentTypeError(f'must be a {what}, {least:g} or above, got {text!r}')
     return value
 
 
-def _count(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'must be a whole number, 1 or above, got {text!r}')
-    return value
+_seconds, _count = partial(_number, float, 0.0), partial(_number, int, 1)
 
 
 def _add_info(commands: Any) -> None:
     command = _add_command(commands, 'info', run_info,
                            'Tell what recordings hold and how to align them.', INFO_EPILOG)
-    _add_bags(command)
+    command.add_argument('bags', nargs='+', metavar='BAG', help=BAG_HELP)
     command.add_argument('--json', metavar='FILE', help='write what is known, for programs; '
                          '-: to standard output, instead of the text')
 
 
-def _add_bags(command: argparse.ArgumentParser) -> None:
-    command.add_argument('bags', nargs='+', metavar='BAG',
-                         help='rosbag2 directory or file (.mcap, .db3), or ROS 1 .bag')
-
-
 def _add_replay(commands: Any) -> None:
     command = _add_command(commands, 'replay', run_replay, 'Align recordings.', REPLAY_EPILOG)
-    _add_bags(command)
+    command.add_argument('bags', nargs='+', metavar='BAG', help=BAG_HELP)
     group = command.add_argument_group('parameters')
     group.add_argument('--params', metavar='FILE', help='parameter file of the node (YAML)')
     group.add_argument('--set', action='append', default=[], metavar='NAME=VALUE',
@@ -310,85 +289,77 @@ def run_info(arguments: argparse.Namespace) -> int:
     """Run ``ins_align info``."""
     if arguments.json:
         check_writable(arguments.json, arguments.bags)
-    from ins_align.recordings import BagError
-    from ins_align.recordings.info import describe, inspect
-
-    several = len(arguments.bags) > 1
-    objects: list[dict[str, Any]] = []
-    status = 0
-    for bag in arguments.bags:
-        try:
-            info = inspect(bag)
-        except BagError as error:
-            if not several:
-                raise UsageError(about(bag, str(error))) from None
-            print(f'ins_align info: {about(bag, str(error))}', file=sys.stderr)
-            objects.append({'bag': bag, 'error': str(error)})
-            status = UNUSABLE
-            continue
-        for warning in info.warnings:
-            print(f'ins_align info: warning: {about(bag, warning)}', file=sys.stderr)
-        if arguments.json != STANDARD_OUTPUT:
-            print(describe(info) + '\n')
-        objects.append(info.to_json())
-    if arguments.json:
-        _write_json(arguments.json, objects if several else objects[0])
-    return status
+    return _tell(arguments, map(survey, arguments.bags), print)
 
 
 def run_replay(arguments: argparse.Namespace) -> int:
     """Run ``ins_align replay``."""
     keep_to_one()
     gc.set_threshold(100_000)  # rows and results by the thousand, none of which is garbage
-    several = len(arguments.bags) > 1
-    names = labels(arguments.bags) if several else ['']
+    names = labels(arguments.bags) if len(arguments.bags) > 1 else ['']
+    files = [{option: with_label(path, label) for option in ('csv', 'plot', 'results')
+              if (path := getattr(arguments, option))} for label in names]
+    _check_outputs(arguments, files)
+    config = _config(arguments)
+    if arguments.plot:
+        check_plot(arguments.plot)
+    tasks = [Task(bag, {
+        'path': os.path.abspath(bag), 'config': config, **{
+            name: getattr(arguments, name) for name in (
+                'imu_topic', 'fix_topic', 'velocity_topic', 'start', 'duration')}},
+        **{option: os.path.abspath(path) for option, path in of_bag.items()})
+        for bag, of_bag in zip(arguments.bags, files)]
+    bar = _progress_bar(len(tasks))
+    status = _tell(arguments, _outcomes(tasks, arguments, bar), bar.write if bar else print)
+    if bar:
+        bar.close()
+    return status
+
+
+def _check_outputs(arguments: argparse.Namespace, files: Sequence[dict[str, str]]) -> None:
+    """Find out before the work whether all files of a replay can be written."""
     for option in ('csv', 'plot'):
         if getattr(arguments, option) == STANDARD_OUTPUT:
             raise UsageError(f'--{option} needs the name of a file')
-    labelled = arguments.csv, arguments.plot, arguments.results
-    outputs = [path for path in (arguments.json, *labelled) if path]
-    outputs += [with_label(path, label) for path in labelled if path for label in names if label]
-    for label in names if arguments.results else ():
-        if os.path.exists(path := with_label(arguments.results, label) or ''):
+    given = arguments.json, arguments.csv, arguments.plot, arguments.results
+    outputs = list(filter(None, given))
+    for of_bag in files:
+        if os.path.exists(path := of_bag.get('results', '')):
             raise UsageError(f'cannot write {path}: it exists already, choose another name')
+        outputs += of_bag.values() if len(files) > 1 else ()
     for path in outputs:
         check_writable(path, [*arguments.bags, *filter(None, [arguments.params])])
         if outputs.count(path) > 1:
             raise UsageError(f'{path} is given for two outputs')
-    config = _config(arguments)
-    if arguments.plot:
-        check_plot(arguments.plot)
-    from ins_align.batch import Task
-    from ins_align.recordings.reader import Request
 
-    tasks = [Task(bag, Request(os.path.abspath(bag), config, arguments.imu_topic,
-                               arguments.fix_topic, arguments.velocity_topic, arguments.start,
-                               arguments.duration),
-                  absolute(arguments.csv, label), absolute(arguments.plot, label),
-                  absolute(arguments.results, label))
-             for bag, label in zip(arguments.bags, names)]
-    objects = []
-    statuses = []
-    bar = _progress_bar(len(tasks))
-    say = print if bar is None else bar.write
+
+def _tell(arguments: argparse.Namespace, outcomes: Iterable[Outcome],
+          say: Callable[..., Any]) -> int:
+    """Print what came of each recording and write ``--json``; return the exit status."""
+    several = len(arguments.bags) > 1
+    objects, statuses = [], []
     # To the very end: a pool of processes that is dropped on the way is torn down in a race.
-    for outcome, bag in zip(_outcomes(tasks, arguments, bar), arguments.bags):
+    for outcome in outcomes:
         objects.append(outcome.json)
         if outcome.error:
             if not several:
-                raise UsageError(about(bag, outcome.error))
-            say(f'ins_align replay: {about(bag, outcome.error)}', file=sys.stderr)
+                raise UsageError(outcome.error)
+            say(f'ins_align {arguments.command}: {outcome.error}', file=sys.stderr)
             statuses.append(UNUSABLE)
             continue
         for warning in outcome.warnings:
-            say(f'ins_align replay: warning: {about(bag, warning)}', file=sys.stderr)
+            say(f'ins_align {arguments.command}: warning: {warning}', file=sys.stderr)
         if arguments.json != STANDARD_OUTPUT:
-            say(outcome.summary + '\n')
-        statuses.append(ALIGNED if outcome.json['aligned'] else NOT_ALIGNED)
-    if bar is not None:
-        bar.close()
-    if arguments.json:
-        _write_json(arguments.json, objects if several else objects[0])
+            say(outcome.text + '\n')
+        statuses.append(ALIGNED if outcome.json.get('aligned', True) else NOT_ALIGNED)
+    text = json.dumps(objects if several else objects[0], indent=2, allow_nan=False) + '\n'
+    if arguments.json == STANDARD_OUTPUT:
+        print(text, end='')
+    elif arguments.json:
+        try:
+            write_whole(arguments.json, lambda file: file.write(text.encode()))
+        except OSError as error:
+            raise UsageError(f'cannot write {arguments.json}: {error.strerror}') from None
     return max(statuses)
 
 
@@ -405,30 +376,16 @@ def _progress_bar(total: int) -> Any:
 def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace, bar: Any,
               ) -> Iterator[Outcome]:
     """Process recordings where the arguments say."""
-    from ins_align.batch import ClusterError, process_all, process_on_cluster
 
     def advance(position: float) -> None:
         if bar is not None:
             bar.update(position - bar.n)
 
-    if arguments.dask is None:
-        yield from process_all(tasks, arguments.jobs or processors(), advance)
-        return
-    try:
-        yield from process_on_cluster(tasks, arguments.dask, advance)
-    except ClusterError as error:
-        raise UsageError(error) from None
-
-
-def _write_json(path: str, content: Any) -> None:
-    text = json.dumps(content, indent=2, allow_nan=False) + '\n'
-    if path == STANDARD_OUTPUT:
-        print(text, end='')
-        return
-    try:
-        write_whole(path, lambda file: file.write(text.encode()))
-    except OSError as error:
-        raise UsageError(f'cannot write {path}: {error.strerror}') from None
+    found = (run_all(process, tasks, arguments.jobs or processors(), advance)
+             if arguments.dask is None else
+             run_on_cluster(process, tasks, arguments.dask, advance))
+    for task, outcome in zip(tasks, found):
+        yield Outcome.lost(task.name, outcome) if isinstance(outcome, Exception) else outcome
 
 
 def _config(arguments: argparse.Namespace) -> Config:

@@ -264,11 +264,7 @@ def config_from_mapping(values: Mapping[str, Any]) -> Config:
     """
     Make a configuration from names and values, the defaults for the rest.
 
-    Raises
-    ------
-    ConfigError
-        If a name is not known, with the names that come close, or a value is wrong.
-
+    A ConfigError names those that come close to a name that is not known, or says what is wrong.
     """
     known = [field.name for field in dataclasses.fields(Config)]
     for name in values:
@@ -293,17 +289,9 @@ def _did_you_mean(name: str) -> str:
 
 def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
-    Read the values for this node from a ROS 2 parameter file.
+    Read the values for this node from a ROS 2 parameter file, by name, not checked.
 
-    Parameters
-    ----------
-    path : path
-        YAML with ``ros__parameters`` below the node's name or a wildcard (``/**``).
-
-    Returns
-    -------
-    dict
-        Values by name, not checked: `config_from_mapping` does that.
+    The YAML has ``ros__parameters`` below the node's name or a wildcard (``/**``).
 
     Raises
     ------
@@ -337,15 +325,7 @@ def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """
-    Split ``name=value``, the value written as in YAML.
-
-    Raises
-    ------
-    ConfigError
-        If there is no ``=`` or the value cannot be read.
-
-    """
+    """Split ``name=value``, the value written as in YAML; a ConfigError says what is wrong."""
     name, equals, value = text.partition('=')
     if not equals or not name.strip():
         raise ConfigError(f'expected NAME=VALUE, got {reprlib.repr(text)}')

@@ -20,9 +20,8 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from ins_align.config import Config, ConfigError
-from ins_align.geometry.rotation import Array, matrix_from_quaternion
-from ins_align.geometry.transform import Transform
-from ins_align.results import Attitude, Event, Severity
+from ins_align.geometry.rotation import Array, matrix_from_quaternion, Transform
+from ins_align.results import Event, Severity
 import numpy as np
 
 ROUNDING = 1e-6  # m: numbers of a robot's model that differ less are the same
@@ -76,26 +75,12 @@ class Mounting(NamedTuple):
     missing: Sequence[str] = ()  # transforms that are wanted and not there, in words
 
 
-def base_attitude(attitude: Attitude | None, base: Transform | None) -> Attitude | None:
-    """Return the attitude of the base; None where it or that of the IMU is not known."""
-    if attitude is None or base is None:
-        return None
-    return dataclasses.replace(attitude, C_nb=attitude.C_nb @ base.rotation)
-
-
 def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Config) -> Mounting:
     """
-    Look up lever arm and mounting.
+    Look up lever arm and mounting, as ``lever_arm_from_tf`` and ``base_frame`` want them.
 
-    Parameters
-    ----------
-    lookup : callable
-        Returns the transform from its second argument to its first, or None.
-    imu_frame, antenna_frame : str
-        The frame_id of the IMU's and of the position messages.
-    config : Config
-        Says with ``lever_arm_from_tf`` and ``base_frame`` what is wanted.
-
+    `lookup` returns the transform from its second argument to its first, or None; the frames are
+    the frame_id of the IMU's and of the position messages.
     """
     words: list[Event] = []
     missing: list[str] = []

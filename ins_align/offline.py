@@ -11,22 +11,23 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Alignment of recorded data: of arrays, and of what replay reads from a recording."""
+"""Recorded data through the aligner: recordings, `replay`, and arrays, `align`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import dataclasses
+import os
 from typing import Any, TYPE_CHECKING, Union
 
 from ins_align.aligner import Aligner
 from ins_align.checks import InputChecks
 from ins_align.config import Config, config_from_mapping
-from ins_align.geometry.rotation import Array, Index
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import Array, Index, Transform
 from ins_align.gnss import messages
-from ins_align.gnss.messages import Fix, Velocity
-from ins_align.results import Epoch, Result, State, Status
+from ins_align.gnss.messages import fault_of_fix, Fix, Velocity
+from ins_align.processes import run_ahead
+from ins_align.results import Epoch, in_order_of_time, Reference, Result, State
 import numpy as np
 
 if TYPE_CHECKING:
@@ -40,43 +41,29 @@ MAX_STAMP_NS = 9e18
 MIN_INTERVAL_NS = 1000
 
 
-class OfflineAligner:
-    """
-    An aligner that takes recorded data, and collects what comes of it.
-
-    Parameters
-    ----------
-    config : Config
-    base : Transform, optional
-        As for `Aligner`.
-
-    """
+class _Run:
+    """An aligner that takes recorded messages, and collects what comes of it."""
 
     def __init__(self, config: Config, base: Transform | None = None) -> None:
-        """Start with no data."""
-        self.config = config
+        self._config = config
         self._aligner = Aligner(config, base)
         self._checks = InputChecks(config)
         self._epochs: list[Epoch] = []
         self._waiting = 0
 
     def add(self, stamps_ns: Index, gyro: Array, accel: Array,
-            gnss: Sequence[tuple[int, Union[Fix, Velocity, tuple[str, str]]]]) -> None:
+            gnss: Sequence[tuple[int, Union[Fix, Velocity, tuple[str, str]]]],
+            undecodable: int = 0) -> None:
         """
         Take consecutive messages.
 
-        Parameters
-        ----------
-        stamps_ns : ndarray of int, shape (N,)
-            Of IMU samples.
-        gyro, accel : ndarray, shape (N, 3)
-            rad/s, m/s^2.
-        gnss : sequence of (int, Fix or Velocity or (str, str))
-            How many of the samples come before each message; of one that cannot be used the
-            arguments of `Aligner.reject`.
-
+        IMU samples, shapes (N,), ns, and (N, 3), rad/s and m/s^2, and how many messages hold none.
+        Each GNSS message comes with how many of the samples are before it; of one that cannot be
+        used the arguments of `Aligner.reject` stand in its place.
         """
         aligner, position = self._aligner, 0
+        for _ in range(undecodable):
+            aligner.reject('imu_undecodable')
         for before, message in (*gnss, (len(stamps_ns), None)):
             if before > position:
                 between = slice(position, before)
@@ -96,18 +83,77 @@ class OfflineAligner:
             self._epochs += aligner.update(dry=True)
             self._waiting = 0
 
-    def reject(self, reason: str, count: int) -> None:
-        """Count messages that cannot be used."""
-        for _ in range(count):
-            self._aligner.reject(reason)
-
-    def finish(self) -> tuple[Status, tuple[Epoch, ...]]:
-        """Return the status at the end, and all epochs."""
+    def result(self, **of_recording: Any) -> Result:
+        """Return what came of it, at the end."""
         self._epochs += self._aligner.flush(dry=True)
         status = self._aligner.status()
         if status.state is not State.ALIGNED and (faults := self._checks.faults()):
             status = dataclasses.replace(status, reason='; '.join([status.reason, *faults]))
-        return status, tuple(self._epochs)
+        return Result(config=self._config, status=status,
+                      epochs=in_order_of_time(self._epochs), **of_recording)
+
+
+def replay(path: str | os.PathLike[str], config: Config | None = None, *,
+           imu_topic: str | None = None, fix_topic: str | None = None,
+           velocity_topic: str | None = None,
+           start: float | None = None, duration: float | None = None,
+           progress: Callable[[float], None] | None = None,
+           read_ahead: bool = False) -> Result:
+    """
+    Align a recording.
+
+    Parameters
+    ----------
+    path : path
+        rosbag2 directory or file, ROS 1 bag.
+    config : Config, optional
+        By default all parameters at their defaults.
+    imu_topic, fix_topic, velocity_topic : str, optional
+        Where there is more than one candidate.
+    start, duration : float, optional
+        Part of the recording, seconds from its start, by recorded time.
+    progress : callable, optional
+        Called with how much has been read, 0 to 1.
+    read_ahead : bool
+        Let another process read: the same result in less time.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    BagError
+        If the recording cannot be read, lacks a topic, or has no messages in the part asked for.
+    BrokenProcessPool
+        If the other process is killed.
+
+    """
+    from ins_align.recordings import reader  # with rosbags, which arrays do not need
+
+    request = reader.Request(path, config or Config(), imu_topic, fix_topic, velocity_topic,
+                             start, duration)
+    run: _Run | None = None
+    fixes: list[tuple[int, float, float]] = []
+    orientations: list[tuple[np.ndarray, np.ndarray]] = []
+    for part in run_ahead(reader.read, request) if read_ahead else reader.read(request):
+        run = run or _Run(part.config, part.topics.base)
+        run.add(part.imu.stamps_ns, part.imu.gyro, part.imu.accel, part.gnss,
+                int(np.count_nonzero(~part.imu.decoded)))
+        fixes += [(message.stamp_ns, message.latitude_deg, message.longitude_deg)
+                  for _, message in part.gnss
+                  if isinstance(message, Fix) and not fault_of_fix(message)]
+        orientations.append(part.orientations.known())
+        if progress is not None:
+            progress(part.done)
+    assert run is not None
+    first_fix_ns = fixes[0][0] if fixes else 0
+    return run.result(
+        bag=str(path), warnings=part.warnings, topics=part.topics, first_fix_ns=first_fix_ns,
+        reference=Reference(*orientations) if any(
+            stamps_ns.size for stamps_ns, _ in orientations) else None,
+        track=np.array([(stamp_ns - first_fix_ns, *place)
+                        for stamp_ns, *place in fixes]).reshape(-1, 3))
 
 
 def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
@@ -162,7 +208,7 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     # Each message comes behind the IMU samples that have its stamp or an older one.
     before = np.searchsorted(np.maximum.accumulate(stamps_ns),
                              [message.stamp_ns for message in gnss], side='right')
-    run = OfflineAligner(settings)
+    run = _Run(settings)
     first = 0
     for start in range(0, stamps_ns.size, MESSAGES):
         part = slice(start, start + MESSAGES)
@@ -170,8 +216,7 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
         run.add(stamps_ns[part], rates[part], forces[part],
                 list(zip((before[first:last] - start).tolist(), gnss[first:last])))
         first = last
-    status, epochs = run.finish()
-    return Result(config=settings, status=status, epochs=epochs)
+    return run.result()
 
 
 def _nanoseconds(name: str, stamps: np.ndarray, unit_ns: float) -> Index:

@@ -11,15 +11,24 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Files that a command writes: named, checked before the work, and written whole."""
+"""What comes of a recording: the files that a command writes, named, checked, written whole."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures.process import BrokenProcessPool
+import dataclasses
+from dataclasses import dataclass
 import errno
+from functools import partial
 import os
 from pathlib import Path
-from typing import Any, IO
+from typing import Any, IO, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ins_align.results import Result
+
+# Everything else is imported where it is used: --help must not wait for numpy.
 
 STANDARD_OUTPUT = '-'
 PAGE_SUFFIX = '.html'
@@ -31,19 +40,96 @@ class UsageError(Exception):
     """A wrong command line; the text says what is wrong in one sentence."""
 
 
+@dataclass(frozen=True)
+class Task:
+    """One recording, how to replay it and what to write; paths that hold on every machine."""
+
+    name: str  # of the recording, as it was given
+    arguments: dict[str, Any]  # of `replay`
+    csv: str | None = None
+    plot: str | None = None
+    results: str | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a recording: either an error in one sentence or a text to print."""
+
+    json: dict[str, Any]  # what --json writes of it
+    text: str = ''
+    warnings: tuple[str, ...] = ()
+    error: str = ''
+
+    @classmethod
+    def failed(cls, bag: str, error: str) -> Outcome:
+        """Return the outcome of a recording that could not be aligned for want of something."""
+        sentence = about(bag, error)
+        return cls({'bag': bag, 'aligned': False, 'error': sentence}, error=sentence)
+
+    @classmethod
+    def lost(cls, bag: str, error: Exception) -> Outcome:
+        """Return the outcome of a recording whose process is gone."""
+        return cls.failed(bag, f'a process died on the way ({type(error).__name__}), perhaps for '
+                               'want of memory; --jobs 1 takes less')
+
+
+def process(task: Task, read_ahead: bool = False,
+            progress: Callable[[float], None] | None = None) -> Outcome:
+    """Replay one recording and write its files; whatever the user can put right is an error."""
+    from ins_align.offline import replay
+    from ins_align.recordings import BagError
+    from ins_align.report import summary
+
+    def named(error: object) -> str:
+        return str(error).replace(str(task.arguments['path']), task.name)
+
+    try:
+        result = replay(**task.arguments, progress=progress, read_ahead=read_ahead)
+        if task.results:
+            from ins_align.recordings.results_bag import write_results
+            write_results(result, task.results)
+        result = dataclasses.replace(result, bag=task.name)
+        if task.csv:
+            write_whole(task.csv, lambda file: file.write(result.to_csv().encode()))
+        if task.plot:
+            write_whole(task.plot, partial(_draw, result, Path(task.plot).suffix.lower()))
+    except BagError as error:
+        return Outcome.failed(task.name, named(error))
+    except BrokenProcessPool as error:
+        return Outcome.lost(task.name, error)
+    except OSError as error:
+        return Outcome.failed(task.name, f'cannot write {error.filename}: {error.strerror}')
+    warnings = tuple(about(task.name, named(text)) for text in result.warnings)
+    return Outcome(result.to_json(), summary(result), warnings)
+
+
+def _draw(result: Result, suffix: str, file: IO[bytes]) -> None:
+    if suffix == PAGE_SUFFIX:
+        from ins_align.page import page
+        file.write(page(result).encode())
+    else:
+        from ins_align.report import plot, save_figure
+        save_figure(plot(result), file, suffix)
+
+
+def survey(bag: str) -> Outcome:
+    """Tell what a recording holds."""
+    from ins_align.recordings import BagError
+    from ins_align.recordings.info import describe, inspect
+
+    try:
+        info = inspect(bag)
+    except BagError as error:
+        return Outcome({'bag': bag, 'error': about(bag, str(error))}, error=about(bag, str(error)))
+    return Outcome(info.to_json(), describe(info),
+                   tuple(about(bag, warning) for warning in info.warnings))
+
+
 def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any]) -> None:
     """
-    Write a file whole or not at all.
-
-    Parameters
-    ----------
-    path : path
-        To be made or replaced.
-    write : callable
-        Gets the open file. If it raises, `path` is as it was before.
+    Write a file whole or not at all, with a function that gets it open.
 
     A link stays one, to a file that is replaced. What is there and is no file is not replaced.
-
     """
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():
@@ -72,16 +158,10 @@ def labels(bags: Sequence[str]) -> list[str]:
     return found
 
 
-def with_label(path: str | None, label: str) -> str | None:
+def with_label(path: str, label: str) -> str:
     """Put the name of a recording into that of a file."""
-    if not path or not label or not Path(path).name:
-        return path
-    return str(Path(path).with_stem(f'{Path(path).stem}_{label}'))
-
-
-def absolute(path: str | None, label: str) -> str | None:
-    """Return the same as it is named from any folder."""
-    return path and os.path.abspath(with_label(path, label) or '')
+    return str(Path(path).with_stem(f'{Path(path).stem}_{label}')) \
+        if label and Path(path).name else path
 
 
 def about(bag: str, text: str) -> str:

@@ -23,11 +23,10 @@ from typing import Any, TYPE_CHECKING
 
 from ins_align.geometry.rotation import Array
 from ins_align.panels import Curve, OVER_TIME, Panel, Picture, picture, STATE_COLOURS
-from ins_align.results import State
+from ins_align.results import Result, State
 import numpy as np
 
 if TYPE_CHECKING:
-    from ins_align.recordings.replay import ReplayResult
     from plotly.graph_objects import Figure
 
 DASHES = {'-': 'solid', '--': 'dash', ':': 'dot'}
@@ -40,7 +39,7 @@ GAP = 0.06                              # between panels, as a part of the heigh
 NOTE_WIDTH = 80                         # characters
 
 
-def page(result: ReplayResult) -> str:
+def page(result: Result) -> str:
     """Return the page of a recording, HTML."""
     html: str = page_figure(result).to_html(
         include_plotlyjs=True, default_height='max(97vh, 900px)',
@@ -48,7 +47,7 @@ def page(result: ReplayResult) -> str:
     return html
 
 
-def page_figure(result: ReplayResult) -> Figure:
+def page_figure(result: Result) -> Figure:
     """Draw the picture of a recording, with its states and the reasons for them above."""
     from plotly.graph_objects import Figure
 
@@ -85,7 +84,7 @@ def _literal(text: str) -> str:
     return escape(text, quote=False)
 
 
-def _states(result: ReplayResult, shown: Picture) -> tuple[Panel, dict[str, Any]]:
+def _states(result: Result, shown: Picture) -> tuple[Panel, dict[str, Any]]:
     """Return the states over time, with their reasons where they change, and their axis."""
     changes = result.changes
     present = [state for state in State if state in {change.state for change in changes}]

@@ -19,15 +19,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from ins_align.geometry.rotation import Array
 from ins_align.recordings import one_line
-from ins_align.results import Epoch, State
+from ins_align.results import Epoch, Result, State
 import numpy as np
-
-if TYPE_CHECKING:
-    from ins_align.recordings.replay import ReplayResult
 
 # Okabe and Ito's palette, which the colour-blind can tell apart.
 STATE_COLOURS = {
@@ -116,7 +113,7 @@ class Picture:
     spans: list[Span]
 
 
-def picture(result: ReplayResult) -> Picture:
+def picture(result: Result) -> Picture:
     """
     Return what a picture of a recording shows.
 
@@ -157,7 +154,7 @@ def declared_spans(epochs: Sequence[Epoch], state: State = State.ALIGNED,
     return spans
 
 
-def state_in_words(result: ReplayResult) -> str:
+def state_in_words(result: Result) -> str:
     """Return the state at the end, and when it was declared, s since the first t0."""
     state = result.status.state
     spans = declared_spans(result.epochs)
@@ -173,7 +170,7 @@ class _Series:
     drawn across.
     """
 
-    def __init__(self, result: ReplayResult) -> None:
+    def __init__(self, result: Result) -> None:
         epochs = [epoch for epoch in result.epochs if not epoch.dry]
         pairs = [(epoch, epoch.initial, epoch.current) for epoch in epochs
                  if epoch.current is not None and epoch.initial is not None]
@@ -219,7 +216,7 @@ def _broken_at_wraps(angle: Array, *arrays: Array) -> Iterator[Array]:
     return (np.insert(array, wraps, np.nan) for array in arrays)
 
 
-def _angles(label: str, series: _Series, result: ReplayResult,
+def _angles(label: str, series: _Series, result: Result,
             lines: tuple[tuple[int, str, str], ...]) -> Panel:
     """Return angles with the reference, and as they were declared: at their t0."""
     if not len(series.time):
@@ -235,9 +232,9 @@ def _angles(label: str, series: _Series, result: ReplayResult,
             angle = series.reference[:, column]
             curves.append(Curve('reference', 'black', *_broken_at_wraps(angle, series.time, angle),
                                 '--', 0.8))
-    declared, start_ns = result.declared, result.first_t0_ns
-    if declared is not None and start_ns is not None:
-        time = np.array([(declared.stamp_ns - start_ns) * 1e-9])
+    declared = result.declared
+    if declared is not None:
+        time = np.array([result.t_s(declared.stamp_ns)])
         angles = declared.roll_deg, declared.pitch_deg, declared.yaw_deg
         level, up = max(declared.sigma_deg[:2]), declared.sigma_deg[2]
         for column, _, _ in lines:
@@ -262,7 +259,7 @@ def _level(name: str, colour: str, time: Array, value: float, style: str) -> Cur
     return Curve(name, colour, ends, np.full(2, value), style, 0.8)
 
 
-def _sigmas(series: _Series, result: ReplayResult) -> Panel:
+def _sigmas(series: _Series, result: Result) -> Panel:
     curves = []
     config, first = result.config, series.initial_sigma
     for column, name, colour, at_t0, threshold in (
@@ -276,8 +273,8 @@ def _sigmas(series: _Series, result: ReplayResult) -> Panel:
     return Panel('1 sigma (deg)', curves, log=True)
 
 
-def _innovations(series: _Series, result: ReplayResult) -> Panel:
-    kind = 'velocity' if result.topics.velocity is not None else 'position'
+def _innovations(series: _Series, result: Result) -> Panel:
+    kind = 'velocity' if result.topics and result.topics.velocity else 'position'
     label = f'innovation of the\n{kind} (sigma)'
     if not np.isfinite(series.innovations).any():
         return Panel(label, [])
@@ -324,7 +321,7 @@ def _errors(series: _Series, errors: Array) -> Panel:
     return Panel(label, curves, (-limit, limit))
 
 
-def _track(result: ReplayResult) -> Panel:
+def _track(result: Result) -> Panel:
     """Return the fixes by the state at each."""
     track = result.track[np.isfinite(result.track).all(axis=1)]
     if not len(track):

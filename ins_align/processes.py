@@ -11,13 +11,18 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Processes that work for this one, and the threads that each may take."""
+"""
+Processes that work for this one, here or on a Dask cluster.
+
+Tasks by the dozen, in order, and one that is some steps ahead; and the threads each may take.
+"""
 
 from __future__ import annotations
 
+import asyncio
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 import multiprocessing
@@ -30,6 +35,11 @@ T = TypeVar('T')
 VARIABLES = ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'OMP_NUM_THREADS')
 # What `run_ahead` produces before it is asked for; more would only take memory.
 AHEAD = 3
+CONNECT_TIMEOUT = 10.0  # s, to the scheduler of a Dask cluster
+
+
+class ClusterError(RuntimeError):
+    """A Dask cluster that cannot be used; the text says why in one sentence."""
 
 
 def processors() -> int:
@@ -67,23 +77,99 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
+def run_all(function: Callable[..., T], tasks: Sequence[Any], jobs: int,
+            progress: Callable[[float], None]) -> Iterator[T | Exception]:
+    """
+    Do tasks in so many processes; yield in their order what a function returns of each.
+
+    One job is this process; where there are two for each task, one of them reads ahead: the
+    function has the options `read_ahead` and `progress`, which is called with its share. That of
+    all is called with the number of tasks done. Where the process of a task is gone, the
+    exception that says so takes the place of what it should have returned.
+    """
+    if jobs == 1 or len(tasks) == 1:
+        for index, task in enumerate(tasks):
+            yield function(task, read_ahead=jobs > 1,
+                           progress=lambda part: progress(index + part))
+            progress(index + 1.0)
+        return
+    executor = pool(min(jobs, len(tasks)))
+    try:
+        yield from _in_order(executor, function, tasks, progress, BrokenProcessPool,
+                             read_ahead=jobs >= 2 * len(tasks))
+    except BaseException:
+        for child in multiprocessing.active_children():
+            child.terminate()
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def run_on_cluster(function: Callable[..., T], tasks: Sequence[Any], address: str,
+                   progress: Callable[[float], None]) -> Iterator[T | Exception]:
+    """
+    Do tasks on a Dask cluster, otherwise as `run_all`; a ClusterError says what is missing.
+
+    The workers read and write the files: they need the same folders as this machine. What a worker
+    that dies had in hand, another one does again; files are replaced as a whole.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise ClusterError('--dask needs Dask, which is not installed: '
+                           'pip install distributed') from None
+    try:
+        # A client by itself waits for a stranger for ever.
+        asyncio.run(asyncio.wait_for(_ask_scheduler(address), CONNECT_TIMEOUT))
+        client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
+    except Exception as error:  # strangers answer all kinds of things
+        reason = f'{type(error).__name__}: {error}'.partition('\n')[0].rstrip(': ')
+        raise ClusterError(f'no Dask scheduler answers at {address} ({reason}); an address is '
+                           'like tcp://localhost:8786') from None
+    with client, client.get_executor() as executor:
+        yield from _in_order(executor, function, tasks, progress, Exception)
+
+
+def _in_order(executor: Executor, function: Callable[..., T], tasks: Sequence[Any],
+              progress: Callable[[float], None], lost: type[Exception], **options: Any,
+              ) -> Iterator[T | Exception]:
+    """Yield what comes of tasks; `lost` says that whoever worked on one is gone."""
+    futures = [executor.submit(function, task, **options) for task in tasks]
+    try:
+        for index, future in enumerate(futures):
+            try:
+                yield future.result()
+            except lost as error:
+                yield error
+            progress(index + 1.0)
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+async def _ask_scheduler(address: str) -> None:
+    """Raise whatever tells that there is no scheduler."""
+    from distributed import Security
+    from distributed.comm import get_address_host_port
+    from distributed.core import rpc
+
+    get_address_host_port(address)  # there is a port
+    arguments = Security().get_connection_args('client')
+    async with rpc(address, connection_args=arguments) as scheduler:
+        if 'workers' not in await scheduler.identity():
+            raise OSError('it is no scheduler')
+
+
 def run_ahead(function: Callable[..., Generator[T, None, None]], *arguments: Any) -> Iterator[T]:
     """
     Yield what a generator yields in another process, which is some items ahead.
 
-    Parameters
-    ----------
-    function : callable
-        Gives the generator; it, the arguments and what is yielded must be picklable.
-    *arguments
-        Of the function.
+    The function that gives the generator, its arguments and what is yielded must be picklable.
 
     Raises
     ------
     BrokenProcessPool
-        If that process is killed.
-    Exception
-        Whatever the generator raises.
+        If that process is killed; otherwise whatever the generator raises.
 
     """
     with pool(1) as executor:

@@ -16,13 +16,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import itertools
 import math
+import shutil
+import textwrap
 from typing import Any, IO, TYPE_CHECKING
 
 from ins_align.panels import Panel, picture, Span, state_in_words
+from ins_align.results import Result
 
 if TYPE_CHECKING:
-    from ins_align.recordings.replay import ReplayResult
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -34,20 +37,8 @@ def format_table(rows: Sequence[Sequence[Any]], header: Sequence[str] = (),
     """
     Align columns of text: the first to the left, all others to the right.
 
-    Parameters
-    ----------
-    rows : sequence of rows
-        Cells are text; floats get four significant digits, None is a dash.
-    header : sequence of str, optional
-        Names of the columns.
-    indent : str, optional
-        In front of every line.
-
-    Returns
-    -------
-    str
-        Without a newline at the end.
-
+    Cells are text; floats get four significant digits, None is a dash. An indent is in front of
+    every line; there is no newline at the end.
     """
     cells = [[_cell(cell) for cell in row] for row in rows]
     if header:
@@ -71,19 +62,18 @@ def _cell(value: Any) -> str:
     return str(value)
 
 
-def summary(result: ReplayResult) -> str:
+def summary(result: Result) -> str:
     """Return the table that ``ins_align replay`` prints of a recording."""
     status = result.status
-    lines = [result.bag, f'  {state_in_words(result)}: {status.reason}']
-    lines += _list_of_changes(result)
+    lines = [result.bag, *_wrapped(f'{state_in_words(result)}: {status.reason}', '  '),
+             *_list_of_changes(result)]
     declared = None if status.initial is None else result.declared
-    attitudes = [('declared', declared), ('initial', status.initial), ('final', status.current)]
-    start_ns = result.first_t0_ns or 0
     rows = []
-    for name, attitude in attitudes:
+    for name, attitude in (
+            ('declared', declared), ('initial', status.initial), ('final', status.current)):
         if attitude is None:
             continue
-        row = [name, f'{(attitude.stamp_ns - start_ns) * 1e-9:.1f}']
+        row = [name, f'{result.t_s(attitude.stamp_ns):.1f}']
         row += [f'{angle:.3f}' for angle in (
             attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg, attitude.heading_deg)]
         row += [f'{sigma:.3f}' for sigma in attitude.sigma_deg]
@@ -97,26 +87,34 @@ def summary(result: ReplayResult) -> str:
         if result.reference is not None:
             header += ['error roll', 'pitch', 'yaw']
         lines += ['', format_table(rows, header, '  '),
-                  f'  all times since the first t0, stamp {start_ns * 1e-9:.3f} s; declared: '
+                  '  all times since the first t0, stamp '
+                  f'{(result.first_t0_ns or 0) * 1e-9:.3f} s; declared: '
                   'at its t0, as the node publishes it', '', _nuisance_table(result)]
     counts = ', '.join(f'{name} {count}' for name, count in sorted(status.counts.items()) if count)
     return '\n'.join([*lines, '', f'  counts: {counts or "nothing read"}'])
 
 
-def _list_of_changes(result: ReplayResult) -> list[str]:
-    """Return a line for each change of the state, of many for the first and the last."""
-    lines = [f'  {change.t_s:8.1f} s  {change.state.value}: {change.reason}'
-             for change in result.changes]
-    if len(lines) < 2:
+def _list_of_changes(result: Result) -> list[str]:
+    """Tell each change of the state, of many the first and the last."""
+    told = [_wrapped(f'{change.state.value}: {change.reason}', f'  {change.t_s:8.1f} s  ')
+            for change in result.changes]
+    if len(told) < 2:
         return []  # what it says is the state at the end
-    left_out = len(lines) - 2 * CHANGES_AT_ENDS
+    left_out = len(told) - 2 * CHANGES_AT_ENDS
     if left_out > 1:
-        lines[CHANGES_AT_ENDS:-CHANGES_AT_ENDS] = [
-            f'{"":13}... {left_out} more, all of them in --json']
-    return ['', *lines]
+        told[CHANGES_AT_ENDS:-CHANGES_AT_ENDS] = [
+            [f'{"":14}... {left_out} more, all of them in --json']]
+    return ['', *itertools.chain(*told)]
 
 
-def _nuisance_table(result: ReplayResult) -> str:
+def _wrapped(text: str, begin: str) -> list[str]:
+    """Break a sentence into lines as wide as the terminal, of which the others are indented."""
+    return textwrap.wrap(
+        text, max(shutil.get_terminal_size().columns, 2 * len(begin)), initial_indent=begin,
+        subsequent_indent=' ' * (len(begin) + 2), break_long_words=False, break_on_hyphens=False)
+
+
+def _nuisance_table(result: Result) -> str:
     status = result.status
     rows = []
     for name, scale, values, stds in (
@@ -149,7 +147,7 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def plot(result: ReplayResult) -> Figure:
+def plot(result: Result) -> Figure:
     """Draw the picture of a recording."""
     shown = picture(result)
     figure = new_figure(16.0, 11.0)

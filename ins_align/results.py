@@ -13,17 +13,29 @@
 # limitations under the License.
 """What an alignment yields: its state, attitudes, epochs, events, the status."""
 
-from collections.abc import Iterable
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+import dataclasses
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 import io
+from itertools import pairwise
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from ins_align.config import Config
-from ins_align.geometry.rotation import Array, quaternion_from_matrix, roll_pitch_yaw
+from ins_align.geometry.rotation import (
+    Array, exp_so3, log_so3, matrix_from_quaternion, quaternion_from_matrix, roll_pitch_yaw,
+    Transform)
 import numpy as np
+
+if TYPE_CHECKING:
+    from ins_align.recordings.reader import Topics
+
+OK, WARN, ERROR = range(3)  # levels of diagnostic_msgs/DiagnosticStatus
+MAX_REFERENCE_GAP_NS = 1_500_000_000  # the reference is not interpolated over more
 
 _ATTITUDE_COLUMNS = 'qx,qy,qz,qw,sigma_e_deg,sigma_n_deg,sigma_u_deg'
 CSV_HEADER = 'stamp_ns,t_s,state,' + ','.join(
@@ -200,9 +212,9 @@ class Nuisance:
                    config.gnss_delay, config.gnss_delay_std)
 
 
-@dataclass(frozen=True)
-class Status:
-    """The aligner's state in numbers; see the attributes' names and units."""
+@dataclass(frozen=True, kw_only=True)
+class Status(Nuisance):
+    """The aligner's state in numbers: stamps and times, attitudes, estimates, counts."""
 
     state: State
     reason: str
@@ -211,15 +223,50 @@ class Status:
     time_to_align_s: float | None
     initial: Attitude | None
     current: Attitude | None
-    gyro_bias: Array
-    gyro_bias_std: Array
-    accel_bias: Array
-    accel_bias_std: Array
-    lever_arm: Array
-    lever_arm_std: Array
-    gnss_delay: float
-    gnss_delay_std: float
     counts: dict[str, int]
+
+
+class Reference:
+    """
+    The attitude that a recording carries to compare with.
+
+    Made of stamps, ns, and quaternions as from `Orientations.known`, at least one part, in any
+    order; of one stamp the first counts.
+    """
+
+    def __init__(self, *parts: tuple[np.ndarray, np.ndarray]) -> None:
+        stamps, quaternions = map(np.concatenate, zip(*parts))
+        self._stamps_ns, first = np.unique(stamps, return_index=True)
+        self._quaternions = quaternions[first]
+
+    def attitude_at(self, stamp_ns: int) -> Array | None:
+        """Return ``C_nb``, shape (3, 3), interpolated; None where there is none close by."""
+        after = int(np.searchsorted(self._stamps_ns, stamp_ns))
+        if after < len(self._stamps_ns) and self._stamps_ns[after] == stamp_ns:
+            return matrix_from_quaternion(self._quaternions[after])
+        if not 0 < after < len(self._stamps_ns):
+            return None
+        start, end = self._stamps_ns[after - 1:after + 1].tolist()
+        if end - start > MAX_REFERENCE_GAP_NS:
+            return None
+        C_before, C_after = matrix_from_quaternion(self._quaternions[after - 1:after + 1])
+        return exp_so3((stamp_ns - start) / (end - start) * log_so3(C_after @ C_before.T)) \
+            @ C_before
+
+    def errors_deg(self, attitude: Attitude) -> tuple[Array, Array] | None:
+        """
+        Return attitude and reference compared, degrees; None where there is no reference.
+
+        The small rotation about east, north, up that takes the attitude to the reference, shape
+        (3,), and the differences of roll, pitch, yaw, attitude less reference, shape (3,).
+        """
+        C_reference = self.attitude_at(attitude.stamp_ns)
+        if C_reference is None:
+            return None
+        C_nb = matrix_from_quaternion(attitude.quaternion_xyzw)
+        difference = roll_pitch_yaw(C_nb) - roll_pitch_yaw(C_reference)
+        return (np.degrees(log_so3(C_reference @ C_nb.T)),
+                np.degrees(np.remainder(difference + np.pi, 2.0 * np.pi) - np.pi))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,12 +281,26 @@ class Result:
         At the end.
     epochs : tuple of Epoch
         Those without GNSS, too.
+    bag : str
+        Path of the recording; empty, as is the rest, where arrays were aligned.
+    warnings : tuple of str
+    reference : Reference or None
+    topics : Topics or None
+    track : ndarray, shape (K, 3)
+        Of usable fixes: stamp, ns since the first; latitude and longitude, degrees.
+    first_fix_ns : int
 
     """
 
     config: Config
     status: Status
     epochs: tuple[Epoch, ...]
+    bag: str = ''
+    warnings: tuple[str, ...] = ()
+    reference: Reference | None = None
+    topics: Topics | None = None
+    track: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    first_fix_ns: int = 0
 
     @property
     def initial(self) -> Attitude | None:
@@ -284,10 +345,17 @@ class Result:
             return None
         return self.epochs[0].stamp_ns - round(self.epochs[0].t_s * 1e9)
 
+    def t_s(self, stamp_ns: int) -> float:
+        """Return the time of a stamp, s since the first t0, on the clock of the last epoch."""
+        if not self.epochs:
+            return 0.0
+        return self.epochs[-1].t_s - (self.epochs[-1].stamp_ns - stamp_ns) * 1e-9
+
     def to_json(self) -> dict[str, Any]:
         """Return the object that ``--json`` writes; numbers that are not finite are None."""
         status = self.status
-        return {
+        content = {
+            'bag': self.bag,
             'aligned': self.aligned,
             'state': status.state.value,
             'reason': status.reason,
@@ -296,14 +364,20 @@ class Result:
             't0': status.t0_ns,
             'time_to_align_s': status.time_to_align_s,
             'initial_attitude': attitude_json(status.initial),
-            'declared_attitude': _stamped(self.declared),
-            'final_attitude': _stamped(status.current),
+            'declared_attitude': attitude_json(self.declared, stamped=True),
+            'final_attitude': attitude_json(status.current, stamped=True),
             'gyro_bias_rad_s': _finite(status.gyro_bias),
             'accel_bias_m_s2': _finite(status.accel_bias),
             'lever_arm_m': _finite(status.lever_arm),
             'gnss_delay_s': _finite([status.gnss_delay])[0],
             'counts': dict(status.counts),
         }
+        if self.topics is not None and self.config.base_frame:
+            content['base_frame'] = self.config.base_frame
+            for name, attitude in (('initial', status.initial), ('final', status.current)):
+                content[f'base_{name}_attitude'] = attitude_json(
+                    base_attitude(attitude, self.topics.base))
+        return content
 
     def to_csv(self) -> str:
         """Return the table that ``--csv`` writes, a row per GNSS epoch."""
@@ -321,22 +395,72 @@ class Result:
         return out.getvalue()
 
 
-def _stamped(attitude: Attitude | None) -> dict[str, Any] | None:
-    values = attitude_json(attitude)
-    if attitude is None or values is None:
+def in_order_of_time(epochs: Iterable[Epoch]) -> tuple[Epoch, ...]:
+    """Let `Epoch.t_s` go on where it counts anew, since a clock was set back."""
+    given = list(epochs)
+    before_s, moved = 0.0, []
+    for last, epoch in pairwise([*given[:1], *given]):
+        if epoch.t_s < last.t_s:
+            before_s += last.t_s
+        moved.append(dataclasses.replace(epoch, t_s=before_s + epoch.t_s) if before_s else epoch)
+    return tuple(moved)
+
+
+def base_attitude(attitude: Attitude | None, base: Transform | None) -> Attitude | None:
+    """Return the attitude of the base; None where it or that of the IMU is not known."""
+    if attitude is None or base is None:
         return None
-    return {'stamp': attitude.stamp_ns, **values}
+    return dataclasses.replace(attitude, C_nb=attitude.C_nb @ base.rotation)
 
 
-def attitude_json(attitude: Attitude | None) -> dict[str, Any] | None:
+def attitude_json(attitude: Attitude | None, stamped: bool = False) -> dict[str, Any] | None:
     """Return an attitude as ``--json`` writes it."""
     if attitude is None:
         return None
     roll, pitch, yaw = _finite([attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg])
-    return {'quaternion_xyzw': _finite(attitude.quaternion_xyzw), 'roll_deg': roll,
+    return {**({'stamp': attitude.stamp_ns} if stamped else {}),
+            'quaternion_xyzw': _finite(attitude.quaternion_xyzw), 'roll_deg': roll,
             'pitch_deg': pitch, 'yaw_deg': yaw, 'sigma_deg': _finite(attitude.sigma_deg)}
 
 
 def _finite(values: Iterable[float]) -> list[float | None]:
     """Return plain numbers as JSON has them: none that are not finite."""
     return [float(value) if math.isfinite(value) else None for value in values]
+
+
+def level_of(state: State) -> int:
+    """Return the level of a state in diagnostics."""
+    return {State.ALIGNED: OK, State.FAULT: ERROR}.get(state, WARN)
+
+
+def status_values(status: Status, base_frame: str = '', base: Transform | None = None,
+                  ) -> Iterator[tuple[str, str]]:
+    """List a status, with the attitude of a base, as names and texts, angles in degrees."""
+
+    def text(value: Any) -> str:
+        return '' if value is None else ' '.join(
+            f'{number:.6g}' for number in np.atleast_1d(value))
+
+    def angles(attitude: Attitude | None) -> str:
+        return text(attitude and (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))
+
+    yield 'state', status.state.value
+    yield 'reason', status.reason
+    for name, stamp_ns in (('stamp_ns', status.stamp_ns), ('t0_ns', status.t0_ns)):
+        yield name, '' if stamp_ns is None else str(stamp_ns)
+    yield 'time_to_align_s', text(status.time_to_align_s)
+    attitudes = ('initial', status.initial), ('current', status.current)
+    for name, attitude in attitudes:
+        yield f'{name}_roll_pitch_yaw_deg', angles(attitude)
+        yield f'{name}_sigma_east_north_up_deg', text(attitude and attitude.sigma_deg)
+    yield 'current_heading_deg', text(status.current and status.current.heading_deg)
+    for name, unit in (('gyro_bias', 'rad_s'), ('accel_bias', 'm_s2'), ('lever_arm', 'm'),
+                       ('gnss_delay', 's')):
+        yield f'{name}_{unit}', text(getattr(status, name))
+        yield f'{name}_std_{unit}', text(getattr(status, f'{name}_std'))
+    for name, count in status.counts.items():
+        yield name, str(count)
+    if base_frame:
+        yield 'base_frame', base_frame
+        for name, attitude in attitudes:
+            yield f'base_{name}_roll_pitch_yaw_deg', angles(base_attitude(attitude, base))

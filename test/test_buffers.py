@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ins_align.gnss.buffer import GnssBuffer, PAIR_NS
 from ins_align.gnss.messages import Fix, Velocity
-from ins_align.imu.buffer import ImuBuffer, KEPT_BEFORE
+from ins_align.imu.buffer import ImuBuffer, KEPT_BEFORE, KEPT_NS
 import numpy as np
 import pytest
 
@@ -198,7 +198,7 @@ def test_an_array_of_good_samples_forgives_a_late_one_too():
 def test_forgetting_keeps_what_interpolation_needs():
     buffer, _ = imu_buffer()
     fill(buffer, range(0, 1000 * MS, 10 * MS))
-    buffer.forget_before(505 * MS)
+    buffer.forget_before(505 * MS + KEPT_NS)
     kept = held(buffer)
     assert kept == list(range((510 - 10 * KEPT_BEFORE) * MS, 1000 * MS, 10 * MS))
     assert 490 * MS in kept and 500 * MS in kept

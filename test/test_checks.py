@@ -19,8 +19,8 @@ from ins_align.checks import BEYOND_THE_POLES, degrees_fault, exchange_fault, In
 from ins_align.config import Config
 from ins_align.gnss.messages import Fix, Velocity
 from ins_align.gnss.motion import Series
+from ins_align.offline import replay
 from ins_align.recordings.info import describe, inspect
-from ins_align.recordings.replay import replay
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
 import pytest

@@ -191,7 +191,7 @@ def _killed(request):
 
 
 def test_a_process_that_is_killed_while_it_reads(flight, monkeypatch, capsys):
-    monkeypatch.setattr('ins_align.recordings.replay.read', _killed)
+    monkeypatch.setattr('ins_align.recordings.reader.read', _killed)
     assert main(['replay', str(flight), '--jobs', '2']) == 2
     error = capsys.readouterr().err
     assert error.count('\n') == 1 and 'a process died on the way' in error
@@ -384,9 +384,9 @@ def test_real_recordings(tmp_path, capsys, name, method):
 
 
 def test_failed_output_leaves_the_old_file(flight, tmp_path, capsys, monkeypatch):
-    from ins_align.recordings import replay
+    from ins_align.results import Result
     (tmp_path / 'a.csv').write_text('old')
-    monkeypatch.setattr(replay.ReplayResult, 'to_csv', lambda self: 1 / 0)
+    monkeypatch.setattr(Result, 'to_csv', lambda self: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(['replay', str(flight), '--csv', str(tmp_path / 'a.csv')])
     assert (tmp_path / 'a.csv').read_text() == 'old'

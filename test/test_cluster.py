@@ -91,7 +91,7 @@ def test_a_worker_dies(cluster, flight, tmp_path, capsys, monkeypatch):
 
 
 def test_no_cluster_there(flight, capsys, monkeypatch):
-    monkeypatch.setattr('ins_align.batch.CONNECT_TIMEOUT', 0.5)
+    monkeypatch.setattr('ins_align.processes.CONNECT_TIMEOUT', 0.5)
     assert main(['replay', str(flight), '--dask', 'tcp://127.0.0.1:9']) == 2
     error = capsys.readouterr().err
     assert 'no Dask scheduler answers at tcp://127.0.0.1:9' in error
@@ -100,7 +100,7 @@ def test_no_cluster_there(flight, capsys, monkeypatch):
 
 @pytest.mark.parametrize('greeting', [b'', b'SSH-2.0-OpenSSH_9.6\r\n'])
 def test_something_else_is_there(flight, capsys, monkeypatch, greeting):
-    monkeypatch.setattr('ins_align.batch.CONNECT_TIMEOUT', 1.0)
+    monkeypatch.setattr('ins_align.processes.CONNECT_TIMEOUT', 1.0)
     callers = []
     with socket.create_server(('127.0.0.1', 0)) as server:
 

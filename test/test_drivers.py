@@ -21,9 +21,9 @@ from types import SimpleNamespace
 from ins_align.config import Config
 from ins_align.gnss.drivers import NoTimeError, receiver_from_msg, RECEIVERS
 from ins_align.gnss.messages import MessageError
+from ins_align.offline import replay
 from ins_align.recordings import BagError
 from ins_align.recordings.info import inspect
-from ins_align.recordings.replay import replay
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
 import pytest

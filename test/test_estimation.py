@@ -23,16 +23,15 @@ from ins_align.aligner import State
 from ins_align.config import Config
 from ins_align.estimation.bank import Bank, RESOLVED_STD
 from ins_align.estimation.filter import Filters
-from ins_align.estimation.linearised import DELAY, FIRST, GYRO, linearised, PHI, PHI0
+from ins_align.estimation.linearised import linearised
 from ins_align.estimation.rivals import SIGNS
+from ins_align.estimation.states import DELAY, FIRST, GYRO, PHI, PHI0
 from ins_align.experiments.dense import bound
 from ins_align.geometry.rotation import exp_so3, log_so3, skew
 from ins_align.gnss.antenna import Antenna
 from ins_align.gnss.buffer import GnssBuffer
 from ins_align.imu.buffer import ImuBuffer
-from ins_align.imu.cutter import ImuCutter
-from ins_align.imu.intervals import SensorErrors
-from ins_align.imu.preintegration import Noise
+from ins_align.imu.preintegration import Noise, SensorErrors
 from ins_align.imu.recent import recent_motion
 from ins_align.results import Attitude
 import numpy as np
@@ -160,7 +159,8 @@ def filters(C, weight=None):
     std = np.concatenate([np.full(3, 0.03), np.ones(3), np.full(3, 5.0), np.full(3, 0.03),
                           np.full(SIZE, 0.01)])
     start = Filters(C.copy(), np.array([3.0, 1.0, 0.0]), np.zeros(SIZE), np.zeros(len(C), int),
-                    np.diag(std ** 2)[None], np.zeros((1, FIRST + SIZE)))
+                    np.diag(std ** 2)[None], np.zeros((1, FIRST + SIZE)), np.zeros(1),
+                    np.ones(1, bool))
     if weight is not None:
         start.weight = np.log(weight)
     return start
@@ -192,7 +192,7 @@ def prepared(s, *, velocity=True, **changes):
     """Return a bank at its t0, the epochs behind it and the IMU intervals before each."""
     config = config_for(s, **changes)
     counts = Counter()
-    samples, messages = ImuBuffer(0, counts), GnssBuffer(0, counts)
+    samples, messages = ImuBuffer(0, counts, config.imu_noise), GnssBuffer(0, counts)
     delay_ns = round(config.gnss_delay * 1e9)
     for k in range(len(s.gnss_stamps_ns)):
         fix, measured = s.fix(k), s.velocity_measurement(k)
@@ -202,9 +202,8 @@ def prepared(s, *, velocity=True, **changes):
     samples.add_many(s.imu_stamps_ns, s.gyro, s.accel)
     antenna = Antenna(config, counts)
     first, *epochs = map(antenna.epoch, messages.release(samples.settled_ns(True), True))
-    cutter = ImuCutter(config.imu_noise, samples, counts)
-    bank = Bank(config, first, cutter.start(first.stamp_ns).integrated(), not velocity)
-    steps = cutter.cut([epoch.stamp_ns for epoch in epochs], [0.0] * len(epochs))
+    bank = Bank(config, first, samples.start(first.stamp_ns).integrated(), not velocity)
+    steps = samples.cut([epoch.stamp_ns for epoch in epochs], [0.0] * len(epochs))
     return bank, epochs, steps.integrated()
 
 
@@ -325,7 +324,7 @@ def test_weights_and_covariances_stay_what_they_are():
             continue
         many.append(len(left.C))
         assert np.array_equal(np.unique(left.rival), left.ids)
-        total = np.bincount(left.place, np.exp(left.weight))
+        total = np.bincount(left.rival, np.exp(left.weight))[left.ids]
         # What is dropped is less than a millionth each.
         assert np.all(np.abs(total - 1.0) < 180e-6)
         assert np.allclose(left.P, left.P.swapaxes(1, 2), rtol=0.0, atol=1e-9 * left.P.max())
@@ -403,6 +402,12 @@ def test_wrong_signs_are_named_and_not_declared(scenario, rival):
     status = aligner.status()
     assert status.state is State.ALIGNING
     assert rival.better in status.reason and rival.advice in status.reason
+
+
+@pytest.mark.parametrize('coarse', [{'quantum': (0.01, 0.0)}, {'dead_band': (0.0087, 0.0)}])
+def test_coarse_gyros_are_no_wrong_axes(coarse):
+    _, epochs = aligned(simulated('flight', seed=7, duration=60.0, stand_still=20.0, **coarse))
+    assert not [epoch for epoch in epochs if 'reversed' in epoch.reason]
 
 
 @pytest.mark.parametrize('scenario', ('flight', 'car', 'hover'))

@@ -16,7 +16,7 @@
 from functools import lru_cache
 
 from alignment import cut_at, integrate
-from ins_align.estimation import formula
+from ins_align.estimation import formula, moments as q_method
 from ins_align.estimation.track import InertialTrack
 from ins_align.experiments.dense import bound
 from ins_align.experiments.note import exact_lever_remainder
@@ -76,7 +76,7 @@ FORMS = {
 
 def aligned(simulation, form, lever=LEVER):
     nuisance, pair = FORMS[form]
-    moments = formula.AttitudeMoments(nuisance)
+    moments = q_method.AttitudeMoments(nuisance)
     for sides in run(simulation, lever):
         moments.add(*pair(*sides))
     return moments.solve()
@@ -249,7 +249,7 @@ def test_q_method_is_the_least_squares_attitude(seed):
     truth = Rotation.random(random_state=seed)
     a = random.standard_normal((30, 3)) * [10.0, 5.0, 1.0]
     s = truth.apply(a) + 0.3 * random.standard_normal((30, 3))
-    C, residual = formula.attitude_from_moments(s.T @ a, float(np.sum(s * s) + np.sum(a * a)))
+    C, residual = q_method.attitude_from_moments(s.T @ a, float(np.sum(s * s) + np.sum(a * a)))
     expected, rssd = Rotation.align_vectors(s, a)
     assert angle_deg(C, expected.as_matrix()) < 1e-6
     assert residual == pytest.approx(rssd ** 2, rel=1e-9)
@@ -259,7 +259,7 @@ def test_q_method_is_the_least_squares_attitude(seed):
 def test_q_method_on_vectors_of_half_a_turn():
     truth = np.diag([1.0, -1.0, -1.0])
     a = np.eye(3)
-    C, residual = formula.attitude_from_moments((a @ truth.T).T @ a, 6.0)
+    C, residual = q_method.attitude_from_moments((a @ truth.T).T @ a, 6.0)
     assert np.allclose(C, truth, atol=1e-12) and residual < 1e-12
 
 
@@ -273,7 +273,7 @@ def test_free_start_is_minimised_over(nuisance):
     basis = np.vander(time, nuisance, increasing=True)
     s = (truth.apply(a) + basis @ random.standard_normal((nuisance, 3)) * 20.0
          + 0.1 * random.standard_normal((20, 3)))
-    moments = formula.AttitudeMoments(nuisance)
+    moments = q_method.AttitudeMoments(nuisance)
     for k in range(20):
         moments.add(s[k], a[k], tuple(basis[k]))
 
@@ -299,7 +299,7 @@ def test_moments_of_hundreds_of_kilometres_keep_a_centimetre():
     truth = Rotation.from_rotvec([0.1, 0.2, -1.0])
     a = np.column_stack([50.0 * np.sin(0.1 * time), 50.0 * np.cos(0.07 * time), 4.9 * time ** 2])
     s = truth.apply(a) + 30.0 * time[:, None] + 0.02 * random.standard_normal(a.shape)
-    moments = formula.AttitudeMoments(2)
+    moments = q_method.AttitudeMoments(2)
     for k in range(time.size):
         moments.add(s[k], a[k], (1.0, time[k]))
     C, _, _ = moments.solve()

@@ -29,10 +29,9 @@ import sys
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from ins_align.config import Config, config_from_mapping, ConfigError, load_params
-from ins_align.recordings import BagError
+from ins_align.offline import replay
+from ins_align.recordings import BagError, ZSTD_MODULE
 from ins_align.recordings.bag import Bag
-from ins_align.recordings.limits import ZSTD_MODULE
-from ins_align.recordings.replay import replay
 import lz4.frame
 import numpy as np
 import pytest
@@ -117,7 +116,7 @@ def test_parameter_files(tmp_path_factory, data):
 LIMITED = """
 import resource, sys
 from ins_align.cli import main
-import ins_align.batch
+import ins_align.offline, ins_align.recordings.reader, ins_align.report
 resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[1]),) * 2)
 sys.exit(main(['replay', *sys.argv[2:]]))
 """

@@ -17,7 +17,6 @@ from collections import Counter
 
 from ins_align.config import ImuNoise
 from ins_align.imu.buffer import ImuBuffer
-from ins_align.imu.cutter import ImuCutter
 from ins_align.imu.noise import GAP_ANGULAR_ACCELERATION, GAP_JERK
 import numpy as np
 import pytest
@@ -31,13 +30,12 @@ EPOCHS = [2 * SECOND, 3 * SECOND + 4_000_000, 4 * SECOND]
 def cut(stamps_ns, samples, epochs=EPOCHS, drift=0.0):
     """Cut samples at the epochs behind the first one; return what comes of it, and the counts."""
     counts = Counter()
-    buffer = ImuBuffer(0, counts)
-    cutter = ImuCutter(ImuNoise(*STATED, gyro_bias_std=0.0, accel_bias_std=0.0), buffer, counts)
+    buffer = ImuBuffer(0, counts, ImuNoise(*STATED, gyro_bias_std=0.0, accel_bias_std=0.0))
     buffer.add_many(stamps_ns, samples[:, :3], samples[:, 3:])
     buffer.consolidate()
-    cutter.check(int(epochs[-1]))
-    cutter.start(epochs[0])
-    return cutter.cut(epochs[1:], [drift] * (len(epochs) - 1)), counts
+    buffer.check(int(epochs[-1]))
+    buffer.start(epochs[0])
+    return buffer.cut(epochs[1:], [drift] * (len(epochs) - 1)), counts
 
 
 def steady(step=STEP, seconds=5.0):

@@ -22,11 +22,11 @@ from ins_align.cli import main
 from ins_align.config import Config
 from ins_align.gnss.motion import (
     find_manoeuvres, Series, track, velocity_frame, without_wild_positions)
+from ins_align.offline import replay
 from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import deserialize
 from ins_align.recordings.info import describe, inspect
-from ins_align.recordings.replay import replay
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
 import pytest

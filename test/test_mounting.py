@@ -19,8 +19,8 @@ from ins_align.cli import main
 from ins_align.config import Config
 from ins_align.geometry.rotation import log_so3, matrix_from_quaternion, matrix_from_rpy
 from ins_align.mounting import find_mounting, FixedFrames
+from ins_align.offline import replay
 from ins_align.recordings import BagError
-from ins_align.recordings.replay import replay
 from ins_align.results import Severity
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np

@@ -19,8 +19,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 CORE = ('aligner', 'config', 'results', 'geometry/*', 'imu/*', 'gnss/*', 'estimation/*',
-        'recordings/__init__', 'recordings/bag', 'recordings/decode', 'recordings/limits',
-        'recordings/reader', 'recordings/salvage')
+        'recordings/__init__', 'recordings/bag', 'recordings/decode', 'recordings/reader',
+        'recordings/salvage')
 
 
 @pytest.mark.linter

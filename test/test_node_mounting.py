@@ -20,7 +20,7 @@ from geometry_msgs.msg import TransformStamped
 from ins_align.config import Config, ConfigError
 from ins_align.gnss.messages import Fix
 from ins_align.ros.frames import MountingSearch
-from ins_align.ros.imu_bytes import ImuSample
+from ins_align.ros.inputs import ImuSample
 from ins_align.simulation.simulate import simulate, write_bag
 from node_harness import bag_script, Listener, play, RELIABLE, replayed, running_node
 import numpy as np

@@ -23,7 +23,7 @@ import sys
 from alignment import error_of, normalised_error, simulated
 import ins_align
 from ins_align.config import ConfigError
-from ins_align.recordings.replay import replay
+from ins_align.offline import replay
 from ins_align.results import State
 from ins_align.simulation.simulate import write_bag
 import numpy as np

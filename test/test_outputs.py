@@ -155,7 +155,7 @@ NASTY = f'../../{MARK}; $(touch {MARK}) `touch {MARK}`; __import__("os").system(
 WATCHED = f"""
 import json, multiprocessing, os, sys
 from ins_align.cli import main
-import ins_align.batch, ins_align.recordings.info, ins_align.report
+import ins_align.offline, ins_align.recordings.info, ins_align.report
 import matplotlib.figure, matplotlib.backends.backend_agg
 if 'fork' in multiprocessing.get_all_start_methods():
     multiprocessing.set_start_method('fork')

@@ -23,8 +23,8 @@ import sys
 
 from ins_align.cli import main
 from ins_align.config import Config
+from ins_align.offline import replay
 from ins_align.page import MAX_MARKS, page
-from ins_align.recordings.replay import replay
 from ins_align.report import plot
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np

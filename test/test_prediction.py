@@ -13,7 +13,9 @@
 # limitations under the License.
 """Attitudes carried on with gyros: against SciPy's rotations, one by one and many at once."""
 
+from ins_align.geometry.earth import EARTH_RATE
 from ins_align.imu.prediction import Follower, MAX_GAP_NS, Prediction
+from ins_align.results import Attitude
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -30,7 +32,14 @@ COVARIANCE = np.array([[4.0, 0.5, 0.2], [0.5, 3.0, -0.1], [0.2, -0.1, 9.0]]) * 1
 
 
 def prediction():
-    return Prediction(0, START.as_matrix(), COVARIANCE, BIAS, MATRIX, 2e-3, 1e-6, RATE)
+    return Prediction(Attitude(0, START.as_matrix(), COVARIANCE), BIAS, MATRIX, 1e-3, 2e-3,
+                      np.array(RATE))
+
+
+def still(stamp_ns, rate):
+    """Return the attitude with its axes in ENU, for gyros without errors."""
+    return Prediction(Attitude(stamp_ns, np.eye(3), COVARIANCE), np.zeros(3), np.zeros((3, 3)),
+                      0.0, 0.0, rate)
 
 
 def truth(count):
@@ -63,8 +72,7 @@ def test_a_rate_that_swings_is_followed():
     swing, frequency, period = 3.0, 2 * np.pi * 2.0, 0.01
     stamps = np.arange(1, 1013) * 10_000_000
     gyro = np.outer(swing * np.sin(frequency * stamps * 1e-9), [0.0, 0.6, 0.8])
-    carried = Prediction(0, np.eye(3), COVARIANCE, np.zeros(3), np.zeros((3, 3)), 0.0, 0.0,
-                         np.zeros(3))
+    carried = still(0, np.zeros(3))
     carried.carry_many(stamps, gyro)
     angle = swing / frequency * (1 - np.cos(frequency * stamps[-1] * 1e-9))
     turned = Rotation.from_quat(carried.quaternion_xyzw).as_rotvec() @ [0.0, 0.6, 0.8]
@@ -77,7 +85,7 @@ def test_covariance_grows_with_the_noise_of_the_gyros():
     assert carried.matrices()[1] == pytest.approx(COVARIANCE)
     carried.carry_many(STAMPS, GYRO)
     seconds = STAMPS[-1] * 1e-9
-    drift = 4e-6 * seconds + 1e-6 * seconds ** 2
+    drift = 4e-6 * seconds + (1e-6 + EARTH_RATE ** 2) * seconds ** 2
     assert carried.matrices()[1] == pytest.approx(COVARIANCE + drift * np.eye(3))
 
 
@@ -111,9 +119,7 @@ def test_follower_knows_which_round_of_a_loop_it_is_in():
     for _ in range(2):
         for stamp_ns in range(STEP_NS, 100 * STEP_NS, STEP_NS):
             assert follower.follow(stamp_ns, (0.0, 0.0, 1.0)) is None
-    still = Prediction(90 * STEP_NS, np.eye(3), COVARIANCE, np.zeros(3), np.zeros((3, 3)), 0.0,
-                       0.0, (0.0, 0.0, 1.0))
-    follower.adopt(still)
+    follower.adopt(still(90 * STEP_NS, np.array([0.0, 0.0, 1.0])))
     now = follower.follow(100 * STEP_NS, (0.0, 0.0, 1.0))
     assert Rotation.from_quat(now.quaternion_xyzw).as_rotvec() == pytest.approx([0, 0, 0.05])
 

@@ -16,9 +16,8 @@
 from dataclasses import replace
 
 from alignment import cut_at, integrate, nanoseconds
-from ins_align.imu.intervals import SensorErrors
 from ins_align.imu.noise import white_noise
-from ins_align.imu.preintegration import Noise, Steps
+from ins_align.imu.preintegration import Noise, SensorErrors, Steps
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp

@@ -23,10 +23,10 @@ import ins_align
 from ins_align.aligner import Aligner, Attitude
 from ins_align.config import Config
 from ins_align.geometry.rotation import exp_so3, matrix_from_rpy, quaternion_from_matrix
+from ins_align.offline import replay
 from ins_align.recordings import bag, BagError
 from ins_align.recordings.decode import Orientations
-from ins_align.recordings.replay import Reference, replay
-from ins_align.results import CSV_HEADER
+from ins_align.results import CSV_HEADER, Reference
 from ins_align.simulation.simulate import feed, simulate, write_bag
 import numpy as np
 import pytest

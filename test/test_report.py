@@ -20,17 +20,25 @@ import re
 from types import SimpleNamespace
 
 from ins_align.config import Config
+from ins_align.offline import replay
 from ins_align.outputs import write_whole
 from ins_align.panels import declared_spans, STATE_COLOURS
-from ins_align.recordings.replay import replay
+from ins_align.recordings.bag import Bag
+from ins_align.recordings.decode import deserialize
 from ins_align.report import format_table, plot, save_figure, summary
 from ins_align.results import State
 from ins_align.simulation.simulate import simulate, write_bag
 from matplotlib.colors import to_rgb
 import numpy as np
 import pytest
+from recordings import messages_of, write_messages
 
 DECLARED_GREEN = STATE_COLOURS[State.ALIGNED]
+
+
+@pytest.fixture(autouse=True)
+def wide_terminal(monkeypatch):
+    monkeypatch.setenv('COLUMNS', '1000')
 
 
 @pytest.fixture(scope='module')
@@ -134,6 +142,44 @@ def test_many_changes_are_cut_in_the_table_and_whole_in_json(result, count, left
     assert (lines[3] == f'... {left_out} more, all of them in --json') == bool(left_out)
     assert [change['reason'] for change in many.to_json()['changes']] == [
         f'reason {k}' for k in range(count)]
+
+
+@pytest.mark.parametrize('columns', [60, 100])
+def test_long_reasons_are_wrapped(result, monkeypatch, columns):
+    monkeypatch.setenv('COLUMNS', str(columns))
+    reason = 'a sentence that goes on and on, as sentences may; ' * 5
+    text = summary(with_states(result, ('ALIGNING', 'short', ''), ('ALIGNED', reason, '')))
+    told = text[text.index('\n\n') + 2:text.index('attitude, deg')].rstrip().splitlines()
+    assert told[0].split() == ['0.0', 's', 'ALIGNING:', 'short']
+    assert ' '.join(' '.join(told[1:]).split()) == f'1.0 s ALIGNED: {reason.strip()}'
+    assert len(told) > 3 and max(map(len, told)) <= columns
+    start = told[1].index('ALIGNED')
+    assert all(line[:start + 2].isspace() for line in told[2:])
+
+
+def test_times_go_on_where_the_clock_is_set_back(tmp_path):
+    """A recording that was played twice, one after the other."""
+    truth = simulate('flight', seed=1, duration=20.0)
+    write_bag(truth, tmp_path / 'flight')
+    with Bag(tmp_path / 'flight') as bag:
+        topics = [topic for topic in bag.topics if not topic.name.startswith('/reference')]
+        messages = [(topic.name, time, deserialize(data, topic))
+                    for topic, time, data in messages_of(bag, topics)]
+    later = round(25e9)
+    path = write_messages(tmp_path / 'twice', 'mcap', [*messages, *(
+        (name, time + later, message) for name, time, message in messages)],
+        {topic.name: topic.msgtype for topic in topics})
+    result = replay(path, Config(lever_arm=(1.0, 1.0, 1.0)))
+    assert result.status.counts['clock_jumps'] == 1
+    times = [epoch.t_s for epoch in result.epochs]
+    assert times == sorted(times) and times[-1] > 35.0
+    changed = [float(line.split()[0]) for line in changes_in(summary(result))]
+    assert len(changed) >= 4 and changed == sorted(changed)
+    again = next(change for change in result.changes if 'clock' in change.reason)
+    assert 18.0 < again.t_s < 22.0
+    row = next(line.split() for line in summary(result).splitlines()
+               if line.split()[:1] == ['final'])
+    assert float(row[1]) == pytest.approx(times[-1], abs=0.1)
 
 
 def test_summary_says_what_matters(result):

@@ -17,8 +17,8 @@ from ins_align.cli import main
 from ins_align.config import Config
 from ins_align.geometry.rotation import log_so3, matrix_from_quaternion
 from ins_align.gnss.messages import stamp_from_msg
+from ins_align.offline import replay
 from ins_align.recordings import BagError
-from ins_align.recordings.replay import replay
 from ins_align.recordings.results_bag import write_results
 from ins_align.results import State
 from ins_align.simulation.simulate import simulate, write_bag

@@ -15,9 +15,8 @@
 
 from ins_align.aligner import Aligner
 from ins_align.config import Config, ConfigError
-from ins_align.geometry.rotation import matrix_from_rpy
-from ins_align.geometry.transform import Transform
-from ins_align.recordings.replay import replay
+from ins_align.geometry.rotation import matrix_from_rpy, Transform
+from ins_align.offline import replay
 from ins_align.results import State
 from ins_align.simulation.scenarios import Motion, Scenario, SCENARIOS
 from ins_align.simulation.simulate import epochs_of, simulate, write_bag

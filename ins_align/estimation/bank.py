@@ -25,18 +25,18 @@ from typing import NamedTuple
 
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimation.declaration import Fit
-from ins_align.estimation.filter import Filters, Track
-from ins_align.estimation.linearised import (
-    DELAY, FIRST, GYRO, Linearised, linearised, MAX_DELAY, MIN_DELAY, PHI, PHI0, triads)
+from ins_align.estimation.filter import Filters
+from ins_align.estimation.linearised import linearised, MAX_DELAY, MIN_DELAY
 from ins_align.estimation.receiver import ReceiverNoise
 from ins_align.estimation.rivals import level_in_words, Parameters, Rivals, SHARE
 from ins_align.estimation.start import all_headings, HEADINGS, OPEN_POSITION, RoughAttitude, Start
+from ins_align.estimation.states import (
+    DELAY, FIRST, GYRO, Linearised, Measured, OF_VEHICLE, triads)
 from ins_align.estimation.track import InertialTrack
-from ins_align.estimation.vehicle import NOT_USED
-from ins_align.geometry.rotation import Array, exp_so3, log_so3
-from ins_align.geometry.transform import Transform
-from ins_align.gnss.messages import AntennaEpoch, velocities_of
-from ins_align.imu.intervals import Intervals, SensorErrors
+from ins_align.estimation.vehicle import NOT_USED, Vehicle
+from ins_align.geometry.rotation import Array, Transform
+from ins_align.gnss.messages import AntennaEpoch
+from ins_align.imu.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
 import numpy as np
 
@@ -50,8 +50,6 @@ MAX_SPAN = 64
 VELOCITY_STOPPED_NS, VELOCITY_BACK_NS = 10_000_000_000, 2_000_000_000
 # So many epochs in a row that do not fit show that the bank has gone astray.
 ASTRAY = 10
-# Attitudes are close when they differ by less than this (rad).
-CLOSE = 0.01
 # A heading that is known to this (rad) is resolved.
 RESOLVED_STD = 0.35
 NOTHING_NEW = np.full(3, math.nan)
@@ -80,6 +78,8 @@ class Bank:
 
     """
 
+    _inertial: InertialTrack                        # up to the last epoch, since n0 is frozen
+
     def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals, use_position: bool,
                  prior: Learnt | None = None, base: Transform | None = None) -> None:
         """Start at t0."""
@@ -99,8 +99,12 @@ class Bank:
         self.t0_ns = epoch.stamp_ns
         force = imu.gained[0, -1]
         force = STANDARD_GRAVITY * force / max(float(np.linalg.norm(force)), 1e-3)
-        self._rivals = Rivals(self._config, self._base)
-        self._known = [Parameters.of(self._config, rival, force) for rival in self._rivals.table]
+        self._rivals = rivals = Rivals(self._config)
+        self._known = [Parameters.of(self._config, rival, force) for rival in rivals.table]
+        self._vehicle: Vehicle | None = None
+        if self._config.vehicle != 'none':
+            std = np.sqrt(self._known[0].P.diagonal()[-OF_VEHICLE:])
+            self._vehicle = Vehicle(self._config, self._base, rivals.along, std)
         if prior is not None:
             self._remember(prior)
         gyro, accel = triads(self._known[0].x.size)
@@ -108,7 +112,8 @@ class Bank:
         self._reach = np.full(self._known[0].x.size, np.inf)      # of a vehicle: linear
         self._reach[:accel.stop] = np.concatenate([_REACH[:gyro.stop], _REACH[16:16 + errors]])
         self._filters: Filters | None = None
-        self._mixed: tuple[Array, Array] | None = None      # the attitudes, once asked for
+        self._mixture: tuple[Array, Array] | None = None
+        self._doubt, self._contradicted = '', False
         self._start = Start(self._config)
         self._last = epoch                          # the last epoch that was processed
         self._C_nn0 = np.eye(3)
@@ -139,14 +144,9 @@ class Bank:
         """Take epochs and the IMU intervals before each; yield each when the results are its."""
         done = 0
         while done < len(epochs):
-            if self._filters is None:
-                self._choose(epochs[done])
-                self._wait(epochs[done], imu.take(slice(done, done + 1)))
-                done += 1
-                yield epochs[done - 1]
-                continue
-            part = slice(done, done + self._left)
+            part = slice(done, done + (1 if self._filters is None else self._left))
             for epoch in self._take(epochs[part], imu.take(part)):
+                self._conclude()
                 done += 1
                 yield epoch
 
@@ -158,14 +158,19 @@ class Bank:
         how many epochs come at a time.
         """
         filters = self._filters
-        assert filters is not None
-        inertial, track = self._track_of(epochs)
+        if filters is None:
+            self._choose(epochs[0])
+            self._wait(epochs[0], imu)
+            yield epochs[0]
+            return
+        inertial = self._inertial.along(epochs, self._n0_ns)
+        measured = inertial.measured(epochs, self._use_position)
         if self._point is None:
             self._point = self._point_of(filters)
         model = self._model(filters, self._point, imu)
         for k, epoch in enumerate(epochs):
-            self._step(filters, model, k, track)
-            self._C_nn0 = track.C_n0n[k].T
+            self._step(filters, model, k, measured)
+            self._C_nn0 = inertial.C_n0n[k].T
             self._last = epoch
             self._left -= 1
             if self._in_a_row >= ASTRAY or self._drop_vehicle(filters):
@@ -178,7 +183,7 @@ class Bank:
                 self._span = 1 if self._left else min(2 * self._span, MAX_SPAN)
                 self._anchor(filters, inertial.at(k))
                 if changed and self._use_position:
-                    filters.open_position(np.zeros(3), OPEN_POSITION)
+                    filters.open_position(OPEN_POSITION)
                 yield epoch
                 return
             if k + 1 == len(epochs):
@@ -207,76 +212,66 @@ class Bank:
         self._point = None
         self._left = self._span
 
-    def _track_of(self, epochs: Sequence[AntennaEpoch]) -> tuple[InertialTrack, Track]:
-        """Return how epochs move in n0, and what the GNSS measures of it."""
-        track = self._inertial.along(epochs, self._n0_ns)
-        covariance = np.array([[epoch.velocity_covariance, epoch.position_covariance]
-                               for epoch in epochs])
-        C_n0n = track.C_n0n[:, None]
-        return track, Track(
-            np.stack([track.s_v(velocities_of(epochs)), track.s_p], axis=1),
-            C_n0n @ covariance @ C_n0n.swapaxes(-1, -2),
-            [(epoch.v_n is not None, epoch.position_measured and self._use_position)
-             for epoch in epochs], [epoch.stated for epoch in epochs], track.C_n0n,
-            track.still_v)
-
     def _point_of(self, filters: Filters) -> Array:
         """Return the parameters of the likeliest mean of each rival, with one delay for all."""
         point = filters.x[filters.lead]
-        point[:, DELAY] = np.clip(point[self._rivals.best(filters), DELAY], MIN_DELAY, MAX_DELAY)
+        point[:, DELAY] = np.clip(point[filters.best, DELAY], MIN_DELAY, MAX_DELAY)
         return point
 
     def _model(self, filters: Filters, point: Array, imu: Intervals) -> Linearised:
         """Linearise epochs."""
         return linearised(point, imu.mirrored(self._rivals.signs[filters.ids]),
                           (imu.Q + SHARE * imu.Q_excess)[:, None], self._use_position,
-                          self._rivals.base_position)
+                          None if self._vehicle is None else self._vehicle.position)
 
     def _anchor(self, filters: Filters, track: InertialTrack) -> None:
         """Freeze n0 at the last epoch that was processed; the track is there."""
         filters.turned(track.C_n0n.T, track.still_v, track.s_p)
-        self._mixed = None
         self._freeze(self._last)
 
-    def _step(self, filters: Filters, model: Linearised, k: int, track: Track) -> None:
-        self._mixed = None
+    def _step(self, filters: Filters, model: Linearised, k: int, measured: Measured) -> None:
+        """Propagate all means over the interval before epoch k, and update them."""
+        vehicle = self._vehicle
         filters.propagate(model, k)
-        vehicle = self._rivals.vehicle_after(model.duration[k])
+        due = vehicle is not None and vehicle.is_due(model.duration[k])
         self._nis, self._innovation = math.nan, NOTHING_NEW
-        if not any(track.present[k]):
+        kinds = [kind for kind, present in enumerate(measured.present[k]) if present]
+        if not kinds:
             return
+        news = []
+        for kind in kinds:
+            new = filters.update(model, k, kind, measured, self._receiver.factors(kind))
+            self._receiver.hear(kind, new.square, new.normalised, measured.stated[k][kind])
+            self._rejected[kind] += not new.taken
+            news.append(new)
         self._offered += 1
-        nis: list[float] = []
-        bad = astray = False
-        for kind, present in enumerate(track.present[k]):
-            if not present:
-                continue
-            new = filters.update(model, k, kind, track, self._receiver.factors(kind))
-            best = self._rivals.best(filters)
-            square = float(new.nis[best]) / 3
-            normalised = new.residual[best] / np.sqrt(np.diagonal(new.covariance[best]))
-            self._receiver.hear(kind, square, normalised, track.stated[k][kind])
-            rejected = not new.taken[best]
-            self._rejected[kind] += rejected
-            bad |= rejected
-            astray |= not new.taken[np.argmax(filters.evidence)]
-            if not nis:
-                first = normalised
-            nis.append(square)
-        self._rejected[2] += bad
-        self._in_a_row = self._in_a_row + 1 if astray else 0
-        self._nis, self._innovation = sum(nis) / len(nis), first
-        if vehicle is not None:
-            filters.hold(vehicle.look(filters, model, k, track))
+        self._rejected[2] += not all(new.taken for new in news)
+        self._in_a_row = self._in_a_row + 1 if any(new.fits_none for new in news) else 0
+        self._nis = sum(new.square for new in news) / len(news)
+        self._innovation = news[0].normalised
+        if vehicle is not None and due:
+            vehicle.look(filters, model, k, measured)
         self._rivals.select(filters)
 
     def _drop_vehicle(self, filters: Filters) -> bool:
         """Assume nothing of the vehicle any more where the motion contradicts it."""
-        if not self._rivals.vehicle_contradicted(filters):
+        if self._vehicle is None or not self._vehicle.contradicted(filters):
             return False
         self._not_used = NOT_USED.format(vehicle=self._config.vehicle)
         self._config = replace(self._config, vehicle='none')
         return True
+
+    def _conclude(self) -> None:
+        """Mix the attitudes of an epoch, and hear the rivals."""
+        filters = self._filters
+        if filters is None:
+            return
+        self._mixture = filters.mixture()
+        self._doubt, self._contradicted = (
+            '' if self._vehicle is None else self._vehicle.doubt(filters)), False
+        if not self._doubt:
+            self._doubt, self._contradicted = self._rivals.doubt(
+                filters, *self._mixture, self._receiver.misfit)
 
     # Start
 
@@ -305,103 +300,66 @@ class Bank:
         P = self._start.covariance(rough, np.array([known.P for known in self._known]))
         v_n = next((epoch.v_n for epoch in epochs if epoch.v_n is not None), np.zeros(3))
         self._freeze(epochs[0])
-        inertial, track = self._track_of(epochs)
+        inertial = self._inertial.along(epochs, self._n0_ns)
         self._filters = filters = Filters(C, v_n, self._known[0].x, rival, P,
-                                          np.array([known.walk for known in self._known]))
+                                          np.array([known.walk for known in self._known]),
+                                          self._rivals.prior, self._rivals.counts)
         for k in range(len(epochs)):
             one = slice(k, k + 1)
             model = self._model(filters, self._point_of(filters), imu.take(one))
-            self._step(filters, model, 0, Track(track.s[one], track.covariance[one],
-                                                track.present[one], track.stated[one],
-                                                track.C_n0n[one], track.still[one]))
+            self._step(filters, model, 0,
+                       inertial.at(one).measured(epochs[one], self._use_position))
         self._start = Start(self._config)
         self._last = epochs[-1]
         self._anchor(filters, inertial.at(len(epochs) - 1))
 
     # Results
 
-    def _shares_of(self, filters: Filters) -> Array:
-        """Return the weight of each mean in the mixture."""
-        level = self._rivals.of_levels(filters)
-        share = np.exp(level - level.max())
-        return (share / share.sum())[filters.place] * np.exp(filters.weight)
-
-    def _attitudes(self) -> tuple[Array, Array]:
-        """
-        Return the attitudes at t0 and now, C_n0b, and their covariances in the axes of n0.
-
-        Returns
-        -------
-        mean, covariance : ndarray, shape (2, 3, 3)
-            Of the mixture of all means.
-
-        """
-        if self._mixed is not None:
-            return self._mixed
-        filters = self._filters
-        assert filters is not None
-        share = self._shares_of(filters)
-        use = np.flatnonzero(share > 1e-6)
-        share = share[use] / share[use].sum()
-        P = filters.P[filters.place[use]]
-        C = np.stack([filters.C0[use], filters.C[use]])
-        covariance = C @ np.stack([P[:, PHI0, PHI0], P[:, PHI, PHI]]) @ C.swapaxes(-1, -2)
-        mean = C[:, np.argmax(share)]
-        if len(use) > 1:
-            for _ in range(3):
-                away = log_so3(C @ mean[:, None].swapaxes(-1, -2))
-                shift = share @ away
-                mean = exp_so3(shift) @ mean
-                away = away - shift[:, None]
-                if np.abs(away).max() < CLOSE:      # the rotations add up like vectors
-                    break
-            covariance = covariance + away[..., :, None] * away[..., None, :]
-        self._mixed = mean, np.sum(share[:, None, None] * covariance, axis=1)
-        return self._mixed
-
     def initial(self) -> tuple[Array, Array] | None:
         """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
-        if self._filters is None:
+        if self._mixture is None:
             return None
-        C, P = self._attitudes()
+        C, P = self._mixture
         return C[0], self._receiver.inflation * P[0]
 
     def current(self) -> tuple[Array, Array] | None:
         """Return ``C_nb`` at the last epoch and the covariance of its error in ENU."""
-        if self._filters is None:
+        if self._mixture is None:
             return None
-        C, P = self._attitudes()
+        C, P = self._mixture
         return self._C_nn0 @ C[1], self._receiver.inflation * self._C_nn0 @ P[1] @ self._C_nn0.T
 
     def fit(self) -> Fit:
-        """Return how well the data fit."""
-        filters = self._filters
+        """Return how well the data fit, and what the rivals say."""
+        filters, receiver = self._filters, self._receiver
         if filters is None:
             return Fit(self._offered, delay=self._config.gnss_delay)
-        doubt, contradicted = self._rivals.doubt(filters, self._attitudes, self._receiver.misfit)
         velocity, position, either = self._rejected
-        level = self._rivals.table[filters.ids[self._rivals.best(filters)]]
-        return Fit(self._offered, 3 * (self._offered - either), self._receiver.misfit,
-                   self._nis, self._innovation, velocity, position, either,
-                   delay=self._config.gnss_delay + float(self._body()[0][DELAY]),
-                   objection=doubt if contradicted else '', doubt=doubt,
-                   remarks=(self._receiver.in_words() + self._not_used
-                            + level_in_words(level, self._config.imu_noise)
-                            + self._rivals.vehicle_in_words(filters)))
+        best = filters.best
+        remarks = receiver.in_words() + self._not_used + level_in_words(
+            self._rivals.table[filters.ids[best]], self._config.imu_noise)
+        if self._vehicle is not None:
+            remarks += self._vehicle.in_words(filters)
+        return Fit(self._offered, 3 * (self._offered - either), receiver.misfit, self._nis,
+                   self._innovation, velocity, position, either,
+                   delay=self._config.gnss_delay + float(filters.x[filters.lead[best], DELAY]),
+                   objection=self._doubt if self._contradicted else '', doubt=self._doubt,
+                   remarks=remarks)
 
     def move_t0(self) -> None:
         """Move t0 to the last epoch."""
         assert self._filters is not None
         self._filters.clone(self._C_nn0.T)
-        self._mixed = None
+        self._mixture = self._filters.mixture()
         self.moved += 1
         self.t0_ns = self._last.stamp_ns
 
     def _body(self) -> tuple[Array, Array]:
+        """Return the likeliest parameters of the body and their covariance."""
         filters = self._filters
         if filters is None:
             return self._known[0].x, self._known[0].P
-        best = self._rivals.best(filters)
+        best = filters.best
         return filters.x[filters.lead[best]], filters.P[best, FIRST:, FIRST:]
 
     def nuisance(self) -> Nuisance:
@@ -422,10 +380,10 @@ class Bank:
 
     def learnt(self) -> Learnt | None:
         """Return what a fresh start may keep; None where the bank has gone astray."""
-        if self._filters is None or self._in_a_row:
+        if self._mixture is None or self._in_a_row:
             return None
         x, P = (array.copy() for array in self._body())
-        if self._attitudes()[1][1, 2, 2] > RESOLVED_STD ** 2:
+        if self._mixture[1][1, 2, 2] > RESOLVED_STD ** 2:
             # Without a change of speed nothing shows lever arm and delay but the noise of the
             # IMU, which feigns a swing that the GNSS does not see.
             antenna = slice(0, GYRO)

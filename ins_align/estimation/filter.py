@@ -27,10 +27,10 @@ Neither their propagation nor a measurement's derivative holds an attitude, so a
 differ in their heading share one covariance (docs, "Theory").
 """
 
-from dataclasses import dataclass
+import math
 from typing import NamedTuple
 
-from ins_align.estimation.linearised import FIRST, GYRO, Linearised, PHI, PHI0, RHO, XI
+from ins_align.estimation.states import FIRST, GYRO, Linearised, Measured, PHI, PHI0, RHO, XI
 from ins_align.geometry.rotation import apply, Array, exp_so3, Index, log_so3
 import numpy as np
 
@@ -41,87 +41,31 @@ GATE = 25.0
 # Log likelihood ratio of a motion that fits a vehicle, to one whose slips are so much larger that
 # a normalised innovation squared of twice this, of two rows, is as likely.
 FITS = 3.0
+# What is less likely than the first is no part of a mixture. Its mean is found when all attitudes
+# are so close to it (rad) that rotations add up like vectors, or it moves no more (rad).
+NEGLIGIBLE, CLOSE, SETTLED = 1e-6, 0.01, 1e-8
+# Turns so small (rad) leave the axes of the errors as they are.
+NO_TURN = 1e-4
 _EYE = np.eye(3)
 
 
-@dataclass
-class Track:
-    """
-    The GNSS side of K epochs in n0; see `track.InertialTrack`.
+class Innovation(NamedTuple):
+    """What was new in a measurement to the likeliest mean."""
 
-    Attributes
-    ----------
-    s : ndarray, shape (K, 2, 3)
-        s_v and s_p.
-    covariance : ndarray, shape (K, 2, 3, 3)
-    present : list of (bool, bool)
-        Whether there is a velocity, a position.
-    stated : list of (bool, bool)
-        Whether the receiver states its noise.
-    C_n0n : ndarray, shape (K, 3, 3)
-    still : ndarray, shape (K, 3)
-        s_v of what rests.
-
-    """
-
-    s: Array
-    covariance: Array
-    present: list[tuple[bool, bool]]
-    stated: list[tuple[bool, bool]]
-    C_n0n: Array
-    still: Array
+    square: float           # normalised, per row
+    normalised: Array       # over its sigmas, in n0, shape (3,)
+    taken: bool             # by this mean's rival
+    fits_none: bool         # not even the likeliest rival of all took it
 
 
-class Look(NamedTuple):
-    """
-    How well B means of M rivals move along x of the vehicle's base; see `vehicle`.
+class _Test(NamedTuple):
+    """An innovation of r rows against what B means of M rivals expect."""
 
-    Attributes
-    ----------
-    held : ndarray of bool, shape (M,)
-        Which of the rivals have to.
-    H : ndarray, shape (M, 2, n)
-        Derivatives of the innovation, sideways and upwards, to the errors.
-    variance : ndarray, shape (M,)
-        Of its noise, (m/s)^2.
-    innovation : ndarray, shape (B, 2)
-        m/s.
-    backwards : ndarray, shape (B,)
-        Speed the wrong way, m/s.
-    tumbled : ndarray of bool, shape (B,)
-        Whether z of the base points down.
-
-    """
-
-    held: np.ndarray
-    H: Array
-    variance: Array
-    innovation: Array
-    backwards: Array
-    tumbled: np.ndarray
-
-
-@dataclass
-class Innovation:
-    """
-    What was new in a measurement, to the likeliest mean of each rival.
-
-    Attributes
-    ----------
-    nis : ndarray, shape (M,)
-        Normalised and squared, of three rows.
-    residual : ndarray, shape (M, 3)
-        In n0.
-    covariance : ndarray, shape (M, 3, 3)
-    taken : ndarray of bool, shape (M,)
-        Whether it was taken.
-
-    """
-
-    nis: Array
-    residual: Array
-    covariance: Array
-    taken: np.ndarray
+    HP: Array               # (M, r, n)
+    S: Array                # (B, r, r), its covariance
+    inverse: Array          # of S
+    weighted: Array         # (B, r), S^-1 times the innovation
+    nis: Array              # (B,), normalised innovation squared
 
 
 class Filters:
@@ -141,15 +85,21 @@ class Filters:
     P : ndarray, shape (M, n, n)
     walk : ndarray, shape (M, n)
         What a second adds to the diagonal of P.
+    prior : ndarray, shape (M,)
+        Log of how likely each rival is before the data.
+    counts : ndarray of bool, shape (M,)
+        Which of the rivals are part of a result; the others may only speak against it.
 
     Attributes
     ----------
     weight : ndarray, shape (B,)
         Log weight among the means of the same rival.
     evidence : ndarray, shape (M,)
-        Log likelihood of all that was measured, under each rival.
+        Log of how likely each rival is after the data, but for a constant.
     ids : ndarray of int, shape (M,)
         The rivals that are left.
+    place : ndarray of int, shape (B,), or slice
+        The place in `ids` of each mean's rival; all of them where each rival has one mean.
     lead : ndarray of int, shape (M,)
         The likeliest mean of each.
     feigned : ndarray, shape (M, 3, 3)
@@ -158,32 +108,43 @@ class Filters:
     """
 
     _OF_MEANS = 'C', 'u', 'w', 'x', 'C0', 'rival', 'weight'
-    _OF_RIVALS = 'P', 'walk', 'evidence', 'ids', 'feigned'
+    _OF_RIVALS = 'P', 'walk', 'evidence', 'counts', 'ids', 'feigned'
 
-    def __init__(self, C: Array, u: Array, x: Array, rival: Index, P: Array,
-                 walk: Array) -> None:
+    def __init__(self, C: Array, u: Array, x: Array, rival: Index, P: Array, walk: Array,
+                 prior: Array, counts: np.ndarray) -> None:
         """Start at t0."""
         B, M = len(C), len(P)
         self.C, self.C0 = C, C.copy()
         self.u, self.w, self.x = np.tile(u, (B, 1)), np.zeros((B, 3)), np.tile(x, (B, 1))
         self.rival, self.ids = rival, np.arange(M)
         self.weight = -np.log(np.bincount(rival))[rival]
-        self.evidence = np.zeros(M)
+        self.evidence, self.counts = prior, counts
         self.P, self.walk = P, walk
         self.feigned = np.zeros((M, 3, 3))
         self._find_places()
 
+    # Which mean is whose, and how likely
+
+    @property
+    def single(self) -> bool:
+        """Whether each rival has one mean only."""
+        return len(self.C) == len(self.ids)
+
+    @property
+    def best(self) -> int:
+        """Return the place of the likeliest rival that counts."""
+        return int(np.where(self.counts, self.evidence, -np.inf).argmax())
+
     def _find_places(self) -> None:
-        self.place = np.searchsorted(self.ids, self.rival)
+        self.place: 'Index | slice' = (slice(None) if self.single
+                                       else np.searchsorted(self.ids, self.rival))
         self.first = np.searchsorted(self.rival, self.ids)
         self._find_leads()
 
     def _find_leads(self) -> None:
-        if len(self.C) == len(self.ids):
-            self.lead = self.first
-        else:
-            order = np.lexsort((-self.weight, self.rival))
-            self.lead = order[self.first]
+        self.lead = self.first
+        if not self.single:
+            self.lead = np.lexsort((-self.weight, self.rival))[self.first]
 
     def keep(self, means: np.ndarray) -> None:
         """Keep some of the means, and the rivals that have any."""
@@ -195,27 +156,49 @@ class Filters:
                 setattr(self, name, getattr(self, name)[left])
         self._find_places()
 
+    def _weigh(self, log_likelihood: Array) -> Array:
+        """Weigh means within rivals; return the log likelihood of these, shape (M,)."""
+        weight = self.weight + log_likelihood
+        if self.single:
+            return weight
+        largest = np.maximum.reduceat(weight, self.first)
+        total: Array = largest + np.log(
+            np.add.reduceat(np.exp(weight - largest[self.place]), self.first))
+        self.weight = weight - total[self.place]
+        self._find_leads()
+        return total
+
+    def _by_most(self, good: np.ndarray) -> np.ndarray:
+        """Return whether more than half of each rival's weight is on means that are good."""
+        if self.single:
+            return good
+        most: np.ndarray = np.add.reduceat(np.exp(self.weight) * good, self.first) > 0.5
+        return most
+
+    # An epoch
+
     def propagate(self, model: Linearised, k: int) -> None:
         """Go over the interval before epoch k of K; the model has those rivals that are left."""
         q, duration = self.place, model.duration[k]
         change = apply(model.J[k][q], self.x - model.point[q])
-        moved = model.moved[k][q] + change[:, 3:]
-        v, p = moved[:, :3], moved[:, 3:]
-        self.w = self.w + duration * self.u + apply(self.C, p - self.x[:, GYRO - 1:GYRO] * v)
-        self.u = self.u + apply(self.C, v)
+        moved = (model.moved[k][q] + change[:, 3:]).reshape(-1, 2, 3) @ self.C.swapaxes(1, 2)
+        v, p = moved[:, 0], moved[:, 1]
+        self.w = self.w + duration * self.u + p - self.x[:, GYRO - 1:GYRO] * v
+        self.u = self.u + v
         self.C = self.C @ exp_so3(change[:, PHI]) @ model.R[k][q]
         F, Q, P = model.F[k], model.Q[k], self.P
         rows = F @ P
         P[:, :9, 9:] = rows[:, :, 9:]
         P[:, 9:, :9] = rows[:, :, 9:].swapaxes(1, 2)
-        P[:, :9, :9] = rows @ F.swapaxes(1, 2) + Q
+        block = rows @ F.swapaxes(1, 2) + Q
+        P[:, :9, :9] = 0.5 * (block + block.swapaxes(1, 2))     # or rounding grows
         M, n = self.walk.shape
         P.reshape(M, -1)[:, ::n + 1] += duration * self.walk
         T = F[:, PHI, PHI]
         self.feigned = T @ self.feigned @ T.swapaxes(1, 2) + Q[:, XI, XI]
 
-    def update(self, model: Linearised, k: int, kind: int, track: Track,
-               noise: Array) -> 'Innovation':
+    def update(self, model: Linearised, k: int, kind: int, measured: Measured,
+               noise: Array) -> Innovation:
         """
         Take the velocity (kind 0) or the position (1) of epoch k.
 
@@ -227,7 +210,7 @@ class Filters:
             Which of them.
         kind : int
             0 or 1.
-        track : Track
+        measured : Measured
             Of the same epochs.
         noise : ndarray, shape (3,)
             Factors on the sigmas that the receiver states, east, north and up.
@@ -235,64 +218,75 @@ class Filters:
         """
         q, lead, C = self.place, self.lead, self.C
         H = model.H[k, kind]
-        PH = self.P @ H.swapaxes(1, 2)
         # What the receiver states is about axes of n0, which the means see in different ways.
-        stated = C.swapaxes(1, 2) @ (track.covariance[k, kind] * noise * noise[:, None]) @ C
-        S = (H @ PH)[q] + stated
-        inverse = np.linalg.inv(S)
-        missing = track.s[k, kind] - (self.w if kind else self.u)
+        stated = C.swapaxes(1, 2) @ (measured.covariance[k, kind] * noise * noise[:, None]) @ C
+        missing = measured.s[k, kind] - (self.w if kind else self.u)
         innovation = (apply(C.swapaxes(1, 2), missing) + model.expected[k, kind][q]
                       - apply(H[q][..., FIRST:], self.x - model.point[q]))
-        weighted = apply(inverse, innovation)
-        nis = np.sum(innovation * weighted, axis=1)
-        good = nis < GATE
+        test = self._test(H, stated, innovation)
+        good = test.nis < GATE
         # By the means before the measurement, which an outlier must not choose.
-        taken = np.bincount(q, np.exp(self.weight) * good, len(self.ids)) > 0.5
-        C_lead, S_lead, inverse = C[lead], S[lead], inverse[lead]
-        result = Innovation(nis[lead], apply(C_lead, innovation[lead]),
-                            C_lead @ S_lead @ C_lead.swapaxes(1, 2), taken)
-        self._weigh(-0.5 * (np.minimum(nis, GATE) + np.log(np.linalg.det(S))))
-        gain = (PH @ inverse) * taken[:, None, None]
-        self.P = self.P - gain @ PH.swapaxes(1, 2)
+        taken = self._by_most(good)
+        self.evidence = self.evidence + self._weigh(
+            -0.5 * (np.minimum(test.nis, GATE) + np.log(np.linalg.det(test.S))))
+        gain = self._reduce(test.HP, test.inverse[lead], taken)
         if kind == 0:
-            self._forget_feigned(gain, inverse, C_lead[:, 2])
-        self._move(apply(PH[q], weighted) * (good & taken[q])[:, None])
-        return result
+            self._forget_feigned(gain, test.inverse[lead], C[lead][:, 2], taken)
+        self._move(test, good & taken[q])
+        best = self.best
+        i = lead[best]
+        sigmas = np.sqrt((C[i] @ test.S[i] @ C[i].T).diagonal())
+        return Innovation(float(test.nis[i]) / 3, C[i] @ innovation[i] / sigmas,
+                          bool(taken[best]), not taken[self.evidence.argmax()])
 
-    def hold(self, look: Look) -> None:
-        """Hold the rivals that assume it to a motion along x of the vehicle's base."""
-        q, held = self.place, look.held
-        PH = self.P @ look.H.swapaxes(1, 2)
-        S = look.H @ PH + look.variance[:, None, None] * np.eye(2)
-        inverse = np.linalg.inv(S)
-        weighted = apply(np.asarray(inverse[q], float), look.innovation)
-        nis = (np.sum(look.innovation * weighted, axis=1)
-               + look.backwards ** 2 / S[q, 0, 0])
-        nis = held[q] * np.where(look.tumbled, GATE, np.minimum(nis, GATE))
-        self.weight = self.weight - 0.5 * nis
-        self._weigh_evenly()
-        self._find_leads()
+    def hold(self, held: np.ndarray, H: Array, variance: Array, innovation: Array,
+             backwards: Array, tumbled: np.ndarray) -> None:
+        """
+        Hold rivals to a motion along x of a vehicle's base; see `vehicle`.
+
+        Parameters
+        ----------
+        held : ndarray of bool, shape (M,)
+            Which of the rivals have to.
+        H : ndarray, shape (M, 2, n)
+            Derivatives of the innovation, sideways and upwards, to the errors.
+        variance : ndarray, shape (M,)
+            Of its noise, (m/s)^2.
+        innovation : ndarray, shape (B, 2)
+            m/s.
+        backwards : ndarray, shape (B,)
+            Speed the wrong way, m/s.
+        tumbled : ndarray of bool, shape (B,)
+            Whether z of the base points down.
+
+        """
+        q = self.place
+        test = self._test(H, variance[q][:, None, None] * np.eye(2), innovation)
+        nis = test.nis + backwards ** 2 / test.S[:, 0, 0]
+        nis = held[q] * np.where(tumbled, GATE, np.minimum(nis, GATE))
+        if not self.single:
+            self._weigh(-0.5 * nis)
         # How headings were spread before says nothing about the assumption.
         self.evidence = self.evidence + held * (FITS - 0.5 * nis[self.lead])
         good = nis < GATE
-        taken = held & (np.bincount(q, np.exp(self.weight) * good, len(self.ids)) > 0.5)
-        gain = PH @ inverse * taken[:, None, None]
-        self.P = self.P - gain @ PH.swapaxes(1, 2)
-        self._move(apply(PH[q], weighted) * (good & taken[q])[:, None])
+        taken = held & self._by_most(good)
+        self._reduce(test.HP, test.inverse[self.lead], taken)
+        self._move(test, good & taken[q])
 
-    def _weigh(self, log_likelihood: Array) -> None:
-        """Weigh means within rivals, and rivals."""
-        weight = self.weight + log_likelihood
-        if len(weight) == len(self.ids):
-            self.evidence = self.evidence + weight
-            return
-        largest = np.maximum.reduceat(weight, self.first)
-        total = largest + np.log(np.add.reduceat(np.exp(weight - largest[self.place]), self.first))
-        self.evidence = self.evidence + total
-        self.weight = weight - total[self.place]
-        self._find_leads()
+    def _test(self, H: Array, noise: Array, innovation: Array) -> _Test:
+        HP = H @ self.P
+        S: Array = (HP @ H.swapaxes(1, 2))[self.place] + noise
+        inverse = np.asarray(np.linalg.inv(S), float)
+        weighted = apply(inverse, innovation)
+        return _Test(HP, S, inverse, weighted, np.einsum('ij,ij->i', innovation, weighted))
 
-    def _forget_feigned(self, gain: Array, inverse: Array, up: Array) -> None:
+    def _reduce(self, HP: Array, inverse: Array, taken: np.ndarray) -> Array:
+        """Take what was measured off the covariances; return the gains, shape (M, r, n)."""
+        gain: Array = (inverse * taken[:, None, None]) @ HP
+        self.P = self.P - HP.swapaxes(1, 2) @ gain
+        return gain
+
+    def _forget_feigned(self, gain: Array, inverse: Array, up: Array, taken: np.ndarray) -> None:
         """
         Take off again the information on the heading that the noise of the IMU feigns.
 
@@ -302,51 +296,53 @@ class Filters:
         """
         V = self.feigned
         weighted = inverse @ V
-        feigned = (np.trace(weighted, axis1=1, axis2=2) - np.sum(up * apply(weighted, up), axis=1))
-        feigned = feigned * (np.abs(gain[:, 3, 0]) > 0)
+        feigned = taken * (np.einsum('ijj', weighted)
+                           - np.einsum('ij,ij->i', up, apply(weighted, up)))
         to_heading = apply(self.P[:, :, PHI], up)
-        variance = np.sum(up * to_heading[:, PHI], axis=1)
+        variance = np.einsum('ij,ij->i', up, to_heading[:, PHI])
         feigned = np.minimum(feigned, 0.5 / variance)
         factor = feigned / (1 - feigned * variance)
-        self.P += factor[:, None, None] * to_heading[:, :, None] * to_heading[:, None]
-        left = 1 - np.clip(np.trace(gain[:, XI], axis1=1, axis2=2) / 3, 0.0, 1.0)
+        self.P += (factor[:, None] * to_heading)[:, :, None] * to_heading[:, None]
+        left = 1 - np.clip(np.einsum('ijj', gain[:, :, XI]) / 3, 0.0, 1.0)
         self.feigned = (left ** 2)[:, None, None] * V
-        if len(self.C) > len(self.ids):
+        if not self.single:
+            # Which mean is the likeliest stays, even where nothing is left to tell them apart.
             self.weight *= (1 - np.minimum(feigned, 1.0))[self.place]
-            self._weigh_evenly()
+            total = np.add.reduceat(np.exp(self.weight), self.first)
+            self.weight -= np.log(total)[self.place]
 
-    def _weigh_evenly(self) -> None:
-        """Make the weights of each rival's means add up to one."""
-        total = np.log(np.add.reduceat(np.exp(self.weight), self.first))
-        self.weight = self.weight - total[self.place]
-
-    def _move(self, d: Array) -> None:
+    def _move(self, test: _Test, use: np.ndarray) -> None:
         """Correct the means, and turn the covariances' frames with the likeliest of them."""
-        C, lead = self.C, self.lead
-        B, M = len(C), len(lead)
-        self.u = self.u + apply(C, d[:, XI])
-        self.w = self.w + apply(C, d[:, RHO])
+        d = ((test.weighted * use[:, None])[:, None] @ test.HP[self.place])[:, 0]
+        C, C0, turn = self.C, self.C0, d[self.lead]
+        self._shift(d)
+        phi, phi0 = turn[:, PHI], turn[:, PHI0]
+        if max(np.abs(phi).max(), np.abs(phi0).max()) <= NO_TURN:
+            return
+        start = apply(C[self.lead].swapaxes(1, 2) @ C0[self.lead], phi0)
+        G = np.zeros((len(turn), FIRST, FIRST))
+        G[:, PHI, PHI], G[:, XI, XI], G[:, PHI0, PHI0] = exp_so3(
+            np.stack([0.5 * start - phi, -phi, -0.5 * phi0]))
+        G[:, RHO, RHO] = G[:, XI, XI]
+        rows = G @ self.P[:, :FIRST]
+        self.P[:, :FIRST] = rows
+        self.P[:, FIRST:, :FIRST] = rows[:, :, FIRST:].swapaxes(1, 2)
+        self.P[:, :FIRST, :FIRST] = rows[:, :, :FIRST] @ G.swapaxes(1, 2)
+
+    def _shift(self, d: Array) -> None:
+        """Correct the means by errors, shape (B, n)."""
+        B = len(d)
+        moved = d[:, 3:9].reshape(-1, 2, 3) @ self.C.swapaxes(1, 2)
+        self.u, self.w = self.u + moved[:, 0], self.w + moved[:, 1]
         self.x = self.x + d[:, FIRST:]
-        phi, phi0 = d[lead, PHI], d[lead, PHI0]
-        start = apply(C[lead].swapaxes(1, 2) @ self.C0[lead], phi0)
-        turns = exp_so3(np.concatenate([d[:, PHI], d[:, PHI0], 0.5 * start - phi, -phi,
-                                        -0.5 * phi0]))
-        self.C, self.C0 = C @ turns[:B], self.C0 @ turns[B:2 * B]
-        if max(np.abs(phi).max(), np.abs(phi0).max()) > 1e-4:
-            G = np.zeros((M, 12, 12))
-            to_phi, to_motion, to_phi0 = turns[2 * B:].reshape(3, M, 3, 3)
-            G[:, PHI, PHI], G[:, PHI0, PHI0] = to_phi, to_phi0
-            G[:, XI, XI] = G[:, RHO, RHO] = to_motion
-            rows = G @ self.P[:, :FIRST]
-            self.P[:, :FIRST] = rows
-            self.P[:, FIRST:, :FIRST] = rows[:, :, FIRST:].swapaxes(1, 2)
-            self.P[:, :FIRST, :FIRST] = rows[:, :, :FIRST] @ G.swapaxes(1, 2)
-        self.P = 0.5 * (self.P + self.P.swapaxes(1, 2))     # or rounding grows
+        turns = exp_so3(np.concatenate([d[:, PHI], d[:, PHI0]]))
+        self.C, self.C0 = self.C @ turns[:B], self.C0 @ turns[B:]
 
     # What does not depend on a measurement
 
     def turned(self, C_nn0: Array, s_v: Array, s_p: Array) -> None:
         """Go on in another n0; its axes, and what an antenna that rests has there of s."""
+        self.P = 0.5 * (self.P + self.P.swapaxes(1, 2))     # or rounding grows
         self.C = C_nn0 @ self.C
         self.u, self.w = (self.u - s_v) @ C_nn0.T, (self.w - s_p) @ C_nn0.T
 
@@ -356,39 +352,74 @@ class Filters:
         self.P[:, PHI0] = self.P[:, PHI]
         self.P[:, :, PHI0] = self.P[:, :, PHI]
 
-    def open_position(self, position: Array, std: float) -> None:
+    def open_position(self, std: float) -> None:
         """Forget the position."""
-        self.w[:] = position
+        self.w[:] = 0.0
         self.P[:, RHO] = self.P[:, :, RHO] = 0.0
         self.P[:, RHO, RHO] = std ** 2 * _EYE
 
     def merge(self, alike: float) -> None:
         """Merge the means of each rival that are all within so many sigmas of the likeliest."""
-        if len(self.C) == len(self.ids):
+        if self.single:
             return
-        lead = self.lead[self.place]
+        leads, place = self.lead, self.place
+        lead = leads[place]
         C, C0 = self.C[lead].swapaxes(1, 2), self.C0[lead].swapaxes(1, 2)
         away = np.hstack([log_so3(C @ self.C), apply(C, self.u - self.u[lead]),
                           apply(C, self.w - self.w[lead]), log_so3(C0 @ self.C0),
                           self.x - self.x[lead]])
-        variance = np.diagonal(self.P, axis1=1, axis2=2)[self.place]
+        variance = np.diagonal(self.P, axis1=1, axis2=2)[place]
         near = np.all(away[:, PHI] ** 2 < alike ** 2 * variance[:, PHI], axis=1)
-        near = np.minimum.reduceat(near, self.first) & (np.bincount(self.place) > 1)
+        near = np.minimum.reduceat(near, self.first) & (np.bincount(self.rival)[self.ids] > 1)
         if not near.any():
             return
         share = np.exp(self.weight)[:, None]
         mean = np.add.reduceat(share * away, self.first)
-        spread = away - mean[self.place]
+        spread = away - mean[place]
         P = np.add.reduceat(share[..., None] * spread[:, :, None] * spread[:, None], self.first)
-        lead = self.lead
         self.P[near] += P[near]
-        d = np.where(near[:, None], mean, 0.0)
-        C = self.C[lead]
-        self.u[lead] += apply(C, d[:, XI])
-        self.w[lead] += apply(C, d[:, RHO])
-        self.C[lead], self.C0[lead] = C @ exp_so3(d[:, PHI]), self.C0[lead] @ exp_so3(d[:, PHI0])
-        self.x[lead] += d[:, FIRST:]
-        kept = ~near[self.place]
-        kept[lead] = True
-        self.weight[lead[near]] = 0.0
+        merged = leads[near]
+        d = np.zeros_like(away)
+        d[merged] = mean[near]
+        self._shift(d)
+        self.weight[merged] = 0.0
+        kept = ~near[place]
+        kept[merged] = True
         self.keep(kept)
+
+    # Results
+
+    def mixture(self) -> tuple[Array, Array]:
+        """
+        Return the attitudes at t0 and now, C_n0b, and their covariances in the axes of n0.
+
+        Both are of shape (2, 3, 3), and of all means of the rivals that count.
+        """
+        level = np.where(self.counts, self.evidence, -np.inf)
+        share = np.exp(level - level.max())
+        share = (share / share.sum())[self.place] * np.exp(self.weight)
+        use: 'Index | slice' = slice(None)
+        blocks = np.stack([self.P[:, PHI0, PHI0], self.P[:, PHI, PHI]])[:, self.place]
+        if share.min() <= NEGLIGIBLE:
+            use = np.flatnonzero(share > NEGLIGIBLE)
+            share, blocks = share[use], blocks[:, use]
+        share = share / share.sum()
+        C = np.stack([self.C0[use], self.C[use]])
+        covariance = C @ blocks @ C.swapaxes(-1, -2)
+        mean = C[:, share.argmax()]
+        if len(share) > 1:
+            for _ in range(3):
+                away = log_so3(C @ mean[:, None].swapaxes(-1, -2))
+                shift = share @ away
+                mean = exp_so3(shift) @ mean
+                away = away - shift[:, None]
+                if np.abs(away).max() < CLOSE or np.abs(shift).max() < SETTLED:
+                    break
+            covariance = covariance + away[..., :, None] * away[..., None, :]
+        return mean, (share @ covariance.reshape(2, -1, 9)).reshape(2, 3, 3)
+
+
+def log_sum(values: Array) -> float:
+    """Return the log of the sum of exponentials."""
+    largest = float(np.max(values))
+    return largest + math.log(float(np.sum(np.exp(values - largest))))

@@ -24,11 +24,12 @@ import math
 
 from ins_align.config import Config
 from ins_align.estimation.declaration import Fit
+from ins_align.estimation.moments import AttitudeMoments
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.earth import earth_rate_n, gravity_n, LocalLevel
-from ins_align.geometry.rotation import Array, cross, matrix_from_quaternion, orthonormalized
+from ins_align.geometry.rotation import Array, cross, orthonormalized
 from ins_align.gnss.messages import AntennaEpoch
-from ins_align.imu.intervals import Intervals, SensorErrors
+from ins_align.imu.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
 import numpy as np
 
@@ -171,79 +172,6 @@ class NavigationIntegrals:
     def beta_p(self) -> Array:
         """Left side of the position form, Remark 2.3."""
         return self.s_p - self.time * self.v_n0
-
-
-class AttitudeMoments:
-    """
-    Sums from which ``min_C sum |s - (unknown start) - C a|^2`` is solved: constant memory.
-
-    Parameters
-    ----------
-    nuisance : int
-        0: the note to the letter, nothing but C is unknown. 1: a free constant (velocity form).
-        2: a free constant and a free slope (position form).
-
-    """
-
-    def __init__(self, nuisance: int) -> None:
-        """Start with empty sums."""
-        self._nuisance = nuisance
-        self.count = 0
-        self._moments = np.zeros((6 + nuisance, 6 + nuisance))
-
-    def add(self, s: Array, a: Array, regressors: tuple[float, ...] = ()) -> None:
-        """Add one pair; `regressors` are the values that multiply the unknown start."""
-        row = np.concatenate([s, a, regressors])
-        self._moments += np.outer(row, row)
-        self.count += 1
-
-    def solve(self) -> tuple[Array, float, Array]:
-        """
-        Davenport's q-method on the moments left when the nuisance parameters are regressed out.
-
-        Returns
-        -------
-        C : ndarray, shape (3, 3)
-            The attitude.
-        residual : float
-            Weighted residual sum of squares.
-        A : ndarray, shape (3, 3)
-            Moments of a about the regression.
-
-        """
-        m = self._moments[:6, :6]
-        if self._nuisance:
-            z = self._moments[6:, 6:]
-            zm = self._moments[6:, :6]
-            m = m - zm.T @ np.linalg.pinv(z, hermitian=True) @ zm
-        C, residual = attitude_from_moments(m[:3, 3:], float(np.trace(m)))
-        return C, residual, m[3:, 3:]
-
-
-def attitude_from_moments(B: Array, total: float) -> tuple[Array, float]:
-    """
-    Davenport's q-method for ``sum |s - C a|^2`` with vectors that are not normalised.
-
-    Parameters
-    ----------
-    B : ndarray, shape (3, 3)
-        ``sum s a^T``.
-    total : float
-        ``sum |s|^2 + |a|^2``.
-
-    Returns
-    -------
-    C : ndarray, shape (3, 3)
-    residual : float
-        Smallest eigenvalue of ``K = total I - 2 D``, the residual sum (not negative).
-
-    """
-    D = np.empty((4, 4))
-    D[:3, :3] = B + B.T - np.trace(B) * np.eye(3)
-    D[:3, 3] = D[3, :3] = B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]
-    D[3, 3] = np.trace(B)
-    values, vectors = np.linalg.eigh(total * np.eye(4) - 2 * D)
-    return matrix_from_quaternion(vectors[:, 0]), max(float(values[0]), 0.0)
 
 
 def _mean_variance(covariance: Array) -> float:

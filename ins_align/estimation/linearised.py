@@ -19,72 +19,17 @@ means of a rival (docs, "Theory").
 """
 
 from copy import copy
-from dataclasses import dataclass
 
+from ins_align.estimation.states import (
+    DELAY, FIRST, LEVER_ARM, Linearised, PHI, RHO, triads, XI)
 from ins_align.geometry.rotation import apply, Array, by_row, cross, exp_so3, skew
-from ins_align.imu.intervals import Intervals
+from ins_align.imu.preintegration import Intervals
 from ins_align.imu.recent import AGES, exact, smooth
 import numpy as np
 
-# Places in the error state; the parameters follow from FIRST on: lever arm, delay, errors of the
-# gyros (bias, then matrix), errors of the accelerometers.
-PHI, XI, RHO, PHI0, FIRST = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12
-LEVER_ARM, DELAY, GYRO = slice(0, 3), 3, 4          # in the parameters
-# At their end, where a vehicle is known: mounting and drift, each sideways and upwards.
-MOUNT, DRIFT, OF_VEHICLE = slice(-4, -2), slice(-2, None), 4
 # A delay within these (s) is followed along the recent motion; from there it goes straight on.
 MIN_DELAY, MAX_DELAY = -0.1, AGES[-1]
 _EYE = np.eye(3)
-
-
-def triads(m: int) -> tuple[slice, slice]:
-    """Return the places of the errors of gyros and accelerometers among m parameters."""
-    size = (m - GYRO) // 6 * 3                  # a bias, or a bias and a matrix
-    return slice(GYRO, GYRO + size), slice(GYRO + size, GYRO + 2 * size)
-
-
-@dataclass
-class Linearised:
-    """
-    Motion and measurements of K epochs, linearised at the parameters of each of M rivals.
-
-    Attributes
-    ----------
-    point : ndarray, shape (M, m)
-        The parameters x.
-    duration : list of float
-        Seconds.
-    R : ndarray, shape (K, M, 3, 3)
-        Rotation over the interval before each epoch, corrected for the point's sensor errors.
-    moved : ndarray, shape (K, M, 6)
-        Velocity and position gained in it.
-    J : ndarray, shape (K, M, 9, m)
-        Derivatives of rotation, velocity and position to x.
-    F : ndarray, shape (K, M, 9, n)
-        Transition of phi, xi, rho.
-    Q : ndarray, shape (K, M, 9, 9)
-        What the noise of the IMU adds to their covariance.
-    H : ndarray, shape (K, 2, M, 3, n)
-        Derivatives of velocity and position, in the body frame, to the errors.
-    expected : ndarray, shape (K, 2, M, 3)
-        What C u and C w lack, in the body frame, of the measurements.
-    base : tuple of ndarray or None
-        Of the velocity of the vehicle's base: derivatives, shape (K, M, 3, n); what C u lacks of
-        it, (K, M, 3); rotation to the body frame from that at the moment of the measurement,
-        (K, M, 3, 3).
-
-    """
-
-    point: Array
-    duration: list[float]
-    R: Array
-    moved: Array
-    J: Array
-    F: Array
-    Q: Array
-    H: Array
-    expected: Array
-    base: tuple[Array, Array, Array] | None = None
 
 
 def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool,

@@ -19,17 +19,14 @@ it is as likely as the configuration and would give another attitude, no heading
 others are levels of the same configuration: what they say counts by their likelihood.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 import math
 
 from ins_align.config import Config, ImuNoise, PRESETS
-from ins_align.estimation.filter import Filters
-from ins_align.estimation.linearised import (
-    DELAY, FIRST, GYRO, LEVER_ARM, OF_VEHICLE, triads)
-from ins_align.estimation.vehicle import AMBIGUOUS, known_of_vehicle, UNCONFIRMED, Vehicle
+from ins_align.estimation.filter import Filters, log_sum
+from ins_align.estimation.states import (
+    DELAY, DRIFT, FIRST, GYRO, LEVER_ARM, MARGIN, MOUNT, OF_VEHICLE, triads)
 from ins_align.geometry.rotation import Array, log_so3
-from ins_align.geometry.transform import Transform
 import numpy as np
 
 # Over the error of the gyros' scale factors: their misalignment; scale factors and misalignment of
@@ -43,11 +40,12 @@ WANDER_TIME, ACCEL_WANDER, DELAY_WANDER = 100.0, 0.1, 0.1
 UNLIKELY, HOPELESS, LEAST = 14.0, 25.0, 13.0
 # Means of a rival that agree to so many sigmas are merged.
 ALIKE = 2.0
-# A wrong rival has to be less likely by this (log likelihood) or to give the same attitude, to so
-# many sigmas.
-MARGIN, HARMLESS = 6.0, 1.0
-# What is assumed of a vehicle must be likelier by this than nothing: some seconds of motion.
-CONFIRMED = 9.0
+# A wrong rival that is likely has to give the same attitude, to so many sigmas.
+HARMLESS = 1.0
+# Velocity of a vehicle sideways and upwards that lasts (m/s: tyres' slip, leeway and current,
+# wind); it changes by its sigma in this time (s), as the wind does where an aeroplane turns.
+DRIFTS = {'car': 0.1, 'boat': 1.0, 'aeroplane': 10.0}
+LASTING = 30.0
 # Share of the IMU's measured noise beyond the stated one that is believed at first: vibration
 # looks white from sample to sample and is less than that over seconds.
 SHARE = 1 / 27
@@ -143,106 +141,54 @@ def rivals_of(config: Config) -> tuple[Rival, ...]:
 
 class Rivals:
     """
-    The table of a configuration, and how likely each of its lines is.
+    The table of a configuration, and what becomes of its lines.
 
     Parameters
     ----------
     config : Config
-    base : Transform
-        From the vehicle's base to the IMU.
 
     Attributes
     ----------
     table : tuple of Rival
     signs : ndarray, shape (R, 4)
-        Of each line.
-    vehicle : Vehicle or None
+    prior : ndarray, shape (R,)
+    along : ndarray of int, shape (R,)
+    counts : ndarray of bool, shape (R,)
+        Whether a line is a part of results: levels that are wrong are not, nor those that are no
+        vehicle, which are there to contradict it.
 
     """
 
-    def __init__(self, config: Config, base: Transform) -> None:
+    def __init__(self, config: Config) -> None:
         """Know nothing of the data."""
         self._gnss_delay = config.gnss_delay
         self.table = rivals_of(config)
         self.signs = np.array([rival.signs for rival in self.table])
-        self._prior = np.array([rival.prior for rival in self.table])
+        self.prior = np.array([rival.prior for rival in self.table])
+        self.along = np.array([rival.along for rival in self.table])
         self._wrong = np.array([rival.wrong for rival in self.table])
-        self._along = along = np.array([rival.along for rival in self.table])
-        self.vehicle = None if config.vehicle == 'none' else Vehicle(config, base, along)
-        # Levels that are no vehicle are there to contradict it; they are no part of a result.
-        self._free = ~self._wrong & (along == 0) & (self.vehicle is not None)
-        self._aside = self._wrong | self._free
-
-    @property
-    def base_position(self) -> Array | None:
-        """Return where the base of the vehicle is in the frame of the IMU, m."""
-        return None if self.vehicle is None else self.vehicle.position
-
-    def vehicle_after(self, duration: float) -> Vehicle | None:
-        """Return the vehicle, where there is one, if it is due when these seconds are over."""
-        vehicle = self.vehicle
-        return vehicle if vehicle is not None and vehicle.is_due(duration) else None
-
-    def best(self, filters: Filters) -> int:
-        """Return the place of the likeliest level."""
-        return int(np.argmax(self.of_levels(filters)))
-
-    def of_levels(self, filters: Filters) -> Array:
-        """Return the log of how likely each rival is, -inf of those that are no levels in use."""
-        return np.where(self._aside[filters.ids], -np.inf, self._posterior(filters))
-
-    def _posterior(self, filters: Filters) -> Array:
-        """Return the log of how likely each rival is, but for a constant, shape (M,)."""
-        return filters.evidence + self._before(filters)
-
-    def _before(self, filters: Filters) -> Array:
-        """Return the log of how likely each was before the data, for the speed of a vehicle."""
-        prior: Array = self._prior[filters.ids]
-        return prior if self.vehicle is None else prior - self.vehicle.against[filters.ids]
+        self.counts = ~self._wrong & ((self.along != 0) | (config.vehicle == 'none'))
 
     def select(self, filters: Filters) -> None:
         """Drop means and rivals that are unlikely, merge means that agree."""
-        ids = filters.ids
-        if len(filters.C) == 1:
-            return
-        wrong = self._wrong[ids]
-        level = self._posterior(filters)
-        best = np.max(level[~self._aside[ids]])
-        filters.evidence = np.where(wrong, filters.evidence,
-                                    np.maximum(level, best - LEAST) - self._before(filters))
-        filters.evidence = filters.evidence - best
-        if len(filters.C) == len(ids) and not wrong.any() and self.vehicle is None:
+        ids, level = filters.ids, filters.evidence
+        wrong, along = self._wrong[ids], self.along[ids]
+        best = level[filters.best]
+        filters.evidence = np.where(wrong, level, np.maximum(level, best - LEAST)) - best
+        if filters.single and not (wrong.any() or along.any()):
             return
         keep = filters.weight > filters.weight[filters.lead][filters.place] - UNLIKELY
-        keep &= (~wrong | (filters.evidence > -HOPELESS))[filters.place]
+        keep &= (~wrong | (filters.evidence - self.prior[ids] > -HOPELESS))[filters.place]
         # A direction in which the vehicle did not set out is none for good.
-        for direction in {1, -1} & set(self._along[ids].tolist()):
-            there = self._along[ids] == direction
+        for direction in {1, -1} & set(along.tolist()):
+            there = along == direction
             if np.max(level[there]) < best - LEAST:
                 keep &= ~there[filters.place]
         if not keep.all():
             filters.keep(keep)
         filters.merge(ALIKE)
 
-    def vehicle_contradicted(self, filters: Filters) -> bool:
-        """Return whether the motion contradicts what is assumed of the vehicle."""
-        if self.vehicle is None:
-            return False
-        free, level = self._free[filters.ids], self._posterior(filters)
-        return (self.vehicle.contradicts(filters.x[filters.lead[self.best(filters)]])
-                or log_sum(level[free]) >= log_sum(level[~free]) + MARGIN)
-
-    def vehicle_in_words(self, filters: Filters) -> str:
-        """Return what is not known of the vehicle's motion, as the end of a sentence, or ''."""
-        if self.vehicle is None:
-            return ''
-        level = self.of_levels(filters)
-        likely = filters.lead[level > np.max(level) - MARGIN]
-        x_n0 = self.vehicle.forward(filters.C[likely])
-        return AMBIGUOUS if np.any(x_n0 @ x_n0.T < 0) else ''
-
-    def doubt(self, filters: Filters, attitudes: Callable[[], tuple[Array, Array]],
-              misfit: float) -> tuple[str, bool]:
+    def doubt(self, filters: Filters, mean: Array, P: Array, misfit: float) -> tuple[str, bool]:
         """
         Hear the rivals that are wrong.
 
@@ -250,8 +196,8 @@ class Rivals:
         ----------
         filters : Filters
             Of the same table.
-        attitudes : callable
-            Returns those of the mixture at t0 and now and their covariances, shape (2, 3, 3).
+        mean, P : ndarray, shape (2, 3, 3)
+            Their mixture.
         misfit : float
             Mean square of normalised innovations.
 
@@ -263,25 +209,25 @@ class Rivals:
             Whether the data fit better with one of them.
 
         """
-        wrong, free = self._wrong[filters.ids], self._free[filters.ids]
-        if free.any() and (np.max(self.of_levels(filters))
-                           < np.max(self._posterior(filters)[free]) + CONFIRMED):
-            return UNCONFIRMED, False
+        wrong = self._wrong[filters.ids]
         if not wrong.any():
             return '', False
         # How much likelier each of them is than all levels.
-        ahead = np.where(wrong, self._posterior(filters), -np.inf)
-        ahead = (ahead - log_sum(self.of_levels(filters))) / max(misfit, 1.0)
+        level = filters.evidence
+        ahead = np.where(wrong, level, -np.inf)
+        ahead = (ahead - log_sum(level[filters.counts])) / max(misfit, 1.0)
         if not np.any(ahead > -MARGIN):
             return '', False
-        mean, P = attitudes()
         C = np.stack([filters.C0[filters.lead], filters.C[filters.lead]], axis=1)
         away = log_so3(C @ mean.swapaxes(-1, -2)) / np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-        harm = np.abs(away).max(axis=(1, 2))
-        worst = int(np.argmax(np.where(harm > HARMLESS, ahead, -np.inf)))
-        if harm[worst] <= HARMLESS or ahead[worst] <= -MARGIN:
+        ahead[np.abs(away).max(axis=(1, 2)) <= HARMLESS] = -np.inf
+        worst = int(np.argmax(ahead))
+        if ahead[worst] <= -MARGIN:
             return '', False
-        if ahead[worst] > MARGIN:
+        # A sensor worse than configured is unlikely before the data, and no error of the user's:
+        # who accuses has to fit better than any level does.
+        fits = np.max((level - self.prior[filters.ids])[filters.counts])
+        if level[worst] - fits > MARGIN * max(misfit, 1.0):
             return in_words(self.table[filters.ids[worst]], filters.x[filters.lead[worst]],
                             self._gnss_delay), True
         return 'the signs of the IMU axes are not confirmed by the motion yet: turn', False
@@ -323,11 +269,13 @@ class Parameters:
         """
         noise = config.imu_noise
         matrices = noise.gyro_scale_std > 0
-        vehicle = OF_VEHICLE if config.vehicle != 'none' else 0
-        x, std, walk = np.zeros((3, GYRO + (24 if matrices else 6) + vehicle))
+        vehicle = config.vehicle != 'none'
+        x, std, walk = np.zeros((3, GYRO + (24 if matrices else 6) + OF_VEHICLE * vehicle))
         accel = triads(x.size)[1].start
         if vehicle:
-            std[-vehicle:], walk[-vehicle:] = known_of_vehicle(config)
+            drift = config.vehicle_velocity_std or DRIFTS[config.vehicle]
+            std[MOUNT], std[DRIFT] = math.radians(config.mount_yaw_std), drift
+            walk[DRIFT] = drift ** 2 / LASTING
         x[LEVER_ARM] = config.lever_arm
         std[LEVER_ARM] = max(config.lever_arm_std, rival.lever_arm_std)
         std[DELAY] = max(config.gnss_delay_std, rival.gnss_delay_std)
@@ -381,9 +329,3 @@ def level_in_words(level: Rival, noise: ImuNoise) -> str:
 def gyro_matrix_std(scale_std: float) -> Array:
     """Return sigmas of scale factors (diagonal) and misalignment of the gyros, shape (3, 3)."""
     return scale_std * np.where(np.eye(3) > 0, 1.0, GYRO_MISALIGNMENT)
-
-
-def log_sum(values: Array) -> float:
-    """Return the log of the sum of exponentials."""
-    largest = float(np.max(values))
-    return largest + math.log(float(np.sum(np.exp(values - largest))))

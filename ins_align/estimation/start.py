@@ -23,13 +23,13 @@ import math
 from typing import NamedTuple
 
 from ins_align.config import Config
-from ins_align.estimation.formula import AttitudeMoments
-from ins_align.estimation.linearised import FIRST, PHI, PHI0, RHO, XI
+from ins_align.estimation.moments import AttitudeMoments
 from ins_align.estimation.receiver import LEAST_NOISE, LOUD
+from ins_align.estimation.states import FIRST, PHI, PHI0, RHO, XI
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.rotation import apply, Array, cross, cumulative_rotations, exp_so3, Index
 from ins_align.gnss.messages import AntennaEpoch, velocities_of
-from ins_align.imu.intervals import Intervals
+from ins_align.imu.preintegration import Intervals
 import numpy as np
 
 # A start takes so many epochs, fewer leave the formula no redundancy, and waits for no more.

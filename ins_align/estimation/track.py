@@ -16,10 +16,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from ins_align.estimation.states import Measured
 from ins_align.geometry.earth import (
     earth_rate_n, gravitation_n, gravity_n, ground_velocity_n, LocalLevel, position_n)
 from ins_align.geometry.rotation import Array, cross, running_sum
-from ins_align.gnss.messages import AntennaEpoch
+from ins_align.gnss.messages import AntennaEpoch, velocities_of
 import numpy as np
 
 
@@ -119,8 +120,8 @@ class InertialTrack:
             *(np.array([getattr(epoch, name) for epoch in epochs])
               for name in ('latitude', 'longitude', 'altitude')))
 
-    def at(self, index: int | tuple[()]) -> 'InertialTrack':
-        """Return one epoch of a track over many; () of a track that is of one."""
+    def at(self, index: int | slice) -> 'InertialTrack':
+        """Return one epoch of a track over many, or some of them."""
         return replace(self, **{name: getattr(self, name)[index] for name in (
             'time', 'C_n0n', 'still_v', 's_p', 'gravity', 'gravitation', 'int_gravitation',
             'int_int_gravitation')})
@@ -128,3 +129,14 @@ class InertialTrack:
     def s_v(self, v_n: Array) -> Array:
         """Velocity side for antenna velocities `v_n` (ENU, m/s), shape (..., 3)."""
         return (self.C_n0n @ v_n[..., None])[..., 0] + self.still_v
+
+    def measured(self, epochs: Sequence[AntennaEpoch], use_position: bool) -> Measured:
+        """Return what the GNSS measures at the epochs of the track."""
+        C_n0n = self.C_n0n[:, None]
+        covariance = np.array([[epoch.velocity_covariance, epoch.position_covariance]
+                               for epoch in epochs])
+        return Measured(
+            np.stack([self.s_v(velocities_of(epochs)), self.s_p], axis=1),
+            C_n0n @ covariance @ C_n0n.swapaxes(-1, -2),
+            [(epoch.v_n is not None, epoch.position_measured and use_position)
+             for epoch in epochs], [epoch.stated for epoch in epochs], self.still_v)

@@ -27,21 +27,16 @@ there to contradict the others, nothing.
 import math
 
 from ins_align.config import Config
-from ins_align.estimation.filter import Filters, Look, Track
-from ins_align.estimation.linearised import (
-    DRIFT, FIRST, Linearised, MOUNT, OF_VEHICLE, PHI, XI)
-from ins_align.geometry.rotation import apply, Array, Index, skew
-from ins_align.geometry.transform import Transform
+from ins_align.estimation.filter import Filters, log_sum
+from ins_align.estimation.states import (
+    DRIFT, FIRST, Linearised, MARGIN, Measured, MOUNT, OF_VEHICLE, PHI, XI)
+from ins_align.geometry.rotation import apply, Array, Index, skew, Transform
 import numpy as np
 
-# Velocity sideways and upwards that lasts (m/s: tyres' slip, leeway and current, wind), and how
-# far the motion is off it without lasting (rad: bends, yawing in waves, gusts).
-KINDS = {'car': (0.1, math.radians(1.0)), 'boat': (1.0, math.radians(10.0)),
-         'aeroplane': (10.0, math.radians(5.0))}
+# How far the motion is off x without lasting (rad: bends, yawing in waves, gusts).
+SLIPS = {'car': math.radians(1.0), 'boat': math.radians(10.0), 'aeroplane': math.radians(5.0)}
 # Looks are so far apart (s) that what does not last is another; its least sigma (m/s).
 INTERVAL, NOISE = 1.0, 0.05
-# What lasts changes by its sigma in this time (s), as the wind does where an aeroplane turns.
-LASTING = 30.0
 # Backwards a vehicle goes as fast as this (m/s, 1 sigma).
 BACKWARDS_SPEED = 2.0
 # A speed of so many of its sigmas has a direction; that of a vehicle at rest would be noise, which
@@ -49,6 +44,8 @@ BACKWARDS_SPEED = 2.0
 MOVES = 5.0
 # Mounting and drift that are so many of their sigmas are none.
 MOST = 4.0
+# What is assumed of a vehicle must be likelier by this than nothing: some seconds of motion.
+CONFIRMED = 9.0
 NOT_USED = ('; the motion contradicts vehicle: {vehicle}, which is not used (a drift, a tow, a '
             'ferry, or x of base_frame does not point forward: raise mount_yaw_std or '
             'vehicle_velocity_std?)')
@@ -67,22 +64,23 @@ class Vehicle:
         From the base to the IMU.
     along : ndarray of int, shape (R,)
         Where each rival sets out: 1 forwards, -1 backwards, 0 anywhere.
+    std : ndarray, shape (4,)
+        Sigmas of mounting and drift.
 
     Attributes
     ----------
     position : ndarray, shape (3,)
         Of the base, in the frame of the IMU, m.
-    against : ndarray, shape (R,)
-        By how much the log likelihood of each is less, for the speed at which it went backwards.
 
     """
 
-    def __init__(self, config: Config, base: Transform, along: Index) -> None:
+    def __init__(self, config: Config, base: Transform, along: Index, std: Array) -> None:
         """Have seen nothing yet."""
         self._axes, self.position = base.rotation, base.translation
-        self._std, self._slip = known_of_vehicle(config)[0], KINDS[config.vehicle][1]
+        self._std, self._slip = std, SLIPS[config.vehicle]
         self._waited, self._along = INTERVAL, along
-        self.against = np.zeros(len(along))
+        # By how much the log likelihood of each is less, for the speed at which it went backwards.
+        self._against = np.zeros(len(along))
 
     def is_due(self, duration: float) -> bool:
         """Return whether to look again, when so many seconds have gone by."""
@@ -92,44 +90,52 @@ class Vehicle:
         self._waited = 0.0
         return True
 
-    def look(self, filters: Filters, model: Linearised, k: int, track: Track) -> Look:
-        """Look at epoch k."""
+    def look(self, filters: Filters, model: Linearised, k: int, measured: Measured) -> None:
+        """Hold filters to the motion along x of the base at epoch k."""
         assert model.base is not None
-        q, lead, along = filters.place, filters.lead, self._along[filters.ids]
+        q, lead, ids = filters.place, filters.lead, filters.ids
+        along = self._along[ids]
         H_v, expected, back = (values[k] for values in model.base)
-        v_n0 = filters.u - track.still[k]
+        v_n0 = filters.u - measured.still[k]
         v_b = (apply(filters.C.swapaxes(1, 2), v_n0) - expected[q]
                + apply(H_v[q][..., FIRST:], filters.x - model.point[q]))
         to_base = self._axes.T @ back.swapaxes(1, 2)
         v = apply(to_base[q], v_b)
         # A rival whose heading is open sets out in its direction; later it may turn back. The
         # derivatives are those at motion along x.
-        open_ = np.bincount(q) > 1
+        open_ = np.bincount(filters.rival)[ids] > 1
         fast = np.linalg.norm(v_n0[lead], axis=1)
         moves = fast > MOVES * np.sqrt(np.trace(filters.P[:, XI, XI], axis1=1, axis2=2) / 3)
         speed = np.where(open_, along * fast, v[lead, 0] * (along != 0))
-        self.against[filters.ids] = np.maximum(
-            self.against[filters.ids], 0.5 * (np.minimum(speed, 0.0) / BACKWARDS_SPEED) ** 2)
+        against = np.maximum(self._against[ids],
+                             0.5 * (np.minimum(speed, 0.0) / BACKWARDS_SPEED) ** 2)
+        filters.evidence = filters.evidence - (against - self._against[ids])
+        self._against[ids] = against
         H = to_base[:, 1:] @ H_v
         H[..., PHI] += to_base[:, 1:] @ skew(speed[:, None] * to_base[:, 0])
         x = H[..., FIRST:]
         x[..., MOUNT], x[..., DRIFT] = -speed[:, None, None] * np.eye(2), -np.eye(2)
         sideways = v[:, 1:] - v[:, :1] * filters.x[:, MOUNT] - filters.x[:, DRIFT]
-        return Look(moves & (along != 0), H, NOISE ** 2 + (self._slip * speed) ** 2, -sideways,
-                    np.maximum(-np.sign(speed)[q] * v[:, 0], 0.0),
-                    apply(filters.C, self._axes[:, 2])[:, 2] < 0)
+        filters.hold(moves & (along != 0), H, NOISE ** 2 + (self._slip * speed) ** 2, -sideways,
+                     np.maximum(-np.sign(speed)[q] * v[:, 0], 0.0),
+                     apply(filters.C, self._axes[:, 2])[:, 2] < 0)
 
-    def forward(self, C: Array) -> Array:
-        """Return x of the base for attitudes C of the IMU, shape (N, 3, 3)."""
-        return apply(C, self._axes[:, 0])
+    def contradicted(self, filters: Filters) -> bool:
+        """Return whether the motion contradicts what is assumed of the vehicle."""
+        x = filters.x[filters.lead[filters.best], -OF_VEHICLE:]
+        free = self._along[filters.ids] == 0
+        return bool(np.any(np.abs(x) > MOST * self._std) or log_sum(filters.evidence[free])
+                    >= log_sum(filters.evidence[~free]) + MARGIN)
 
-    def contradicts(self, x: Array) -> bool:
-        """Return whether the parameters x, shape (m,), can be those of the vehicle no more."""
-        return bool(np.any(np.abs(x[-OF_VEHICLE:]) > MOST * self._std))
+    def doubt(self, filters: Filters) -> str:
+        """Return that the motion does not confirm yet what is assumed of the vehicle, or ''."""
+        free = self._along[filters.ids] == 0
+        ahead = filters.evidence[filters.best] - np.max(filters.evidence[free])
+        return UNCONFIRMED if ahead < CONFIRMED else ''
 
-
-def known_of_vehicle(config: Config) -> tuple[Array, Array]:
-    """Return the sigmas of mounting and drift, and what a second adds to their variances."""
-    drift = config.vehicle_velocity_std or KINDS[config.vehicle][0]
-    std = np.array([math.radians(config.mount_yaw_std)] * 2 + [drift] * 2)
-    return std, np.array([0.0] * 2 + [drift ** 2 / LASTING] * 2)
+    def in_words(self, filters: Filters) -> str:
+        """Return what is not known of the vehicle's motion, as the end of a sentence, or ''."""
+        level = filters.evidence
+        likely = filters.lead[filters.counts & (level > level[filters.best] - MARGIN)]
+        x_n0 = apply(filters.C[likely], self._axes[:, 0])
+        return AMBIGUOUS if np.any(x_n0 @ x_n0.T < 0) else ''

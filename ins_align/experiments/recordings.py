@@ -26,7 +26,7 @@ from functools import lru_cache
 import itertools
 import math
 from pathlib import Path
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple
 
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config
@@ -38,11 +38,10 @@ from ins_align.geometry.earth import matrix_en, position_n
 from ins_align.geometry.rotation import apply, Array
 from ins_align.gnss.messages import Velocity
 from ins_align.recordings import BagError
+from ins_align.recordings.decode import ImuSamples, Orientations, Refused
+from ins_align.recordings.reader import read, Request
+from ins_align.results import Reference
 import numpy as np
-
-if TYPE_CHECKING:
-    from ins_align.recordings.decode import ImuSamples
-    from ins_align.recordings.replay import Reference
 
 # What is known beside the recording, by the beginning of its name: the lever arm, and how well
 # its reference is known (tilt, heading; degrees), where its stated sigma is too good to be true:
@@ -115,10 +114,6 @@ def recordings_in(folder: Path) -> list[Path]:
 @lru_cache(maxsize=3)
 def load(path: Path) -> Recording:
     """Read and decode a recording; the last few are kept."""
-    from ins_align.recordings.decode import ImuSamples, Orientations, Refused
-    from ins_align.recordings.reader import read, Request
-    from ins_align.recordings.replay import Reference
-
     parts = list(read(Request(path)))
     if parts[0].topics.reference is None:
         raise BagError(f'it has no reference attitude on {REFERENCE}')

@@ -12,13 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Rotations: vectors, matrices, quaternions; every function works over leading axes.
+Rotations: vectors, matrices, quaternions, over leading axes; transforms between fixed frames.
 
 Matrices are ``C_xy`` (components in y to components in x), quaternions are (x, y, z, w) of the
 same rotation with w >= 0, angles are radians.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,9 +28,9 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.integer[Any]]
 
-# Below this angle (rad) four terms of the Taylor series of sin(x)/x and friends are exact to
-# rounding.
+# Below this angle (rad) four terms of the Taylor series of (x - sin x)/x^3 are exact to rounding.
 _SERIES_ANGLE = 0.05
+_TINY = 1e-300          # an angle that may be divided by, and is none
 
 
 def apply(matrix: Array, vectors: Array) -> Array:
@@ -92,17 +94,15 @@ def cross(a: ArrayLike, b: ArrayLike) -> Array:
     return result
 
 
+_EYE = np.eye(3)
+_SKEWS = skew(_EYE).reshape(3, 9)       # row i: that of unit vector i
+
+
 def _trigonometric_factors(angle2: Array) -> tuple[Array, Array]:
-    """Return sin(x)/x and (1 - cos x)/x^2 of x^2."""
-    a = 1 - angle2 / 6 * (1 - angle2 / 20 * (1 - angle2 / 42))
-    b = 0.5 - angle2 / 24 * (1 - angle2 / 30 * (1 - angle2 / 56))
-    small = angle2 < _SERIES_ANGLE ** 2
-    if small.all():
-        return a, b
-    x2 = np.where(small, 1.0, angle2)
-    x = np.sqrt(x2)
-    return (np.where(small, a, np.sin(x) / x),
-            np.where(small, b, 2 * np.sin(x / 2) ** 2 / x2))
+    """Return sin(x)/x and (1 - cos x)/x^2 of x^2, from half the angle: exact to rounding."""
+    half = 0.5 * np.sqrt(angle2) + _TINY
+    ratio = np.sin(half) / half
+    return ratio * np.cos(half), 0.5 * ratio * ratio
 
 
 def exp_and_left_jacobian(vector: ArrayLike) -> tuple[Array, Array]:
@@ -146,8 +146,13 @@ def _rodrigues(v: Array, angle2: Array, odd: Array, even: Array) -> Array:
 def exp_so3(vector: ArrayLike) -> Array:
     """Return rotation matrices, shape (..., 3, 3), of rotation vectors (Rodrigues' formula)."""
     v = np.asarray(vector, dtype=float)
-    angle2 = _squared_norm(v)
-    return _rodrigues(v, angle2, *_trigonometric_factors(angle2))
+    angle2 = np.einsum('...i,...i', v, v)
+    odd, even = _trigonometric_factors(angle2)
+    # Few calls: most arrays are small. Each entry of the skew matrix is one product and zeros.
+    matrix: Array = (even[..., None] * v)[..., :, None] * v[..., None, :]
+    matrix += ((odd[..., None] * v) @ _SKEWS).reshape(matrix.shape)
+    matrix += (1.0 - even * angle2)[..., None, None] * _EYE
+    return matrix
 
 
 def rotated(rotation: Array, vectors: Array) -> Array:
@@ -165,20 +170,16 @@ def log_so3(matrix: ArrayLike) -> Array:
     full precision near pi.
     """
     m = np.asarray(matrix, dtype=float)
-    cosine = 0.5 * (m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2] - 1)
+    cosine = 0.5 * (np.einsum('...ii', m) - 1.0)
     if (cosine > 0).all():
-        axis = np.empty(m.shape[:-1])
-        axis[..., 0] = m[..., 2, 1] - m[..., 1, 2]
-        axis[..., 1] = m[..., 0, 2] - m[..., 2, 0]
-        axis[..., 2] = m[..., 1, 0] - m[..., 0, 1]
-        axis, part = 0.5 * axis, 1.0                # of the angle, whose sine the axis has
+        # Half of m_32 - m_23, m_13 - m_31, m_21 - m_12; of the angle, whose sine the axis has.
+        axis, part = 0.5 * (m.reshape(m.shape[:-2] + (9,)) @ _SKEWS.T), 1.0
     else:
         q = quaternion_from_matrix(m)
         axis, cosine, part = q[..., :3], q[..., 3], 2.0
-    sine = np.sqrt(_squared_norm(axis))
-    small = sine < 1e-12
-    scale = np.where(small, part, part * _arctan2(sine, cosine) / np.where(small, 1.0, sine))
-    return axis * scale[..., None]
+    sine = np.sqrt(np.einsum('...i,...i', axis, axis)) + _TINY
+    angle: Array = part * _arctan2(sine, cosine) / sine
+    return axis * angle[..., None]
 
 
 def _arctan2(y: Array, x: Array) -> Array:
@@ -266,3 +267,19 @@ def cumulative_rotations(steps: Array) -> Array:
 def running_sum(start: Array, steps: Array) -> Array:
     """Return ``start + steps[0] + ... + steps[k]`` for every k, to the bit as one by one."""
     return np.cumsum(np.concatenate([start[None], steps]), axis=0)[1:]
+
+
+class Transform(NamedTuple):
+    """Takes vectors of a source frame to a target frame: rotate, then add."""
+
+    rotation: Array  # (3, 3)
+    translation: Array  # (3,), m
+
+    def after(self, other: Transform) -> Transform:
+        """Return the transform that does the other one first."""
+        return Transform(self.rotation @ other.rotation,
+                         self.rotation @ other.translation + self.translation)
+
+    def inverse(self) -> Transform:
+        """Return the transform from target to source."""
+        return Transform(self.rotation.T, -self.rotation.T @ self.translation)

@@ -13,6 +13,8 @@
 # limitations under the License.
 """Where the GNSS antenna is: GNSS messages put together to the epochs that a method takes."""
 
+from __future__ import annotations
+
 from collections import Counter, deque
 import math
 
@@ -51,13 +53,8 @@ class Antenna:
     """
     Follows the antenna from epoch to epoch, with or without a fix in each.
 
-    Parameters
-    ----------
-    config : Config
-    counts : Counter
-        Where is counted what is not believed: ``fix_jump``, ``fix_covariance``,
-        ``velocity_covariance``, ``velocity_no_vertical``.
-
+    What is not believed is counted: ``fix_jump``, ``fix_covariance``, ``velocity_covariance``,
+    ``velocity_no_vertical``.
     """
 
     def __init__(self, config: Config, counts: Counter[str]) -> None:
@@ -105,10 +102,9 @@ class Antenna:
         believed = self._locate(message.stamp_ns, fix, self._v_n if v_n is None else v_n)
         if self._place is None or self.jumped:
             return None
-        stated = fix.covariance if fix is not None and believed else None
-        position_covariance = self._position_noise.believed(stated)
-        if position_covariance is not stated and stated is not None:
-            self._counts['fix_covariance'] += 1
+        position_covariance = self._believed(
+            self._position_noise, fix.covariance if fix is not None and believed else None,
+            'fix_covariance')
         if fix is not None and not fix.vertical:
             position_covariance = _without_vertical(position_covariance, _UNKNOWN_ALTITUDE_STD)
         if v_n is not None or believed:
@@ -165,11 +161,15 @@ class Antenna:
             self._place, self._place_ns = predicted, stamp_ns
         return False
 
-    def _covariance_of(self, velocity: Velocity | None) -> Array:
-        stated = None if velocity is None else velocity.covariance
-        covariance = self._velocity_noise.believed(stated)
+    def _believed(self, noise: StatedNoise, stated: Array | None, counter: str) -> Array:
+        covariance = noise.believed(stated)
         if covariance is not stated and stated is not None:
-            self._counts['velocity_covariance'] += 1
+            self._counts[counter] += 1
+        return covariance
+
+    def _covariance_of(self, velocity: Velocity | None) -> Array:
+        covariance = self._believed(self._velocity_noise, None if velocity is None
+                                    else velocity.covariance, 'velocity_covariance')
         if not self._vertical or (velocity is not None and not velocity.vertical):
             return _without_vertical(covariance, _UNKNOWN_VERTICAL_STD)
         return covariance
@@ -183,32 +183,16 @@ def _without_vertical(covariance: Array, std: float) -> Array:
 
 
 class StatedNoise:
-    """
-    What a receiver states about its noise, as far as it can be believed.
-
-    Parameters
-    ----------
-    std, std_vertical : float
-        Of a receiver that states nothing, 1 sigma.
-
-    """
+    """What a receiver states about its noise, as far as it can be believed."""
 
     def __init__(self, std: float, std_vertical: float) -> None:
-        """Expect what is configured."""
+        """Expect what is configured, 1 sigma, for a receiver that states nothing."""
         self._default = np.diag([std ** 2, std ** 2, std_vertical ** 2])
         self._variances = self._default.diagonal().tolist()
         self._recent: list[deque[float]] = [deque(maxlen=USUAL_EPOCHS) for _ in self._variances]
 
     def believed(self, covariance: Array | None) -> Array:
-        """
-        Return the covariance to work with, shape (3, 3), ENU.
-
-        Parameters
-        ----------
-        covariance : ndarray, shape (3, 3), or None
-            As stated; itself is returned where it can be believed.
-
-        """
+        """Return the covariance to work with, (3, 3), ENU: the stated one if it is believed."""
         if covariance is None:
             return self._default
         variances = covariance.diagonal().tolist()

@@ -61,17 +61,9 @@ class GnssBuffer:
     """
     GNSS messages that are not used yet, by stamp.
 
-    Parameters
-    ----------
-    lateness_ns : int
-        How much later than newer IMU samples a message may arrive.
-    counts : Counter
-        Where messages are counted, and epochs that only repeat the one before
-        (``gnss_repeated``) or are behind the end of the IMU (``gnss_after_imu``), and velocities
-        of a receiver that has no fix (``velocity_no_fix``).
-    pair_ns : int
-        A fix and a velocity that are no further apart are of one epoch; 0: where the stamp is one.
-
+    They are counted, and so are epochs that only repeat the one before (``gnss_repeated``) or are
+    behind the end of the IMU (``gnss_after_imu``), and velocities of a receiver that has no fix
+    (``velocity_no_fix``). A fix and a velocity no further apart than `pair_ns` are of one epoch.
     """
 
     def __init__(self, lateness_ns: int, counts: Counter[str], pair_ns: int = 0) -> None:
@@ -137,11 +129,7 @@ class GnssBuffer:
         return 'ahead' if stamp_ns > imu_newest_ns + MAX_AHEAD_NS else ''
 
     def left_out(self, kind: str, before: Counter[str]) -> str:
-        """
-        List in words what was left out since the counts were those `before`; '' if nothing.
-
-        `kind`: ``fix`` or ``velocity``.
-        """
+        """List in words which of a kind, fix or velocity, were left out since counts `before`."""
         parts = []
         for ending, why in _LEFT_OUT.items():
             name = f'{kind}_{ending}'

@@ -25,13 +25,6 @@ from ins_align.config import Config
 from ins_align.gnss.messages import Fix, fixes, MessageError, stamp_from_msg, velocities, Velocity
 import numpy as np
 
-ENU_FROM: dict[str, Callable[[float, float, float], tuple[float, float, float]]] = {
-    'enu': lambda east, north, up: (east, north, up),
-    'ned': lambda north, east, down: (east, north, -down),
-    # Speed, m/s, track, degrees clockwise from north, and climb, m/s.
-    'track': lambda speed, track, climb: (speed * math.sin(math.radians(track)),
-                                          speed * math.cos(math.radians(track)), climb),
-}
 FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
 UTC_KNOWN = 3  # UBX-NAV-PVT, valid: bits of date and time
 
@@ -65,7 +58,7 @@ class Receiver(NamedTuple):
     position: Mapping[str, float]  # latitude and longitude, degrees; altitude, m
     position_std: Mapping[str, float]  # m; or a covariance with its type as in NavSatFix
     velocity: Mapping[str, float]  # m/s
-    frame: str  # of the velocity, one of ENU_FROM
+    frame: str  # of the velocity: enu, ned, or track: speed, course from north, degrees, climb
     velocity_std: Mapping[str, float]  # m/s
     has_velocity: Callable[[Any], bool] = lambda msg: True
     unknown: tuple[float, ...] = ()  # what stands for a number that is not known
@@ -116,24 +109,16 @@ DRIVER_TYPES = {**RECEIVERS, **INERTIAL_UNITS}
 
 def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velocity]:
     """
-    Convert a message of one of RECEIVERS.
+    Convert a message of one of RECEIVERS, which say what axes they have.
 
-    `config` has the standard deviations that are not stated; its velocity_frame is not for these
-    messages, which say what axes they have.
-
-    Raises
-    ------
-    NoTimeError
-        If the receiver does not know the time yet.
-    MessageError
-        If a field is missing, or a position is in other units than those of the table.
-
+    `config` has the standard deviations that are not stated. A NoTimeError says that the receiver
+    does not know the time yet, another MessageError that a field is missing or in other units.
     """
     row = RECEIVERS[msgtype]
     try:
         stamp_ns, has_fix = row.stamp(msg), row.has_fix(msg)
         position = _numbers(msg, row, row.position)
-        enu = ENU_FROM[row.frame](*_numbers(msg, row, row.velocity))
+        velocity_numbers = _numbers(msg, row, row.velocity)
         position_std, velocity_std = (_numbers(msg, row, fields)
                                       for fields in (row.position_std, row.velocity_std))
         has_velocity = row.has_velocity(msg)
@@ -146,19 +131,20 @@ def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velo
                 f'units of {row.position[field]:.6g} deg')
     fix, = fixes([stamp_ns], [position], _covariance(position_std),
                  [getattr(msg, 'position_covariance_type', 2)], [0 if has_fix else -1])
+    frame = row.frame
+    if frame == 'track':
+        speed, course, climb = velocity_numbers
+        east, north = math.sin(math.radians(course)), math.cos(math.radians(course))
+        velocity_numbers, frame = [speed * east, speed * north, climb], 'enu'
     velocity, = velocities(
-        [stamp_ns], '', [enu if has_velocity else [math.nan] * 3],
+        [stamp_ns], '', [velocity_numbers if has_velocity else [math.nan] * 3],
         _covariance(velocity_std) if velocity_std else None,
-        dataclasses.replace(config, velocity_frame='enu'))
+        dataclasses.replace(config, velocity_frame=frame))
     return fix, velocity
 
 
 def imu_from_driver(msg: Any, msgtype: str) -> tuple[int, np.ndarray, np.ndarray]:
-    """
-    Convert a message of one of INERTIAL_UNITS like `messages.imu_from_msg`.
-
-    A field that is missing is a MessageError.
-    """
+    """Convert a message of one of INERTIAL_UNITS; a field that is missing is a MessageError."""
     row = INERTIAL_UNITS[msgtype]
     try:
         return (row.stamp(msg), row.axes * np.asarray(getattr(msg, row.gyro), float),

@@ -30,9 +30,13 @@ from ins_align.geometry.rotation import Array
 import numpy as np
 from numpy.typing import ArrayLike
 
-ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-# The same without products, in which one component that is not finite would spoil the others.
-NED_ORDER, NED_SIGNS = [1, 0, 2], np.array([1.0, 1.0, -1.0])
+
+def enu_from_ned(vectors: Array) -> Array:
+    """Turn vectors, (..., 3), without products: what is not finite spoils nothing else."""
+    return vectors[..., [1, 0, 2]] * [1.0, 1.0, -1.0]
+
+
+ENU_FROM_NED = enu_from_ned(np.eye(3))
 
 # Names of the customary body frames (REP-105 and what drivers call the rest), as a whole word of
 # the frame_id. A GNSS driver puts "gps", "gnss", "antenna" or a world frame instead.
@@ -75,43 +79,20 @@ class Velocity(NamedTuple):
 
 @dataclass(frozen=True)
 class AntennaEpoch:
-    """
-    Where the antenna is and how it moves at a GNSS epoch, as a method takes it.
-
-    Attributes
-    ----------
-    stamp_ns : int
-    latitude, longitude, altitude : float
-        Of the antenna, radians and metres; always there.
-    v_n : ndarray, shape (3,), or None
-        Antenna velocity, ENU, m/s.
-    velocity_covariance, position_covariance : ndarray, shape (3, 3)
-        ENU.
-    position_measured : bool
-        Whether the position is a measurement to align with.
-    gravity_drift : float
-        Noise density of gravity because the place is not known, m/s/sqrt(s).
-    fault : str
-        Fault of the velocities up to here, in words; '' when none is known.
-    dry : bool
-        Whether there is no GNSS message at all: an epoch that divides an outage.
-    stated : (bool, bool)
-        Whether the receiver states the noise of the velocity and of the position.
-
-    """
+    """Where the antenna is and how it moves at a GNSS epoch, as a method takes it."""
 
     stamp_ns: int
-    latitude: float
+    latitude: float  # of the antenna, radians; always there
     longitude: float
-    altitude: float
-    v_n: Array | None
-    velocity_covariance: Array
-    position_measured: bool
+    altitude: float  # m
+    v_n: Array | None  # (3,), antenna velocity, ENU, m/s
+    velocity_covariance: Array  # (3, 3), ENU
+    position_measured: bool  # whether the position is a measurement to align with
     position_covariance: Array
-    gravity_drift: float = 0.0
-    fault: str = ''
-    dry: bool = False
-    stated: tuple[bool, bool] = (True, True)
+    gravity_drift: float = 0.0  # noise of gravity for want of a place, m/s/sqrt(s)
+    fault: str = ''  # of the velocities up to here, in words; '' when none is known
+    dry: bool = False  # whether no GNSS message is there: an epoch that divides an outage
+    stated: tuple[bool, bool] = (True, True)  # is the noise of velocity and position stated?
 
 
 def velocities_of(epochs: Sequence[AntennaEpoch]) -> Array:
@@ -183,17 +164,10 @@ def fixes_from_msgs(msgs: Sequence[Any]) -> list[Fix]:
 def fixes(stamps_ns: ArrayLike, places: ArrayLike, covariances: np.ndarray,
           covariance_types: ArrayLike, status: ArrayLike) -> list[Fix]:
     """
-    Make fixes of the columns of N messages.
+    Make fixes of the columns of N messages, types and status as in sensor_msgs/NavSatFix.
 
-    Parameters
-    ----------
-    stamps_ns, covariance_types, status : array_like of int, shape (N,)
-        The last two as in sensor_msgs/NavSatFix.
-    places : array_like, shape (N, 3)
-        Latitude and longitude, degrees; altitude, m.
-    covariances : ndarray, shape (N, 3, 3)
-        As sent, m^2.
-
+    Places, (N, 3), are latitude and longitude, degrees, and altitude, m; covariances, (N, 3, 3),
+    as sent, m^2.
     """
     columns = (stamps_ns, *np.asarray(places, float).T, covariance_types, status)
     return [Fix(stamp, latitude, longitude, altitude, covariance if kind != 0 else None, mode)
@@ -203,15 +177,7 @@ def fixes(stamps_ns: ArrayLike, places: ArrayLike, covariances: np.ndarray,
 
 
 def velocity_from_msg(msg: Any, config: Config) -> Velocity:
-    """
-    Convert the velocity message that ``config.velocity_type`` names, like `velocities`.
-
-    Raises
-    ------
-    MessageError
-        If the message says that the velocity is given in a body frame.
-
-    """
+    """Convert the message that ``config.velocity_type`` names, like `velocities`."""
     return velocities_from_msgs([msg], config)[0]
 
 
@@ -244,29 +210,13 @@ def is_body_frame(frame: str) -> bool:
 def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
                covariances: np.ndarray | None, config: Config) -> list[Velocity]:
     """
-    Make velocities of the columns of N messages.
+    Make velocities of the columns of N messages that say that they are in a frame.
 
     A variance that is 0 (or less than that of any sensor), negative (-1 marks "unknown") or not
     finite takes the configured value; where all three are like that, the covariance is None.
-
-    Parameters
-    ----------
-    stamps_ns : array_like of int, shape (N,)
-        Times of measurement.
-    frame : str
-        In which they say that they are.
-    linear : array_like, shape (N, 3)
-        m/s; east, north, up or as ``config.velocity_frame`` says.
-    covariances : ndarray, shape (N, 6, 6), or None
-        Of a twist.
-    config : Config
-        What axes they are in, and standard deviations that are not stated.
-
-    Raises
-    ------
-    MessageError
-        If the frame is that of a body and ``config.velocity_frame`` does not say otherwise.
-
+    `linear`, (N, 3), m/s, is east, north, up or as ``config.velocity_frame`` says; covariances,
+    (N, 6, 6), are those of twists. The frame of a body is a MessageError, unless
+    ``config.velocity_frame`` says otherwise.
     """
     if config.velocity_frame == 'auto' and is_body_frame(frame):
         raise MessageError(
@@ -275,13 +225,13 @@ def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
             'frame_id says, set velocity_frame to enu or ned')
     velocity = np.array(linear, dtype=float)
     usable: list[np.ndarray | None] = [None] * len(velocity)
-    if config.velocity_frame == 'ned':
-        velocity = velocity[:, NED_ORDER] * NED_SIGNS
     if covariances is not None:
         covariances = covariances[:, :3, :3]
-        if config.velocity_frame == 'ned':
-            covariances = (covariances[:, NED_ORDER][:, :, NED_ORDER]
-                           * np.outer(NED_SIGNS, NED_SIGNS))
+    if config.velocity_frame == 'ned':
+        velocity = enu_from_ned(velocity)
+        if covariances is not None:
+            covariances = enu_from_ned(enu_from_ned(covariances).swapaxes(1, 2))
+    if covariances is not None:
         usable = _usable_covariances(
             covariances, (config.velocity_std, config.velocity_std, config.velocity_std_vertical))
     return [Velocity(*columns) for columns in zip(np.asarray(stamps_ns).tolist(), velocity,
@@ -291,10 +241,9 @@ def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
 def _usable_covariances(covariances: np.ndarray, default_std: tuple[float, float, float] | None,
                         ) -> list[np.ndarray | None]:
     """
-    Return symmetric positive definite (3, 3) covariances, None where nothing is known.
+    Return symmetric positive definite covariances of those sent, None where nothing is known.
 
-    Of covariances as sent, with whatever drivers put in for "unknown". `default_std` stands in
-    for single unknown variances; None: one unknown variance makes all unknown.
+    `default_std` stands in for single unknown variances; None: one makes all unknown.
     """
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     known = (variances >= SMALLEST_VARIANCE) & (variances < np.inf)

@@ -11,12 +11,24 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""IMU samples that have arrived and are not integrated yet, in the order of their stamps."""
+"""
+IMU samples that have arrived, put in order, and cut into steps between GNSS epochs.
+
+The steps come with their white noise: what is stated, what is measured, and what makes the samples
+miss the motion (gaps, stamps that jitter, the end of the sensors' range, gravity at a place that
+is not known).
+"""
 
 from collections import Counter
+from typing import NamedTuple
 
+from ins_align.config import ImuNoise
 from ins_align.geometry.rotation import Array, Index
-from ins_align.imu.noise import IMU_BEFORE, without_spikes
+from ins_align.imu.noise import (
+    gap_and_jitter, GAP_ANGULAR_ACCELERATION, GAP_JERK, IMU_BEFORE, RangeCheck, stuck, white_noise,
+    without_spikes)
+from ins_align.imu.preintegration import Intervals, Noise, preintegrate, split_at_epochs, Steps
+from ins_align.imu.recent import AGES, Recent, recent_motion
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -25,16 +37,48 @@ MAX_RATE, MAX_ACCELERATION = 200.0, 2000.0
 _LIMITS = np.repeat([MAX_RATE, MAX_ACCELERATION], 3)[:, None]
 # The IMU may be silent for this long; then the attitude is lost and alignment starts over (ns).
 MAX_GAP_NS = 500_000_000
+NO_SAMPLE = f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s'
 # IMU samples that are kept before those wanted: interpolation needs two, the checks the rest.
 KEPT_BEFORE = 2 + IMU_BEFORE
 # So many IMU samples in a row that go in order, behind the newest one, through a time that others
 # have gone through before them: not late, but of a clock that was set back.
 SET_BACK_SAMPLES = 8
+# Noise is measured over the interval and this long before it (ns); it counts when it is this
+# many times the stated one.
+NOISE_WINDOW_NS = 500_000_000
+NOISE_EXCESS = 1.25
+# Samples are kept for that, and for as long as a receiver may be late.
+KEPT_NS = max(NOISE_WINDOW_NS, round(1e9 * AGES[-1]))
+# How many IMU samples are cut at one go; those that an epoch looks back at count for a sixth.
+MAX_CUT_SAMPLES, LOOKED_AT = 6144, 6
 # Why samples were left out, by the name under which they are counted.
 _LEFT_OUT = {'imu_undecodable': 'that cannot be decoded',
              'imu_nan': 'without numbers or with impossible ones',
              'imu_duplicate': 'with the stamp of another (does the driver set stamps?)',
              'imu_late': 'too late'}
+
+
+class Silence(NamedTuple):
+    """A time in which the IMU says too little: stamps, the count's name, why in words."""
+
+    start_ns: int
+    end_ns: int
+    counter: str
+    why: str
+
+
+class ImuSteps(NamedTuple):
+    """IMU steps before each of K epochs, the white noise in them and the motion at their ends."""
+
+    steps: Steps
+    noise: Noise
+    recent: Recent
+    # Sum and number of the magnitudes of the specific force before each epoch, and seconds.
+    forces: list[tuple[float, int, float]]
+
+    def integrated(self) -> Intervals:
+        """Return the intervals that they make."""
+        return preintegrate(self.steps, self.noise, self.recent)
 
 
 class ImuBuffer:
@@ -46,8 +90,9 @@ class ImuBuffer:
     lateness_ns : int
         How far out of order a sample may arrive.
     counts : Counter
-        Where samples are counted: ``imu``, ``imu_nan``, ``imu_duplicate``, ``imu_out_of_order``,
-        ``imu_late``, ``imu_ahead``.
+        Where is counted what becomes of samples, by names that begin with ``imu``.
+    stated : ImuNoise, optional
+        What noise the sensors have at least.
 
     Attributes
     ----------
@@ -59,35 +104,40 @@ class ImuBuffer:
     newest_ns : int or None
         The newest stamp that has come.
     used_ns : int
-        Up to here samples are used: what comes later and is older is late.
+        Up to here samples are cut: what comes later and is older is late.
     jumped_to_ns : int or None
         Where the clock has jumped back to.
 
     """
 
-    def __init__(self, lateness_ns: int, counts: Counter[str]) -> None:
+    def __init__(self, lateness_ns: int, counts: Counter[str],
+                 stated: ImuNoise = ImuNoise(0.0, 0.0, 0.0, 0.0)) -> None:
         """Start empty."""
-        self.lateness_ns = lateness_ns
+        self._lateness_ns = lateness_ns
         self._reach_ns = max(lateness_ns, MAX_GAP_NS)
         self._counts = counts
+        self._stated = np.array(stated[:2])
         self.stamps = np.zeros(0, np.int64)
         self.samples = np.zeros((0, 6), order='F')
         # What is not sorted into these yet: stamps and samples, of one sample or of many.
         self._new: list[tuple[ArrayLike, ArrayLike]] = []
         self.newest_ns: int | None = None
-        self.used_ns = -(1 << 62)
         self._suspect_ns: int | None = None
         # A sample far ahead of the others, until the next one shows whether time goes on there.
         self._ahead: tuple[int, Array, Array] | None = None
         # The samples in a row behind the newest one: that one, the first, the last, how many.
         self._behind: tuple[int | None, int, int, int] = None, 0, 0, 0
         self.jumped_to_ns: int | None = None
+        self.used_ns = -(1 << 62)
+        self._range = RangeCheck()
+        self._checked_ns = 0                # up to where it has seen them
+        self._silences: list[Silence] = []
 
     def add(self, stamp_ns: int, gyro: Array, accel: Array) -> None:
         """Append one sample."""
         if self._ahead is not None:
             ahead, self._ahead = self._ahead, None
-            if stamp_ns >= ahead[0] - self.lateness_ns:
+            if stamp_ns >= ahead[0] - self._lateness_ns:
                 self._append(*ahead)
             else:
                 self._counts['imu_ahead'] += 1
@@ -98,8 +148,14 @@ class ImuBuffer:
 
     def _append(self, stamp_ns: int, gyro: Array, accel: Array) -> None:
         newest = self.newest_ns
-        if newest is not None and stamp_ns < newest - self.lateness_ns:
-            self._old_sample(stamp_ns)
+        if newest is not None and stamp_ns < newest - self._lateness_ns:
+            # One sample from long ago is late; a second one after it means a clock set back.
+            suspect = self._suspect_ns
+            if suspect is not None and 0 <= stamp_ns - suspect < 1_000_000_000:
+                self.jumped_to_ns = stamp_ns
+            else:
+                self._suspect_ns = stamp_ns
+                self._counts['imu_late'] += 1
             return
         self._suspect_ns = None
         if newest is None or stamp_ns > newest:
@@ -115,11 +171,7 @@ class ImuBuffer:
         """
         Append samples, shapes (N,), (N, 3), (N, 3); the same as one by one.
 
-        Returns
-        -------
-        int
-            How many were taken: all, or those before the one at which the clock has jumped.
-
+        Returns how many were taken: all, or those before the one at which the clock has jumped.
         """
         if stamps_ns.size == 0:
             return 0
@@ -137,15 +189,6 @@ class ImuBuffer:
         self._new.append((stamps_ns, np.hstack([gyro, accel])))
         self.newest_ns = int(stamps_ns[-1])
         return int(stamps_ns.size)
-
-    def _old_sample(self, stamp_ns: int) -> None:
-        """One sample from long ago is late; a second one after it means a clock set back."""
-        suspect = self._suspect_ns
-        if suspect is not None and 0 <= stamp_ns - suspect < 1_000_000_000:
-            self.jumped_to_ns = stamp_ns
-            return
-        self._suspect_ns = stamp_ns
-        self._counts['imu_late'] += 1
 
     def _set_back(self, stamp_ns: int) -> bool:
         """Whether samples behind the newest one are of a clock that was set back a little."""
@@ -201,7 +244,7 @@ class ImuBuffer:
         self.consolidate(last)
         if self.newest_ns is None or self.stamps.size < 4:
             return None
-        settled_ns = self.newest_ns - (0 if last else self.lateness_ns)
+        settled_ns = self.newest_ns - (0 if last else self._lateness_ns)
         settled = int(np.searchsorted(self.stamps, settled_ns, side='right'))
         # Interpolation at an epoch wants two samples after it, and whether they are spikes shows
         # in the next one.
@@ -211,7 +254,7 @@ class ImuBuffer:
     def silent(self) -> bool:
         """Whether samples come, but for too long none that could be used."""
         return (self.newest_ns is not None and self.stamps.size > 0
-                and self.newest_ns - self.lateness_ns - int(self.stamps[-1]) > MAX_GAP_NS)
+                and self.newest_ns - self._lateness_ns - int(self.stamps[-1]) > MAX_GAP_NS)
 
     def left_out(self, before: Counter[str]) -> str:
         """List in words what was left out since the counts were those `before`."""
@@ -235,6 +278,95 @@ class ImuBuffer:
         return stamps[first - looked_at:], rates[first - looked_at:], rate
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Drop samples before `stamp_ns`, but for those that are still looked at."""
-        first = max(int(np.searchsorted(self.stamps, stamp_ns, side='right')) - KEPT_BEFORE, 0)
-        self.stamps, self.samples = self.stamps[first:], self.samples[first:]
+        """Drop samples that no epoch at or after a stamp looks back at."""
+        first = int(np.searchsorted(self.stamps, stamp_ns - KEPT_NS, side='right')) - KEPT_BEFORE
+        self.stamps, self.samples = self.stamps[max(first, 0):], self.samples[max(first, 0):]
+        self._range.forget_before(stamp_ns)
+
+    # Steps between epochs
+
+    def check(self, upto_ns: int) -> None:
+        """Look for times in which the IMU says too little, and for the end of its range."""
+        stamps = self.stamps
+        first, last = np.searchsorted(stamps, [self._checked_ns, upto_ns], side='right').tolist()
+        context = max(first - IMU_BEFORE, 0)
+        around = slice(context, last + 1)
+        samples, _ = without_spikes(stamps[around], self.samples[around])
+        before = self._range.stamps.size
+        self._range.add(stamps[first:last], samples[first - context:last - context])
+        self._counts['imu_saturated'] += self._range.stamps.size - before
+        self._checked_ns = max(self._checked_ns, upto_ns)
+        gaps = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
+        self._silences = [Silence(start, end, 'imu_gap', NO_SAMPLE) for start, end in
+                          zip(stamps[gaps].tolist(), stamps[gaps + 1].tolist())]
+        # An epoch is taken when the IMU is ahead by the lateness: what is known by then counts.
+        self._silences += [Silence(max(start, known - self._lateness_ns), end, 'imu_stuck',
+                                   'the IMU sends the same values again and again')
+                           for start, end, known in stuck(stamps, self.samples)]
+        self._silences += [Silence(stamp - 1, stamp, 'imu_blind', 'the gyros are at the end of '
+                                   'their range: let the driver set a larger one')
+                           for stamp in self._range.blind]
+
+    def silence(self, start_ns: int, end_ns: int) -> Silence | None:
+        """Return why the IMU says too little between two stamps, or at one."""
+        return next((silence for silence in self._silences
+                     if silence.start_ns < end_ns and silence.end_ns > start_ns), None)
+
+    def parts(self, epochs_ns: list[int]) -> list[slice]:
+        """Divide epochs into parts to be cut one after the other, so that memory is bounded."""
+        stamps = self.stamps
+        place, first = np.searchsorted(stamps, [epochs_ns, np.subtract(epochs_ns, KEPT_NS)])
+        size = place - place[0] + np.cumsum(place - first) // LOOKED_AT
+        starts = np.flatnonzero(np.diff(size // MAX_CUT_SAMPLES, prepend=-1)).tolist()
+        return [slice(*ends) for ends in zip(starts, [*starts[1:], len(epochs_ns)])]
+
+    def start(self, stamp_ns: int) -> ImuSteps:
+        """Return the steps of no length at the first epoch of an alignment."""
+        self.used_ns = stamp_ns
+        return self.cut([stamp_ns], [0.0])
+
+    def cut(self, epochs_ns: list[int], gravity_drift: list[float]) -> ImuSteps:
+        """
+        Return the steps up to each epoch, in increasing order, since the one before.
+
+        `gravity_drift`: noise of gravity for want of a place, m/s/sqrt(s), before each.
+        """
+        stamps = self.stamps
+        ends_ns = np.array([self.used_ns, *epochs_ns])
+        ends = np.searchsorted(stamps, ends_ns, side='left') + 2
+        first = np.searchsorted(stamps, ends_ns[:-1] - NOISE_WINDOW_NS)
+        stamps = stamps[:ends[-1] + 1]
+        samples, spikes = without_spikes(stamps, self.samples[:stamps.size])
+        self._counts['imu_spike'] += int(np.count_nonzero(spikes[ends[0] - 2:ends[-1] - 2]))
+        stamps, samples = stamps[:ends[-1]], samples[:ends[-1]]
+        steps = split_at_epochs(stamps, samples, ends_ns)
+        measured = white_noise(stamps, samples, first, ends[1:])
+        excess = np.where(measured > NOISE_EXCESS * self._stated, np.sqrt(np.maximum(
+            measured ** 2 - self._stated ** 2, 0.0)), 0.0)
+        gap, jitter = gap_and_jitter(stamps, first, ends[1:], steps.dt)
+        self._counts['imu_gap'] += int(np.count_nonzero(gap))
+        beyond = self._range.beyond(stamps, ends_ns, steps.dt)
+        noise = Noise(
+            _together(self._stated[0], GAP_ANGULAR_ACCELERATION * gap,
+                      jitter * _rms(steps.omega_dot), beyond[0]),
+            _together(self._stated[1], GAP_JERK * gap, jitter * _rms(steps.f_dot), beyond[1],
+                      np.array(gravity_drift)[:, None]),
+            excess[:, :1], excess[:, 1:])
+        magnitudes = np.sqrt(np.sum(np.square(samples[:, 3:]), axis=1))
+        sums = np.diff(np.concatenate([[0.0], np.cumsum(magnitudes)])[ends - 2])
+        seconds = np.diff(ends_ns) * 1e-9
+        cut = ImuSteps(steps, noise, recent_motion(stamps, samples, ends_ns[1:]),
+                       list(zip(sums.tolist(), np.diff(ends).tolist(), seconds.tolist())))
+        self.used_ns = epochs_ns[-1]
+        self.forget_before(self.used_ns)
+        return cut
+
+
+def _together(*densities: 'Array | float') -> Array:
+    """Return the density of noises that are independent of each other."""
+    return np.asarray(np.sqrt(sum(map(np.square, densities))))
+
+
+def _rms(slope: Array) -> Array:
+    """Return the root mean square of the three axes at the end of each step, shape (K, n)."""
+    return np.sqrt(np.mean(np.square(slope[:, 1:]), axis=2))

@@ -62,23 +62,9 @@ def without_spikes(stamps: Index, samples: Array) -> tuple[Array, np.ndarray]:
     Replace single samples that the motion cannot have made by what lies between their neighbours.
 
     The gyros and the accelerometers are judged each on their own. A shock is no spike: what was
-    hit rings.
-
-    Parameters
-    ----------
-    stamps : ndarray of int, shape (N,)
-        Increasing.
-    samples : ndarray, shape (N, 6)
-        Angular rate, rad/s, and specific force, m/s^2. The first `SPIKE_BEFORE` + 1
-        and the last one cannot be judged.
-
-    Returns
-    -------
-    samples : ndarray, shape (N, 6)
-        The same array where nothing was found.
-    spikes : ndarray of bool, shape (N,)
-        Which ones were replaced.
-
+    hit rings. Of samples, (N, 6), rad/s and m/s^2, the first `SPIKE_BEFORE` + 1 and the last one
+    cannot be judged. Returns them, the same array where nothing was found, and which ones were
+    replaced, (N,).
     """
     spikes = np.zeros((stamps.size, 2), bool)
     if stamps.size < IMU_BEFORE + 1:
@@ -105,20 +91,9 @@ def without_spikes(stamps: Index, samples: Array) -> tuple[Array, np.ndarray]:
 
 def stuck(stamps: Index, samples: Array) -> list[tuple[int, int, int]]:
     """
-    Find where an IMU sends the same values again and again.
+    Find where an IMU sends the same values again and again, stamps (N,), ns, samples (N, 6).
 
-    Parameters
-    ----------
-    stamps : ndarray of int, shape (N,)
-        Increasing, ns.
-    samples : ndarray, shape (N, 6)
-        Angular rate and specific force.
-
-    Returns
-    -------
-    list of (int, int, int)
-        First and last stamp with the same values, and the one from which on it is no chance.
-
+    Returns the first and the last stamp of each, and the one from which on it is no chance.
     """
     new = np.flatnonzero(np.any(samples[1:] != samples[:-1], axis=1)) + 1
     first = np.concatenate([[0], new])
@@ -233,22 +208,9 @@ def white_noise(stamps_ns: Index, samples: Array, first: Index, last: Index) -> 
     Return the white noise densities of gyros and accelerometers in K windows of the data.
 
     Third divided differences take out everything that is quadratic over four samples, which
-    motion is, and leave what is new in each sample. Vibration counts as noise.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray of int, shape (N,)
-        Strictly increasing.
-    samples : ndarray, shape (N, 6)
-        Angular rate, rad/s, and specific force, m/s^2.
-    first, last : ndarray of int, shape (K,)
-        Each window's first sample and the one after its last.
-
-    Returns
-    -------
-    ndarray, shape (K, 2)
-        rad/sqrt(s) and m/s/sqrt(s), mean over the axes; 0 for fewer than eight samples.
-
+    motion is, and leave what is new in each sample. Vibration counts as noise. Of samples, (N, 6),
+    a window has its first one and the one after its last, (K,). Returns means over the axes,
+    (K, 2), rad/sqrt(s) and m/s/sqrt(s); 0 for fewer than eight samples.
     """
     count = last - first - 3
     enough = count >= 5

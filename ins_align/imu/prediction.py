@@ -25,7 +25,7 @@ import math
 
 from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import (
-    apply, Array, matrix_from_quaternion, quaternion_from_matrix)
+    apply, Array, cumulative_rotations, exp_so3, matrix_from_quaternion, quaternion_from_matrix)
 from ins_align.imu.buffer import MAX_GAP_NS, MAX_RATE
 from ins_align.results import Attitude
 import numpy as np
@@ -41,42 +41,32 @@ class Prediction:
 
     Parameters
     ----------
-    stamp_ns : int
-    C_nb, covariance : ndarray, shape (3, 3)
-        Body to ENU at the epoch, and its small rotation about the axes of ENU, rad^2.
-    gyro_bias, gyro_matrix : array_like, shape (3,) and (3, 3)
+    attitude : Attitude
+        At the epoch.
+    gyro_bias, gyro_matrix : ndarray, shape (3,) and (3, 3)
         The rate is ``measured - gyro_matrix @ measured - gyro_bias``, rad/s.
+    gyro_bias_std : float
+        How far the rate may be off steadily, rad/s. That the Earth turns, too, is left out of the
+        rate and counts as an error.
     angle_random_walk : float
         Of the gyroscopes, rad/sqrt(s).
-    rate_variance : float
-        What else may be wrong with the rate, steadily, (rad/s)^2.
-    rate : three floats
+    rate : ndarray, shape (3,)
         As measured at the epoch, rad/s.
 
     """
 
-    def __init__(self, stamp_ns: int, C_nb: Array, covariance: Array, gyro_bias: Array,
-                 gyro_matrix: Array, angle_random_walk: float, rate_variance: float,
-                 rate: Sequence[float]) -> None:
+    def __init__(self, attitude: Attitude, gyro_bias: Array, gyro_matrix: Array,
+                 gyro_bias_std: float, angle_random_walk: float, rate: Array) -> None:
         """Stand at the epoch."""
-        self.stamp_ns = stamp_ns
-        x, y, z, w = quaternion_from_matrix(C_nb).tolist()
+        self.stamp_ns = self._epoch_ns = attitude.stamp_ns
+        x, y, z, w = attitude.quaternion_xyzw.tolist()
         self._quaternion = x, y, z, w
-        self._covariance = tuple(np.asarray(covariance, float).ravel().tolist())
-        self._bias = tuple(np.asarray(gyro_bias, float).tolist())
+        self._covariance = tuple(attitude.covariance.ravel().tolist())
+        self._bias = tuple(gyro_bias.tolist())
         self._matrix = (np.eye(3) - gyro_matrix).tolist()
-        self._epoch_ns = stamp_ns
-        self._rate = tuple(rate)            # as measured last
+        self._rate = tuple(rate.tolist())   # as measured last
         self._white_variance = angle_random_walk ** 2
-        self._rate_variance = rate_variance
-
-    @staticmethod
-    def of(attitude: Attitude, gyro_bias: Array, gyro_matrix: Array, gyro_bias_std: float,
-           angle_random_walk: float, rate: Array) -> 'Prediction':
-        """Stand at an estimate; that the Earth turns, too, is left out and counts as an error."""
-        return Prediction(attitude.stamp_ns, attitude.C_nb, attitude.covariance, gyro_bias,
-                          gyro_matrix, angle_random_walk, gyro_bias_std ** 2 + EARTH_RATE ** 2,
-                          rate.tolist())
+        self._rate_variance = gyro_bias_std ** 2 + EARTH_RATE ** 2
 
     def carry(self, stamp_ns: int, gyro: Sequence[float]) -> bool:
         """
@@ -117,15 +107,9 @@ class Prediction:
         self._rate = tuple(rates[-1].tolist())
         rates = 0.5 * (rates[:-1] + rates[1:])
         turns = (apply(np.array(self._matrix), rates) - self._bias) * dt[:, None]
-        half = 0.5 * np.sqrt(np.einsum('ij,ij->i', turns, turns))
-        # numpy's sinc is that of pi x.
-        steps = np.column_stack([0.5 * turns * np.sinc(half / np.pi)[:, None], np.cos(half)])
-        while len(steps) > 1:
-            odd = steps[len(steps) & ~1:]
-            steps = np.concatenate([_products(steps[:-1:2], steps[1::2]), odd])
-        x, y, z, w = _products(np.array([self._quaternion]), steps)[0].tolist()
-        size = math.sqrt(x * x + y * y + z * z + w * w)
-        self._quaternion = x / size, y / size, z / size, w / size
+        turned = cumulative_rotations(exp_so3(turns))[-1]
+        x, y, z, w = quaternion_from_matrix(self.matrices()[0] @ turned).tolist()
+        self._quaternion = x, y, z, w
         self.stamp_ns = int(stamps_ns[-1])
 
     @property
@@ -146,14 +130,6 @@ class Prediction:
         """Return ``C_nb`` and its covariance, each of shape (3, 3)."""
         return (matrix_from_quaternion(np.array(self._quaternion)),
                 np.array(self.covariance).reshape(3, 3))
-
-
-def _products(first: Array, second: Array) -> Array:
-    """Multiply quaternions, shape (N, 4), each of the first with the second in its row."""
-    a, b, c, d = first.T
-    x, y, z, w = second.T
-    return np.column_stack([d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x,
-                            d * z + a * y - b * x + c * w, d * w - a * x - b * y - c * z])
 
 
 class Follower:

@@ -19,12 +19,12 @@ samples both are taken as cubics in time; a GNSS stamp inside a step splits it t
 of an interval, and all intervals of a batch, are handled as arrays.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from ins_align.geometry.rotation import (
-    Array, cross, cumulative_rotations, exp_and_left_jacobian, Index, orthonormalized, product,
-    skew)
-from ins_align.imu.intervals import Intervals
+    apply, Array, cross, cumulative_rotations, exp_and_left_jacobian, exp_so3, Index, log_so3,
+    orthonormalized, product, skew)
 from ins_align.imu.recent import Recent
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,6 +33,118 @@ from numpy.typing import ArrayLike
 UNEVEN = 0.1
 # So many steps of the IMU are one to the derivatives.
 DERIVATIVE_STEPS = 4
+
+
+class SensorErrors(NamedTuple):
+    """
+    Errors of gyros and accelerometers that stay: true = measured - matrix @ measured - bias.
+
+    A matrix has scale factor errors on its diagonal and misalignments beside it.
+    """
+
+    gyro_bias: Array        # (3,), rad/s
+    gyro_matrix: Array      # (3, 3)
+    accel_bias: Array       # (3,), m/s^2
+    accel_matrix: Array     # (3, 3)
+
+    @staticmethod
+    def none() -> 'SensorErrors':
+        """Return those of perfect sensors."""
+        return SensorErrors.of(np.zeros(24))
+
+    @staticmethod
+    def of(vector: Array) -> 'SensorErrors':
+        """Return those that make up a vector, shape (24,), the matrices row by row."""
+        return SensorErrors(vector[:3], vector[3:12].reshape(3, 3), vector[12:15],
+                            vector[15:].reshape(3, 3))
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """
+    Preintegrated IMU data of K intervals, each in the body frame at the interval's start.
+
+    Attributes
+    ----------
+    duration : ndarray, shape (K,)
+        Seconds.
+    R : ndarray, shape (K, 3, 3)
+        Rotation from the body frame at the end to the one at the start.
+    v, p : ndarray, shape (K, 3)
+        Integral and double integral of the specific force, m/s and m.
+    J_Rg, J_vg, J_pg, J_va, J_pa : ndarray, shape (K, 3, 12)
+        Derivatives to bias and matrix of the gyros (g) and of the accelerometers (a), in the order
+        of `SensorErrors.of`: of the rotation as a left error (``R <- exp_so3(J_Rg d) R``), of v,
+        of p.
+    Q : ndarray, shape (K, 9, 9)
+        Covariance of the errors (rotation at the start, v, p) that the sensors' noise leaves.
+    Q_excess : ndarray, shape (K, 9, 9)
+        The same for the noise that was measured in excess of what is stated.
+    omega : ndarray, shape (K, 3)
+        Angular rate at the end of the interval, as measured.
+    gained, turned : ndarray, shape (K, RUNGS, 3)
+        Before the end of the interval, as measured; see `Recent`.
+
+    """
+
+    duration: Array
+    R: Array
+    v: Array
+    p: Array
+    J_Rg: Array
+    J_vg: Array
+    J_pg: Array
+    J_va: Array
+    J_pa: Array
+    Q: Array
+    Q_excess: Array
+    omega: Array
+    gained: Array
+    turned: Array
+
+    def take(self, index: 'slice | Array') -> 'Intervals':
+        """Return the intervals of `index`."""
+        return Intervals(**{name: array[index] for name, array in vars(self).items()})
+
+    def end(self) -> 'Intervals':
+        """Return the interval of no length, and without noise, at the end of a single one."""
+        none = {name: np.zeros_like(array) for name, array in vars(self).items()}
+        return Intervals(**none | {'R': np.eye(3)[None], 'omega': self.omega,
+                                   'gained': self.gained, 'turned': self.turned})
+
+    def mirrored(self, signs: Array) -> 'Intervals':
+        """
+        Return what the intervals would be with the signs of sensors changed, leading axes (K, M).
+
+        `signs`, shape (M, 4), are those of the gyros x, y, z and of the accelerometers. To second
+        order in the rotation over an interval, with rate and force steady in it: good for telling
+        the signs apart.
+        """
+        gyro, accel = signs[:, :3], signs[:, 3:]
+        wider = {name: array[:, None] for name, array in vars(self).items()}
+        if (signs == 1).all():
+            shape = self.duration.size, len(signs)
+            return Intervals(**wider | {
+                name: np.broadcast_to(array, shape + array.shape[2:])
+                for name, array in wider.items() if name != 'duration'} | {
+                    'duration': self.duration})
+        turn = log_so3(self.R)[:, None]
+        # Forces act on average half and, for the way, a third of the rotation after the start.
+        half, third = (exp_so3(part * gyro * turn) @ exp_so3(-part * turn) for part in (1/2, 1/3))
+        ones = np.ones((len(signs), 3))
+        # What a bias does stays; an entry of a matrix is one in proportion to what is mirrored.
+        of_gyro = np.hstack([ones, np.tile(gyro, 3)])[:, None]
+        of_accel = np.hstack([ones, np.tile(accel, 9)])[:, None]
+        force = accel[:, None]
+        return Intervals(**wider | {
+            'duration': self.duration, 'R': exp_so3(gyro * turn),
+            'v': accel * apply(half, wider['v']), 'p': accel * apply(third, wider['p']),
+            'J_Rg': of_gyro * (half @ wider['J_Rg']),
+            'J_vg': force * of_gyro * (half @ wider['J_vg']),
+            'J_pg': force * of_gyro * (third @ wider['J_pg']),
+            'J_va': of_accel * (half @ wider['J_va']), 'J_pa': of_accel * (third @ wider['J_pa']),
+            'omega': gyro * wider['omega'], 'gained': force * wider['gained'],
+            'turned': gyro[:, None] * wider['turned']})
 
 
 class Noise(NamedTuple):
@@ -56,20 +168,11 @@ class Steps(NamedTuple):
 
 def split_at_epochs(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Steps:
     """
-    Cut a run of samples into the intervals between epochs.
+    Cut a run of samples, (N, 6), rad/s and m/s^2, into the K intervals between K + 1 epochs.
 
     Values at an epoch are interpolated with the cubic of the neighbouring samples and their
-    central differences.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray of int, shape (N,)
-        Strictly increasing, first <= epochs_ns[0], last >= epochs_ns[-1].
-    samples : ndarray, shape (N, 6)
-        Angular rate, rad/s, and specific force, m/s^2.
-    epochs_ns : ndarray of int, shape (K + 1,)
-        Increasing; two equal ones make an interval of no length.
-
+    central differences. Stamps increase strictly and hold all epochs between them; two epochs that
+    are equal make an interval of no length.
     """
     samples = samples.T
     slopes = _slopes(samples, np.diff(stamps_ns) * 1e-9)
@@ -115,15 +218,6 @@ def preintegrate(steps: Steps, noise: Noise, recent: Recent) -> Intervals:
     Angle and velocity increments come from the cubic through both ends of a step (trapezoid with
     end correction, whose noise telescopes); coning and sculling terms are of second order [1]_,
     [2]_, in the form that rates at instants allow.
-
-    Parameters
-    ----------
-    steps : Steps
-        The samples, cut at the epochs.
-    noise : Noise
-        Of the sensors, in each step.
-    recent : Recent
-        Motion before the end of each interval.
 
     References
     ----------

@@ -49,16 +49,7 @@ def recent_motion(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Recent:
 
     A rate that changes its axis makes the rotation vector differ from its integral [Bortz1971]_.
     Where the samples do not reach back far enough, because they begin there or are missing, it
-    goes on with their mean.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray of int, shape (N,)
-        Strictly increasing, first <= epochs_ns, last >= epochs_ns.
-    samples : ndarray, shape (N, 6)
-        Angular rate, rad/s, and specific force, m/s^2.
-    epochs_ns : ndarray of int, shape (K,)
-        Their stamps.
+    goes on with their mean. Samples, (N, 6), rad/s and m/s^2, are there before and after each.
 
     References
     ----------
@@ -119,13 +110,8 @@ def exact(integrals: Array, age: float) -> tuple[Array, Array, Array]:
     """
     Follow a force or rate, shape (K, RUNGS, 3) as in `Recent`, back to an age.
 
-    Before age 0 it is extrapolated.
-
-    Returns
-    -------
-    value, integral, double_integral : ndarray, shape (K, 3)
-        The force or rate at that age, and its integrals over the ages from 0 on.
-
+    Returns its value, integral and double integral over the ages from 0 on, each (K, 3); before
+    age 0 it is extrapolated.
     """
     there, value, _ = _cubic(age, 1)
     rung = min(max(int(age / RUNG), 0), RUNGS - 1)

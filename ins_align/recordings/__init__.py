@@ -15,10 +15,28 @@
 Recordings: rosbag2 (mcap, sqlite3, compressed) and ROS 1, from file to arrays.
 
 `bag` opens and lists them with rosbags, `salvage` reads an mcap that rosbags cannot open, `reader`
-chooses the topics that an alignment reads, `decode` makes arrays of them, `limits` bounds it all.
+chooses the topics that an alignment reads, `decode` makes arrays of them. The limits here bound it
+all, so that a damaged or hostile recording takes little memory.
 """
 
-from typing import NamedTuple
+import importlib
+import sys
+from typing import Any, NamedTuple
+
+MAX_CHUNK_BYTES = 1 << 28  # of a chunk, unpacked
+MAX_HELD_BYTES = 1 << 30  # of chunks, unpacked, that have messages of the same time
+MAX_MESSAGE_BYTES = 1 << 16  # of an IMU or GNSS message, which has some hundred bytes
+MAX_DEFINITION_BYTES = 1 << 24  # of the description of a topic
+MAX_TOPICS = 10_000
+MAX_METADATA_BYTES = 1 << 24  # of metadata.yaml
+# A file may unpack to this much, or to more at no more than this ratio.
+UNPACKED_BYTES_FREE = 1 << 30
+MAX_UNPACK_RATIO = 200
+
+ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+ZSTD_MODULE = 'compression.zstd' if sys.version_info >= (3, 14) else 'backports.zstd'
+DECOMPRESSORS = {'bz2': ('bz2', 'BZ2Decompressor'), 'lz4': ('lz4.frame', 'LZ4FrameDecompressor'),
+                 'zstd': (ZSTD_MODULE, 'ZstdDecompressor')}
 
 
 def printable(line: str) -> str:
@@ -46,3 +64,33 @@ class Topic(NamedTuple):
     encoding: str  # of its messages: cdr or ros1
     message_count: int = 0  # as the recording says
     definition: str = ''  # of the type, where the recording has it
+
+
+def max_unpacked_bytes(size: int) -> int:
+    """Return to how much a file of a size, bytes, may unpack."""
+    return max(UNPACKED_BYTES_FREE, MAX_UNPACK_RATIO * size)
+
+
+def unpack(data: bytes, compression: str, limit: int, damaged: bytes | None = None) -> bytes:
+    """
+    Unpack data; of those that were cut off the front, of those that are damaged what is given.
+
+    A BagError says that there are more than `limit` bytes or the compression is not known. Damaged
+    data raise errors of many kinds, if nothing is given for them.
+    """
+    if compression in ('', 'none'):
+        return data
+    if compression not in DECOMPRESSORS:
+        raise BagError(f'is compressed with {compression[:40]!r}, which is not supported')
+    module, name = DECOMPRESSORS[compression]
+    decompressor: Any = getattr(importlib.import_module(module), name)()
+    try:
+        unpacked: bytes = decompressor.decompress(data, limit + 1)
+    except Exception:  # each library has its own kind of error for damaged data
+        if damaged is None:
+            raise
+        return damaged
+    if len(unpacked) > limit:
+        raise BagError(f'unpacks, in a part, to more than the {limit} bytes that are allowed or '
+                       'claimed')
+    return unpacked

@@ -29,10 +29,9 @@ import sqlite3
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from ins_align.recordings import BagError, one_line, Topic
-from ins_align.recordings.limits import (
-    MAX_CHUNK_BYTES, MAX_HELD_BYTES, MAX_MESSAGE_BYTES, MAX_METADATA_BYTES, MAX_TOPICS,
-    max_unpacked_bytes, unpack, ZSTD_MAGIC, ZSTD_MODULE)
+from ins_align.recordings import (
+    BagError, MAX_CHUNK_BYTES, MAX_HELD_BYTES, MAX_MESSAGE_BYTES, MAX_METADATA_BYTES, MAX_TOPICS,
+    max_unpacked_bytes, one_line, Topic, unpack, ZSTD_MAGIC, ZSTD_MODULE)
 from ins_align.recordings.salvage import MAGIC as MCAP_MAGIC
 from ins_align.recordings.salvage import SalvagedMcap
 import numpy as np
@@ -117,25 +116,19 @@ class Bag:
         """
         Yield the messages of some topics in recorded order, many at a time.
 
-        Parameters
-        ----------
-        topics : sequence of Topic
-            What to read.
-        start_ns, stop_ns : int, optional
-            First recorded time and the one to stop before.
-
+        They are recorded from one time on, to before another one.
         """
         numbers = {key: topics.index(topic) for key, topic in self._topics.items()
                    if topic in topics}
         with _bag_errors(self.path):
             records = self._records(numbers, start_ns, stop_ns)
             while group := list(itertools.islice(records, BLOCK)):
-                connections, times_ns, messages = zip(*group)
-                places = np.array([numbers[id(connection)] for connection in connections])
-                yield Block(np.array(times_ns, np.int64), places, [
-                    _without_compression([messages[place] for place in chosen.tolist()])
-                    for chosen in (np.flatnonzero(places == number)
-                                   for number in range(len(topics)))])
+                messages: list[list[bytes]] = [[] for _ in topics]
+                for connection, _, data in group:
+                    messages[numbers[id(connection)]].append(data)
+                yield Block(np.array([time_ns for _, time_ns, _ in group], np.int64),
+                            np.array([numbers[id(connection)] for connection, _, _ in group]),
+                            [*map(_without_compression, messages)])
 
     def _records(self, chosen: Container[int], start_ns: int | None, stop_ns: int | None,
                  ) -> Iterator[tuple[Any, int, bytes]]:

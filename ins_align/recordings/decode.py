@@ -207,11 +207,7 @@ def deserialize(data: bytes, topic: Topic) -> Any:
     """
     Deserialise one message with rosbags.
 
-    Raises
-    ------
-    MessageError
-        If the bytes are none, or nothing defines the type.
-
+    A MessageError says that the bytes are none, or that nothing defines the type.
     """
     if topic.msgtype in DRIVER_TYPES and not topic.definition:
         raise MessageError(

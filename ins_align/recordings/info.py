@@ -28,7 +28,7 @@ from ins_align.checks import (
 from ins_align.config import Config, config_from_mapping, parse_override
 from ins_align.geometry.earth import normal_gravity
 from ins_align.gnss.buffer import MAX_AHEAD_NS
-from ins_align.gnss.messages import NED_ORDER, NED_SIGNS
+from ins_align.gnss.messages import enu_from_ned
 from ins_align.gnss.motion import (
     differences, EMPTY, find_manoeuvres, heading_in_words, MANOEUVRE_SPEED, MANOEUVRE_TIME,
     Manoeuvres, on_grid, Series, track, velocity_frame, velocity_from_positions,
@@ -36,8 +36,8 @@ from ins_align.gnss.motion import (
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings import BagError, printable
 from ins_align.recordings.bag import Bag
-from ins_align.recordings.imu_survey import ImuFacts, Resolution, survey_imu
-from ins_align.recordings.motion_fit import fit_motion, MotionFit
+from ins_align.recordings.imu_survey import (
+    fit_motion, ImuFacts, MotionFit, Resolution, survey_imu)
 from ins_align.recordings.reader import choose_topics
 from ins_align.recordings.topic_survey import (
     Gap, MAX_ASTRAY, read_candidates, Recorded, TopicInfo)
@@ -83,15 +83,7 @@ class Info:
 
 
 def inspect(path: str | os.PathLike[str]) -> Info:
-    """
-    Tell what a recording holds.
-
-    Raises
-    ------
-    BagError
-        If it cannot be read at all.
-
-    """
+    """Tell what a recording holds; a BagError says that it cannot be read at all."""
     with Bag(path) as bag:
         return _Survey(bag).info()
 
@@ -305,7 +297,7 @@ def _look_at_imu(data: Recorded, motion: Series, gravity: float, alone: bool) ->
 def _in_enu(velocity: Recorded) -> Series:
     series = velocity.series()
     if velocity.frame is not None and velocity.frame.frame == 'ned':
-        return Series(series.times, series.vectors[:, NED_ORDER] * NED_SIGNS)
+        return Series(series.times, enu_from_ned(series.vectors))
     return series
 
 

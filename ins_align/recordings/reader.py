@@ -25,7 +25,7 @@ import os
 from typing import NamedTuple
 
 from ins_align.config import Config
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import Transform
 from ins_align.gnss.drivers import (
     DRIVER_TYPES, imu_from_driver, INERTIAL_UNITS, LIVE_TYPES, NoTimeError, receiver_from_msg,
     RECEIVERS, type_in_words)
@@ -87,12 +87,8 @@ def read(request: Request) -> Iterator[Part]:
     """
     Read a recording; the last part has no messages and all warnings.
 
-    Raises
-    ------
-    BagError
-        If the recording cannot be read or lacks a topic, or if a part was asked for that holds no
-        message of these topics.
-
+    A BagError says that the recording cannot be read or lacks a topic, or that a part was asked
+    for that holds no message of these topics.
     """
     with Bag(request.path) as bag:
         try:
@@ -119,7 +115,8 @@ def read(request: Request) -> Iterator[Part]:
             yield _decoded(block, wanted, topics, config, done, tuple(bag.warnings))
             empty = False
         if empty and (start_ns, stop_ns) != (None, None):
-            raise BagError(f'{request.path} has no IMU or GNSS messages {_window(request, bag)}')
+            raise BagError(f'{request.path} has no IMU or GNSS messages '
+                           f'{_window(request, ((bag.end_ns or first_ns) - first_ns) * 1e-9)}')
         nothing = Block(np.zeros(0, np.int64), np.zeros(0, np.int64), [()] * len(wanted))
         yield _decoded(nothing, wanted, topics, config, 1.0, tuple(bag.warnings))
 
@@ -154,14 +151,12 @@ def _frame_id(bag: Bag, topic: Topic) -> str:
     return ''
 
 
-def _window(request: Request, bag: Bag) -> str:
+def _window(request: Request, length_s: float) -> str:
     """Say which part of a recording was asked for, and how long all of it is."""
     start = request.start or 0.0
     window = (f'after {start:g} s' if request.duration is None
               else f'between {start:g} s and {start + request.duration:g} s')
-    if bag.start_ns is None or bag.end_ns is None:
-        return window
-    return f'{window}: it is {(bag.end_ns - bag.start_ns) * 1e-9:.1f} s long'
+    return f'{window}: it is {length_s:.1f} s long'
 
 
 def _decoded(block: Block, wanted: list[Topic], topics: Topics, config: Config, done: float,
@@ -239,10 +234,9 @@ def _velocity(bag: Bag, config: Config, fix: Topic, name: str | None) -> Topic |
 
 
 def _required(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None) -> Topic:
-    topic = _choose(bag, what, groups, name)
-    if topic is None:
-        raise BagError(f'{bag.path} has no {what} topic ({_in_words(groups[0])}); {_listing(bag)}')
-    return topic
+    if topic := _choose(bag, what, groups, name):
+        return topic
+    raise BagError(f'{bag.path} has no {what} topic ({_in_words(groups[0])}); {_listing(bag)}')
 
 
 def _candidates(bag: Bag, types: list[str]) -> list[Topic]:

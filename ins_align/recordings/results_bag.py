@@ -15,7 +15,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
+import dataclasses
 import math
 import os
 from pathlib import Path
@@ -24,13 +26,10 @@ from typing import Any
 
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.imu.prediction import Prediction
-from ins_align.mounting import Mounting
 from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import decode_imu, deserialize
-from ins_align.recordings.replay import ReplayResult
-from ins_align.results import Epoch, State, Status
-from ins_align.status_values import base_values, level_of, status_values
+from ins_align.results import Epoch, level_of, Result, State, Status, status_values
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
@@ -38,6 +37,7 @@ from rosbags.typesys import get_typestore, Stores
 NAMESPACE = '/ins_align'
 IMU, ATTITUDE = 'sensor_msgs/msg/Imu', 'geometry_msgs/msg/QuaternionStamped'
 STATUS, VECTOR = 'diagnostic_msgs/msg/DiagnosticArray', 'geometry_msgs/msg/Vector3Stamped'
+XYZ = 'geometry_msgs/msg/Vector3'
 TOPICS = {'imu': IMU, 'initial_attitude': ATTITUDE, 'status': STATUS,
           'roll_pitch_yaw_deg': VECTOR, 'sigma_deg': VECTOR}
 STATUS_PERIOD_NS = 1_000_000_000  # and whenever the state is another one
@@ -47,18 +47,13 @@ MAX_AGE_NS = 2_500_000_000
 Record = tuple[str, int, Any]  # topic without its namespace, recorded time, message
 
 
-def write_results(result: ReplayResult, path: str | os.PathLike[str]) -> None:
+def write_results(result: Result, path: str | os.PathLike[str]) -> None:
     """
     Write the results of a recording as a rosbag2 (mcap) with the topics of the node.
 
-    Stamps are those of the input; the recorded time is that of the IMU message which follows.
-
-    Parameters
-    ----------
-    result : ReplayResult
-        What came of a recording, which is read once more for its IMU messages.
-    path : path
-        Directory to be made; written whole or not at all.
+    It makes a directory, whole or not at all, and reads the recording once more for its IMU
+    messages. Stamps are those of the input; the recorded time is that of the IMU message which
+    follows.
 
     Raises
     ------
@@ -87,21 +82,27 @@ def write_results(result: ReplayResult, path: str | os.PathLike[str]) -> None:
 class _Results:
     """Makes the messages of a result."""
 
-    def __init__(self, result: ReplayResult, types: Any) -> None:
+    def __init__(self, result: Result, types: Any) -> None:
+        assert result.topics is not None
         self._result, self._types = result, types
-        self._mounting = Mounting(result.config, result.topics.base)
+        self._topic, self._base = result.topics.imu, result.topics.base
         self._state: State | None = None  # of the epoch before
         self._status_ns = -STATUS_PERIOD_NS
+        nan = np.full(3, math.nan)  # of what an epoch does not tell
+        self._unknown = dataclasses.replace(
+            result.status, gyro_bias_std=nan, accel_bias_std=nan, lever_arm=nan,
+            lever_arm_std=nan, gnss_delay=math.nan, gnss_delay_std=math.nan, counts={},
+            time_to_align_s=None)
 
     def records(self) -> Iterator[Record]:
         """Go through the recording's IMU messages, epochs between them."""
-        epochs = list(self._result.epochs)
+        epochs = deque(self._result.epochs)
         prediction: Prediction | None = None
         before_ns, before = 0, np.zeros(3)
         time_ns = epoch_ns = 0
         for time_ns, data, stamp_ns, gyro, accel in self._samples():
             while epochs and epochs[0].stamp_ns <= stamp_ns:
-                epoch = epochs.pop(0)
+                epoch = epochs.popleft()
                 yield from self._of_epoch(epoch, time_ns)
                 part = ((epoch.stamp_ns - before_ns) / (stamp_ns - before_ns)
                         if before_ns < stamp_ns else 1.0)
@@ -111,9 +112,7 @@ class _Results:
             if prediction is None:
                 if not epochs:
                     break
-                continue
-            if stamp_ns > prediction.stamp_ns + MAX_GAP_NS \
-                    or stamp_ns > epoch_ns + MAX_AGE_NS:
+            elif stamp_ns > min(prediction.stamp_ns + MAX_GAP_NS, epoch_ns + MAX_AGE_NS):
                 prediction = None
             elif prediction.carry(stamp_ns, gyro.tolist()) or stamp_ns == epoch_ns:
                 yield 'imu', time_ns, self._imu(prediction, data, gyro, accel)
@@ -123,80 +122,69 @@ class _Results:
 
     def _samples(self) -> Iterator[tuple[int, Any, int, Any, Any]]:
         """Yield recorded time, message, stamp, rate and specific force of the IMU."""
-        topic = self._result.topics.imu
         with Bag(self._result.bag) as bag:
-            for block in bag.blocks([topic]):
-                messages = block.messages[0]
-                samples = decode_imu(messages, topic)
-                places = np.flatnonzero(samples.decoded)
-                for place, *numbers in zip(
-                        places.tolist(), samples.stamps_ns.tolist(), samples.gyro, samples.accel):
-                    yield int(block.times_ns[place]), messages[place], *numbers
+            for block in bag.blocks([self._topic]):
+                stamps_ns, gyro, accel, decoded = decode_imu(block.messages[0], self._topic)
+                for place, *numbers in zip(np.flatnonzero(decoded).tolist(), stamps_ns.tolist(),
+                                           gyro, accel):
+                    yield int(block.times_ns[place]), block.messages[0][place], *numbers
 
     def _prediction(self, epoch: Epoch, rate: Any) -> Prediction | None:
         """Return the attitude to be carried on from an epoch while it is declared."""
         if epoch.state is not State.ALIGNED or epoch.current is None:
             return None
         noise = self._result.config.imu_noise
-        return Prediction.of(epoch.current, epoch.gyro_bias, np.zeros((3, 3)),
-                             noise.gyro_bias_std, noise.angle_random_walk, rate)
+        return Prediction(epoch.current, epoch.gyro_bias, np.zeros((3, 3)),
+                          noise.gyro_bias_std, noise.angle_random_walk, rate)
 
     def _of_epoch(self, epoch: Epoch, time_ns: int) -> Iterator[Record]:
+        first, now = epoch.initial, epoch.current
         declared = epoch.state is State.ALIGNED and self._state is not State.ALIGNED
-        if declared and epoch.initial is not None:
-            yield 'initial_attitude', time_ns, self._types[ATTITUDE](
-                self._header(epoch.initial.stamp_ns), self._quaternion(
-                    epoch.initial.quaternion_xyzw))
-        if epoch.current is not None:
-            now = epoch.current
+        if declared and first is not None:
+            yield 'initial_attitude', time_ns, self._make(
+                ATTITUDE, self._header(first.stamp_ns), self._quaternion(first.quaternion_xyzw))
+        if now is not None:
             for name, values in (
                     ('roll_pitch_yaw_deg', (now.roll_deg, now.pitch_deg, now.yaw_deg)),
                     ('sigma_deg', now.sigma_deg.tolist())):
-                yield name, time_ns, self._types[VECTOR](
-                    self._header(now.stamp_ns), self._types['geometry_msgs/msg/Vector3'](*values))
+                yield name, time_ns, self._make(
+                    VECTOR, self._header(now.stamp_ns), self._make(XYZ, *values))
         if epoch.state is not self._state or epoch.stamp_ns >= self._status_ns + STATUS_PERIOD_NS:
             self._status_ns = epoch.stamp_ns
-            yield 'status', time_ns, self._status(_status_of(epoch))
+            yield 'status', time_ns, self._status(dataclasses.replace(
+                self._unknown, state=epoch.state, reason=epoch.reason, stamp_ns=epoch.stamp_ns,
+                t0_ns=first and first.stamp_ns, initial=first, current=now,
+                gyro_bias=epoch.gyro_bias, accel_bias=epoch.accel_bias))
         self._state = epoch.state
 
     def _imu(self, prediction: Prediction, data: bytes, gyro: Any, accel: Any) -> Any:
         """Return the input message with the orientation filled in."""
-        message = deserialize(data, self._result.topics.imu)
-        make = self._types
-        if self._result.topics.imu.msgtype == IMU:
+        message = deserialize(data, self._topic)
+        if self._topic.msgtype == IMU:
             rest = (message.angular_velocity, message.angular_velocity_covariance,
                     message.linear_acceleration, message.linear_acceleration_covariance)
         else:  # a driver's own
-            vector, unknown = make['geometry_msgs/msg/Vector3'], np.zeros(9)
-            rest = vector(*gyro.tolist()), unknown, vector(*accel.tolist()), unknown
-        return make[IMU](
-            self._header(prediction.stamp_ns, getattr(message, 'header', None)),
+            rest = (self._make(XYZ, *gyro.tolist()), np.zeros(9),
+                    self._make(XYZ, *accel.tolist()), np.zeros(9))
+        return self._make(
+            IMU, self._header(prediction.stamp_ns, getattr(message, 'header', None)),
             self._quaternion(prediction.quaternion_xyzw), np.array(prediction.covariance), *rest)
 
     def _status(self, status: Status) -> Any:
-        make = self._types
-        values = [*status_values(status), *base_values(status, self._mounting)]
-        return make[STATUS](self._header(status.stamp_ns or 0), [
-            make['diagnostic_msgs/msg/DiagnosticStatus'](
-                level_of(status.state), 'ins_align: alignment',
-                f'{status.state.value}: {status.reason}'.removesuffix(': '), '',
-                [make['diagnostic_msgs/msg/KeyValue'](*each) for each in values])])
+        values = status_values(status, self._result.config.base_frame, self._base)
+        return self._make(STATUS, self._header(status.stamp_ns or 0), [self._make(
+            'diagnostic_msgs/msg/DiagnosticStatus', level_of(status.state),
+            'ins_align: alignment', f'{status.state.value}: {status.reason}'.removesuffix(': '),
+            '', [self._make('diagnostic_msgs/msg/KeyValue', *each) for each in values])])
 
     def _header(self, stamp_ns: int, source: Any = None) -> Any:
         """Return a header; its frame_id is that of a source, or the world's."""
-        time = self._types['builtin_interfaces/msg/Time'](*divmod(stamp_ns, 1_000_000_000))
         frame = self._result.config.world_frame_id if source is None else source.frame_id
-        return self._types['std_msgs/msg/Header'](time, frame)
+        return self._make('std_msgs/msg/Header', self._make(
+            'builtin_interfaces/msg/Time', *divmod(stamp_ns, 1_000_000_000)), frame)
 
     def _quaternion(self, xyzw: Any) -> Any:
-        return self._types['geometry_msgs/msg/Quaternion'](*map(float, xyzw))
+        return self._make('geometry_msgs/msg/Quaternion', *map(float, xyzw))
 
-
-def _status_of(epoch: Epoch) -> Status:
-    """Return what an epoch knows of a status: no counts."""
-    unknown = np.full(3, math.nan)
-    return Status(
-        epoch.state, epoch.reason, epoch.stamp_ns,
-        None if epoch.initial is None else epoch.initial.stamp_ns, None, epoch.initial,
-        epoch.current, epoch.gyro_bias, unknown, epoch.accel_bias, unknown, unknown, unknown,
-        math.nan, math.nan, {})
+    def _make(self, msgtype: str, *fields: Any) -> Any:
+        return self._types[msgtype](*fields)

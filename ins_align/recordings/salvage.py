@@ -23,9 +23,8 @@ import struct
 from typing import Any
 import zlib
 
-from ins_align.recordings import BagError
-from ins_align.recordings.limits import (
-    MAX_CHUNK_BYTES, MAX_DEFINITION_BYTES, MAX_MESSAGE_BYTES, max_unpacked_bytes, unpack)
+from ins_align.recordings import (
+    BagError, MAX_CHUNK_BYTES, MAX_DEFINITION_BYTES, MAX_MESSAGE_BYTES, max_unpacked_bytes, unpack)
 from rosbags.interfaces import (
     Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat)
 

@@ -214,15 +214,7 @@ class Recorded(TopicInfo):
 
 
 def read_candidates(bag: Bag) -> list[Recorded]:
-    """
-    Read every topic that an alignment could read, sorted by name.
-
-    Raises
-    ------
-    BagError
-        If the recording cannot be read.
-
-    """
+    """Read every topic that an alignment could read, sorted by name."""
     topics = sorted(topic for topic in bag.topics if topic.msgtype in KINDS
                     and may_be_velocity(topic) and REFERENCE_NAMESPACE not in topic.name)
     recorded = {topic: [Recorded(topic, kind, bag.start_ns or 0) for kind in KINDS[topic.msgtype]]

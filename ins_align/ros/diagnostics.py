@@ -16,7 +16,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-import itertools
 import re
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -24,8 +23,7 @@ from geometry_msgs.msg import Vector3Stamped
 from ins_align.config import Config, Parameter, parameters
 from ins_align.gnss.drivers import type_in_words
 from ins_align.mounting import Mounting
-from ins_align.results import Status
-from ins_align.status_values import base_values, status_values
+from ins_align.results import Status, status_values
 import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.node import Node
@@ -53,15 +51,7 @@ class ReasonLog:
         """
         Return the parts to log, and whether they were there before; they are taken for logged.
 
-        Parameters
-        ----------
-        parts : sequence of str
-            Other numbers in a part make no other kind.
-        now : float
-            s.
-        again : bool
-            Whether what stays is logged again and again.
-
+        Other numbers in a part make no other kind; `again`: what stays is logged again and again.
         """
         self._logged = {kind: when for kind, when in self._logged.items()
                         if now - when < LOG_AGAIN}
@@ -101,17 +91,8 @@ def topic_faults(node: Node, inputs: Mapping[str, type], expected: Iterable[str]
     """
     Look at the publishers of the topics that a node reads, and say what is wrong with them.
 
-    Parameters
-    ----------
-    node : Node
-        That reads them.
-    inputs : mapping
-        Message types by topic, as they are named in the node.
-    expected : iterable of str
-        Topics that are worth a word where nobody publishes them.
-    velocity_types : mapping
-        Message types that the parameter velocity_type can name.
-
+    `inputs` and `velocity_types` are message types by topic and by the parameter velocity_type;
+    topics that are `expected` are worth a word where nobody publishes them.
     """
     for topic, msg_type in inputs.items():
         name = node.resolve_topic_name(topic)
@@ -159,5 +140,5 @@ def diagnostic_status(name: str, hardware_id: str, level: int, status: Status,
     return DiagnosticStatus(
         level=bytes([level]), name=f'{name.lstrip("/")}: alignment', hardware_id=hardware_id,
         message=f'{status.state.value}: {status.reason}',
-        values=[KeyValue(key=key, value=value) for key, value in itertools.chain(
-            status_values(status), base_values(status, mounting))])
+        values=[KeyValue(key=key, value=value) for key, value in status_values(
+            status, *((mounting.config.base_frame, mounting.base) if mounting else ()))])

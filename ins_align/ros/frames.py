@@ -20,16 +20,17 @@ from importlib import import_module
 from typing import Any
 
 from ins_align.config import Config, ConfigError
-from ins_align.geometry.transform import Transform
+from ins_align.geometry.rotation import Transform
 from ins_align.gnss.messages import Fix, Velocity
 from ins_align.mounting import find_mounting, Mounting, transform_from_msg
-from ins_align.ros.imu_bytes import ImuSample
+from ins_align.ros.inputs import ImuSample
 from rclpy.node import Node
 from rclpy.time import Time
 
 # A robot's model is published once, to all who join: it is there as soon as the sensors are.
 WAIT = 2.0  # s, for what may not be there, from when both frame_ids are known
-MAX_HELD = 4000  # messages
+MAX_HELD = 4000
+MESSAGES = ImuSample, Fix, Velocity
 
 
 def open_buffer(node: Node, config: Config) -> Any | None:
@@ -52,18 +53,7 @@ class MountingSearch:
     """
     Looks for the transforms that the parameters want, once messages have told their frames.
 
-    Parameters
-    ----------
-    config : Config
-        As configured.
-    buffer : tf2_ros.Buffer or None
-        None: there is no TF.
-
-    Raises
-    ------
-    ConfigError
-        If the parameters cannot do without TF and there is none.
-
+    Without a `tf2_ros.Buffer` there is no TF: a ConfigError if the parameters cannot do without.
     """
 
     def __init__(self, config: Config, buffer: Any | None) -> None:
@@ -72,16 +62,14 @@ class MountingSearch:
         if self._required and buffer is None:
             raise ConfigError('lever_arm_from_tf is true or base_frame is set, but tf2_ros is not '
                               'installed: sudo apt install ros-$ROS_DISTRO-tf2-ros-py')
-        self.mounting: Mounting | None = None
-        self.antenna_frame = ''
-        self._imu_frame = ''
+        self.antenna_frame = self._imu_frame = ''
         self._lever_arm = config.lever_arm  # that is in use
         self._held: deque[tuple[int, Any]] = deque(maxlen=MAX_HELD)
         self.restart()
 
     def restart(self) -> None:
         """Look again: the IMU is another one."""
-        self.mounting = None
+        self.mounting: Mounting | None = None
         self.waits_for = 'the transforms of IMU and antenna' if self._required else ''
         self._since: float | None = None
         self._held.clear()
@@ -89,27 +77,15 @@ class MountingSearch:
     def take(self, items: list[tuple[int, Any]], now: float,
              ) -> tuple[list[tuple[int, Any]], Mounting | None]:
         """
-        Look for the transforms, and keep what comes until they are known or given up.
+        Look for the transforms; keep the messages until they are known or given up.
 
-        Parameters
-        ----------
-        items : list of (int, object)
-            Messages and other things that have come.
-        now : float
-            s.
-
-        Returns
-        -------
-        items : list
-            What to align with now: all that was kept where a lever arm was found.
-        mounting : Mounting or None
-            What TF says, once.
-
+        Returns what to align with now, which is all that was kept where a lever arm was found,
+        and once what TF says. `now` is in seconds.
         """
         if self.mounting is not None:
             return items, None
-        messages = [item for item in items if isinstance(item[1], (ImuSample, Fix, Velocity))]
-        others = [item for item in items if not isinstance(item[1], (ImuSample, Fix, Velocity))]
+        messages = [item for item in items if isinstance(item[1], MESSAGES)]
+        others = [item for item in items if not isinstance(item[1], MESSAGES)]
         self._held.extend(messages)
         self._imu_frame = next((item.frame_id for _, item in reversed(messages)
                                 if isinstance(item, ImuSample)), self._imu_frame)
@@ -142,8 +118,3 @@ class MountingSearch:
         if not self._buffer.can_transform(target, source, Time()):
             return None
         return transform_from_msg(self._buffer.lookup_transform(target, source, Time()).transform)
-
-
-def frame_id_of(msg: Any) -> str:
-    """Return the frame_id of a message, empty where it has none."""
-    return str(getattr(getattr(msg, 'header', None), 'frame_id', ''))

@@ -67,7 +67,7 @@ def main(args: Sequence[str] | None = None) -> int:
     from ins_align.config import ConfigError
     import rclpy
     from rclpy.exceptions import ParameterException
-    from rclpy.executors import ExternalShutdownException
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.qos_overriding_options import InvalidQosOverridesError
     from rclpy.utilities import remove_ros_args
 
@@ -83,8 +83,9 @@ def main(args: Sequence[str] | None = None) -> int:
     sys.setswitchinterval(0.001)
     node = None
     try:
+        executor = SingleThreadedExecutor()  # a signal while it is made ends in a traceback
         node = AlignmentNode()
-        rclpy.spin(node)
+        rclpy.spin(node, executor)
     except ExternalShutdownException:
         pass
     except (ConfigError, ParameterException, InvalidQosOverridesError, RuntimeError) as error:

@@ -19,12 +19,14 @@ Everything that decides anything is in the aligner, which `ins_align replay` run
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable
 import dataclasses
 from functools import partial
 from operator import itemgetter
+import threading
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
@@ -35,16 +37,13 @@ from ins_align.config import (
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
 from ins_align.mounting import Mounting
-from ins_align.results import Severity
+from ins_align.results import level_of, Severity, WARN
 from ins_align.ros.diagnostics import (
     diagnostic_status, inputs_in_words, parameter_descriptor, ReasonLog, topic_faults, vector_msg)
-from ins_align.ros.frames import frame_id_of, MountingSearch, open_buffer
-from ins_align.ros.gnss_inputs import (
-    FIX_TOPIC, gnss_from_msg, gnss_topics, REJECTED_AS, VELOCITY_TOPIC, VELOCITY_TYPES)
-from ins_align.ros.imu_bytes import ImuSample, read_imu, with_orientation
-from ins_align.ros.on_demand import OnDemand, queued
-from ins_align.ros.worker import Worker
-from ins_align.status_values import level_of, WARN
+from ins_align.ros.frames import MountingSearch, open_buffer
+from ins_align.ros.inputs import (
+    FIX_TOPIC, Gate, gnss_from_msg, gnss_topics, ImuSample, queued, read_imu, REJECTED_AS,
+    VELOCITY_TOPIC, VELOCITY_TYPES, with_orientation)
 import numpy as np
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -65,41 +64,28 @@ IMU_TOPIC = 'imu/data_raw'
 STATE_NUMBERS = {state: number for number, state in enumerate(State)}
 IMU_DEPTH = 2000  # ten seconds at 200 Hz: the machine may be busy, no sample may be lost
 GNSS_DEPTH = 200
-IMU_BATCH = 100  # messages taken in a turn of the executor: more would hold up the others
+PERIOD = 0.2  # s, between two rounds of the worker: many messages at one go cost less
 STATUS_PERIOD = 1.0  # s
 # Without a sample for so long, by the clock of this machine, the IMU is silent: the status says
 # so, and another one may take its place (s).
 IMU_SILENT = 1.0
-MAX_OTHER_FRAMES = 8
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.5)
 RCLPY_PARAMETERS = {'use_sim_time', 'start_type_description_service'}  # it declares them itself
-
-
-class _Reset(NamedTuple):
-    """The alignment starts over on request."""
-
-
-class _Outlook(NamedTuple):
-    """What ~/imu goes on from: after how many resets, for which IMU."""
-
-    starts: int
-    frame_id: str | None
-    prediction: Prediction | None
 
 
 class AlignmentNode(Node):
     """
     Feeds an `Aligner` from topics and publishes the attitude that it declares.
 
-    A thread of its own takes the messages and aligns, several times a second. If somebody listens
-    to `~/imu`, the executor takes the IMU's messages instead and answers each at once, with the
-    attitude that the thread knew last, carried on with the gyros since. While there is no such
-    attitude it answers none.
+    The executor's thread puts messages into an inbox. Each one of the IMU it answers on `~/imu`
+    with the attitude that the worker knew last, carried on with the gyros since: at once while
+    somebody listens, otherwise it takes them several times a second, which costs half. The
+    worker, a thread of its own that no callback waits for, aligns several times a second.
 
     Attributes
     ----------
     failure : exception or None
-        What ended the thread, and with it the context.
+        What ended the worker, and with it the context.
 
     Raises
     ------
@@ -119,108 +105,111 @@ class AlignmentNode(Node):
             raise ConfigError('the value of a parameter is an empty list: write its numbers, as '
                               'lever_arm:=[0.0, 0.0, 0.0], or leave it out') from None
         self.failure: BaseException | None = None
-        self._worker = Worker(self._work, self._on_failure)
         self._config = self._declare_parameters()
         self._search = MountingSearch(self._config, open_buffer(self, self._config))
-        # The executor's thread:
+        # From the executor to the worker: when it was received, ns, and a message or a request.
+        self._inbox: deque[tuple[int, Any]] = deque()
+        # From the worker to the executor, replaced as a whole: what ~/imu goes on from, None for
+        # nothing, and the frame_id of the IMU that it is for.
+        self._prediction: tuple[Prediction | None, str | None] = None, None
+        # The executor's:
         self._follower = Follower()
-        self._adopted: _Outlook | None = None
-        self._starts = 0  # how often it was told to start over
+        self._followed = self._prediction
         # The worker's:
         self._aligner = Aligner(self._config)
         self._checks = InputChecks(self._config)
         self._declared: Attitude | None = None
         self._imu_frame: str | None = None
-        self._started = 0  # how often it has started over
-        self._next_status = 0.0
-        self._reasons = ReasonLog()
         self._imu_received_ns = 0  # the last sample of that frame
         self._other_frames: set[str] = set()  # of IMUs that were there before
         self._newest_imu_ns: int | None = None
         self._imu_heard: float | None = None  # when there was a new sample of use
-        # From the worker to the executor, replaced as a whole:
-        self._outlook = _Outlook(0, None, None)
+        self._next_status = 0.0
+        self._reasons = ReasonLog()
+        self._wake, self._stopping = threading.Event(), False
+        self._worker = threading.Thread(target=self._run, name='ins_align', daemon=True)
 
-        self._attitude_publisher = self._open_attitude_topic()
-        self._imu_publisher = self._publish_on(Imu, '~/imu', QoSProfile(depth=100))
-        self._status_publishers = [
-            self._publish_on(DiagnosticArray, topic, QoSProfile(depth=10))
-            for topic in ('~/status', '/diagnostics')]
-        self._angles_publisher, self._sigma_publisher = (
-            self._publish_on(Vector3Stamped, topic, QoSProfile(depth=100))
-            for topic in ('~/roll_pitch_yaw_deg', '~/sigma_deg'))
-        self._state_publisher = self._publish_on(UInt8, '~/state', QoSProfile(depth=10))
-        gnss = gnss_topics(self._config)
-        self._inputs = {IMU_TOPIC: Imu, **gnss}
-        self._imu_on_demand = OnDemand()
-        self._imu_subscription = self._subscribe_to(
-            Imu, IMU_TOPIC, self._on_imu, IMU_DEPTH, self._imu_on_demand)
-        self._gnss_subscriptions = [
-            (self._subscribe_to(msg_type, topic, _nothing, GNSS_DEPTH, OnDemand()),
-             partial(self._gnss, topic)) for topic, msg_type in gnss.items()]
+        self._open_topics()
         self.get_logger().info(inputs_in_words(self, self._inputs, self._config))
         self.create_service(Trigger, '~/reset', self._on_reset)
         # A signal between two waits of the executor wakes it from neither: it has to look.
-        self.create_timer(1.0, _nothing, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(PERIOD, self._open_gate, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._worker.start()
 
     def destroy_node(self) -> None:
         """Let the worker end its round first."""
-        self._worker.stop()
+        self._stopping = True
+        self._wake.set()
+        self._worker.join()
         super().destroy_node()
 
     # Callbacks: in the executor's thread, which never waits for the aligner
 
-    def _on_imu(self, data: bytes, info: dict[str, int]) -> None:
-        # A turn of the executor costs many times what is done with a message: what has queued up
-        # comes along.
-        for message, received_ns in ((data, info['received_timestamp']),
-                                     *queued(self._imu_subscription, IMU_BATCH)):
-            sample = read_imu(message)
-            self._worker.put((received_ns, sample))
-            self._publish_imu(sample, message)
+    def _open_gate(self) -> None:
+        self._gate.is_open = True
 
-    def _publish_imu(self, sample: ImuSample, data: bytes) -> None:
-        outlook = self._outlook
-        if outlook is not self._adopted:
-            self._adopted = outlook
-            self._follower.adopt(
-                outlook.prediction if outlook.starts == self._starts else None)
-        # What was learnt is about the axes of another IMU when the frame is another one.
-        if outlook.frame_id not in (None, sample.frame_id):
-            return
-        now = self._follower.follow(sample.stamp_ns, sample.gyro)
-        # Without an attitude nothing is published: navsat_transform takes the quaternion of the
-        # first message that it gets for the heading, for good, whatever its covariance says.
-        if now is not None:
-            self._imu_publisher.publish(
-                with_orientation(data, now.quaternion_xyzw, now.covariance))
+    def _on_imu(self, data: bytes, info: dict[str, int]) -> None:
+        self._take_imu([(data, info['received_timestamp']), *queued(self._imu_subscription)])
+        self._gate.is_open = self._imu_publisher.get_subscription_count() > 0
+
+    def _take_imu(self, messages: list[tuple[bytes, int]]) -> None:
+        if self._followed is not self._prediction:
+            self._followed = self._prediction
+            self._follower.adopt(self._followed[0])
+        for data, received_ns in messages:
+            sample = read_imu(data)
+            self._inbox.append((received_ns, sample))
+            # What was learnt is about the axes of another IMU when the frame is another one.
+            if self._followed[1] not in (None, sample.frame_id):
+                continue
+            now = self._follower.follow(sample.stamp_ns, sample.gyro)
+            # Without an attitude nothing is published: navsat_transform takes the quaternion of
+            # the first message that it gets for the heading, for good, whatever its covariance.
+            if now is not None:
+                self._imu_publisher.publish(
+                    with_orientation(data, now.quaternion_xyzw, now.covariance))
+
+    def _on_gnss(self, topic: str, msg: Any, info: dict[str, int]) -> None:
+        self._take_imu(queued(self._imu_subscription))  # what came before it is not to be behind
+        if topic == FIX_TOPIC and hasattr(msg, 'header'):
+            self._search.antenna_frame = msg.header.frame_id
+        items: Iterable[Any]
+        try:
+            items = gnss_from_msg(topic, msg, self._config)
+        except MessageError as error:
+            why = str(error)
+            items = [lambda: self._aligner.reject(REJECTED_AS[topic], why)]
+        self._inbox.extend((info['received_timestamp'], item) for item in items)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._starts += 1  # from here on, what the worker knew before does not hold
-        self._follower.adopt(None)
-        self._worker.put((self._now_ns(), _Reset()))
-        self._worker.wake()
+        self._inbox.append((time.time_ns(), lambda: self._start_over('requested by service')))
+        self._wake.set()
         response.success = True
         response.message = 'alignment starts over'
         return response
 
     # Alignment and what comes of it: in the worker's thread, the aligner's only one
 
+    def _run(self) -> None:
+        try:
+            while not self._stopping:
+                # Only as much as is there now: the executor goes on putting in.
+                self._work([self._inbox.popleft() for _ in range(len(self._inbox))])
+                self._wake.wait(PERIOD)
+                self._wake.clear()
+        except BaseException as error:
+            # An interruption in the middle of rcl's work is no failure.
+            if self.context.ok():
+                self.failure = error
+                self.context.try_shutdown()
+
     def _work(self, items: list[tuple[int, Any]]) -> None:
         """Take in what has come, align and publish what has changed."""
-        for subscription, convert in (
-                *([] if self._imu_on_demand.is_open else
-                  [(self._imu_subscription, lambda message: [read_imu(message)])]),
-                *self._gnss_subscriptions):
-            items += [(received_ns, item) for message, received_ns
-                      in queued(subscription, subscription.qos_profile.depth)
-                      for item in convert(message)]
         # Each topic is a queue by itself: nothing shall be late, or early, for having waited.
         items.sort(key=itemgetter(0))
         items, mounting = self._search.take(items, time.monotonic())
         if mounting is not None:
-            self._adopt(mounting)
+            self._use_mounting(mounting)
         for received_ns, item in items:
             self._feed(received_ns, item)
         self._check([item for _, item in items])
@@ -229,7 +218,7 @@ class AlignmentNode(Node):
         if newest_ns is not None and newest_ns != self._newest_imu_ns:
             self._imu_heard = time.monotonic()
         self._newest_imu_ns = newest_ns
-        self._look_out()
+        self._update_prediction()
         events = self._aligner.take_events()
         for event in events:
             self._log(event.severity, event.text)
@@ -238,7 +227,7 @@ class AlignmentNode(Node):
         if events or time.monotonic() >= self._next_status:
             self._publish_status()
 
-    def _adopt(self, mounting: Mounting) -> None:
+    def _use_mounting(self, mounting: Mounting) -> None:
         """Take over what TF says."""
         for severity, text in mounting.words:
             self._log(severity, text)
@@ -259,19 +248,15 @@ class AlignmentNode(Node):
             self.get_logger().info(text)
 
     def _feed(self, received_ns: int, item: Any) -> None:
-        aligner = self._aligner
         if isinstance(item, ImuSample):
-            if self._heeds(item.frame_id, received_ns):
-                aligner.add_imu(item.stamp_ns, item.gyro, item.accel)
+            if self._accepts_frame(item.frame_id, received_ns):
+                self._aligner.add_imu(item.stamp_ns, item.gyro, item.accel)
         elif isinstance(item, Fix):
-            aligner.add_fix(item)
+            self._aligner.add_fix(item)
         elif isinstance(item, Velocity):
-            aligner.add_velocity(item)
-        elif isinstance(item, Config):
-            aligner.reconfigure(item)
-        elif isinstance(item, _Reset):
-            self._started += 1
-            self._start_over('requested by service')
+            self._aligner.add_velocity(item)
+        else:
+            item()
 
     def _check(self, items: list[Any]) -> None:
         """Let the checks see what has come from the IMU in use and from the GNSS."""
@@ -299,16 +284,7 @@ class AlignmentNode(Node):
         self._aligner.reset(why)
         self._checks = InputChecks(self._config)
 
-    def _gnss(self, topic: str, msg: Any) -> Sequence[Fix | Velocity]:
-        if topic == FIX_TOPIC:
-            self._search.antenna_frame = frame_id_of(msg)
-        try:
-            return gnss_from_msg(topic, msg, self._config)
-        except MessageError as error:
-            self._aligner.reject(REJECTED_AS[topic], str(error))
-            return []
-
-    def _heeds(self, frame_id: str, received_ns: int) -> bool:
+    def _accepts_frame(self, frame_id: str, received_ns: int) -> bool:
         """Whether a sample is of the IMU that is aligned, which one that is new becomes."""
         if frame_id != self._imu_frame:
             silent = received_ns - self._imu_received_ns > IMU_SILENT * 1e9
@@ -318,37 +294,23 @@ class AlignmentNode(Node):
                     f'two IMUs send on one topic, with frame_id {frame_id!r} and '
                     f'{self._imu_frame!r}: the latter is used', once=True)
                 return False
-            self._change_imu_frame(frame_id)
+            if self._imu_frame is not None:
+                # What was learnt is about axes that are no longer the IMU's.
+                self._aligner.reject('imu_frame_changed')
+                self._search.restart()
+                self._start_over(
+                    f'frame_id of the IMU changed from {self._imu_frame!r} to {frame_id!r}')
+                self._other_frames.add(self._imu_frame)
+            self._imu_frame = frame_id
         self._imu_received_ns = received_ns
         return True
 
-    def _change_imu_frame(self, frame_id: str) -> None:
-        """Start over: what was learnt is about axes that are no longer the IMU's."""
-        if self._imu_frame is not None:
-            self._aligner.reject('imu_frame_changed')
-            self._search.restart()
-            self._start_over(
-                f'frame_id of the IMU changed from {self._imu_frame!r} to {frame_id!r}')
-            if len(self._other_frames) < MAX_OTHER_FRAMES:
-                self._other_frames.add(self._imu_frame)
-        self._imu_frame = frame_id
-
-    def _look_out(self) -> None:
-        """Tell the executor what to go on from, if somebody listens."""
+    def _update_prediction(self) -> None:
+        """Hand over what ~/imu goes on from; None where nobody listens or nothing is declared."""
         listened = self._imu_publisher.get_subscription_count() > 0
         prediction = self._aligner.prediction() if listened and self._declared else None
-        if prediction is not None or self._outlook.prediction is not None:
-            self._outlook = _Outlook(self._started, self._imu_frame, prediction)
-        if listened != self._imu_on_demand.is_open:
-            self._imu_on_demand.is_open = listened
-            if self.executor is not None:
-                self.executor.wake()
-
-    def _on_failure(self, error: BaseException) -> None:
-        # An interruption in the middle of rcl's work is no failure.
-        if self.context.ok():
-            self.failure = error
-            self.context.try_shutdown()
+        if prediction is not None or self._prediction[0] is not None:
+            self._prediction = prediction, self._imu_frame
 
     def _declare(self, attitude: Attitude | None) -> None:
         """Publish the initial attitude once, or withdraw it."""
@@ -431,7 +393,24 @@ class AlignmentNode(Node):
 
     # Topics and parameters
 
-    def _publish_on(self, msg_type: type, topic: str, qos: QoSProfile) -> Publisher:
+    def _open_topics(self) -> None:
+        self._attitude_publisher = self._open_attitude_topic()
+        self._imu_publisher = self._publish_on(Imu, '~/imu', 100)
+        self._status_publishers = [self._publish_on(DiagnosticArray, topic, 10)
+                                   for topic in ('~/status', '/diagnostics')]
+        self._angles_publisher, self._sigma_publisher = (
+            self._publish_on(Vector3Stamped, topic, 100)
+            for topic in ('~/roll_pitch_yaw_deg', '~/sigma_deg'))
+        self._state_publisher = self._publish_on(UInt8, '~/state', 10)
+        gnss = gnss_topics(self._config)
+        self._inputs = {IMU_TOPIC: Imu, **gnss}
+        self._gate = Gate()
+        self._imu_subscription = self._subscribe_to(
+            Imu, IMU_TOPIC, self._on_imu, IMU_DEPTH, self._gate)
+        for topic, msg_type in gnss.items():
+            self._subscribe_to(msg_type, topic, partial(self._on_gnss, topic), GNSS_DEPTH)
+
+    def _publish_on(self, msg_type: type, topic: str, qos: QoSProfile | int) -> Publisher:
         # Every event handler is one more thing to wait for at each IMU message. What is offered
         # here suits every subscriber but those that ask for more, and these warn on their side.
         return self.create_publisher(
@@ -444,7 +423,7 @@ class AlignmentNode(Node):
             depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
 
     def _subscribe_to(self, msg_type: type, topic: str, callback: Callable[..., None],
-                      depth: int, group: OnDemand) -> Subscription:
+                      depth: int, group: Gate | None = None) -> Subscription:
         # Best effort matches every publisher, so that no event can tell of one that does not.
         return self.create_subscription(
             msg_type, topic, callback,
@@ -453,11 +432,6 @@ class AlignmentNode(Node):
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             raw=msg_type is Imu)
-
-    @staticmethod
-    def _now_ns() -> int:
-        """Return the time by the clock of received messages."""
-        return time.time_ns()
 
     def _declare_parameters(self) -> Config:
         """Check the values given at start and declare all parameters with their description."""
@@ -492,9 +466,5 @@ class AlignmentNode(Node):
         return SetParametersResult(successful=True)
 
     def _change_parameters(self, changes: list[Parameter]) -> None:
-        self._config = self._changed_config(changes)
-        self._worker.put((self._now_ns(), self._config))
-
-
-def _nothing(*_: Any) -> None:
-    """Be a callback where nothing is to be done."""
+        config = self._config = self._changed_config(changes)
+        self._inbox.append((time.time_ns(), lambda: self._aligner.reconfigure(config)))

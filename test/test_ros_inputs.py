@@ -13,7 +13,7 @@
 # limitations under the License.
 """What the node reads of a serialised IMU message and what it changes in it."""
 
-from ins_align.ros.imu_bytes import read_imu, with_orientation
+from ins_align.ros.inputs import read_imu, with_orientation
 import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
@@ -41,7 +41,7 @@ def message(frame_id, seconds=1_700_000_000, nanoseconds=999_999_999):
 def way(request, monkeypatch):
     """Take the layout that is known, and one of a middleware with another serialisation."""
     if request.param == 'library':
-        monkeypatch.setattr('ins_align.ros.imu_bytes.body_start', lambda data: None)
+        monkeypatch.setattr('ins_align.ros.inputs.body_start', lambda data: None)
 
 
 @pytest.mark.parametrize('frame_id', FRAMES)

@@ -1,0 +1,159 @@
+# Copyright 2026 The ins_align Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+What the node reads: IMU messages as bytes, the GNSS topics with their types.
+
+Turning every IMU sample into a Python message and back costs several times what the alignment
+itself does with it, so the node takes its bytes as they arrive and changes them in place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import import_module
+import struct
+from typing import Any, NamedTuple
+
+from geometry_msgs.msg import TwistStamped, TwistWithCovarianceStamped, Vector3Stamped
+from ins_align.config import Config, ConfigError
+from ins_align.gnss.drivers import LIVE_TYPES, receiver_from_msg
+from ins_align.gnss.messages import Fix, fix_from_msg, imu_from_msg, Velocity, velocity_from_msg
+from nav_msgs.msg import Odometry
+from rclpy.callback_groups import CallbackGroup
+from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import Imu, NavSatFix
+
+FIX_TOPIC, VELOCITY_TOPIC = 'fix', 'fix_velocity'
+# As what is counted a message that cannot be used.
+REJECTED_AS = {FIX_TOPIC: 'fix_undecodable', VELOCITY_TOPIC: 'velocity_body_frame'}
+# What the parameter velocity_type can name.
+VELOCITY_TYPES = {kind.__name__: kind for kind in (
+    TwistWithCovarianceStamped, TwistStamped, Odometry, Vector3Stamped)}
+
+# sensor_msgs/Imu in plain CDR, little endian (OMG DDSI-RTPS 2.3, 10.2): four bytes that say so,
+# the stamp, the frame_id behind its length, and the body: orientation 4 and its covariance 9, rate
+# 3 and 9, specific force 3 and 9, all float64.
+_LITTLE_ENDIAN = b'\x00\x01'
+_STAMP, _ORIENTATION, _VECTOR = struct.Struct('<iI'), struct.Struct('<13d'), struct.Struct('<3d')
+_STAMP_OFFSET, _FRAME_OFFSET = 4, 16
+_RATE_OFFSET, _FORCE_OFFSET, _BODY_BYTES = 8 * 13, 8 * 25, 8 * 37
+
+
+class ImuSample(NamedTuple):
+    """What the alignment needs of one message."""
+
+    stamp_ns: int
+    gyro: tuple[float, float, float]  # rad/s
+    accel: tuple[float, float, float]  # m/s^2
+    frame_id: str
+
+
+def body_start(data: bytes) -> int | None:
+    """Return where the numbers of a serialised Imu start; None: this is not the known layout."""
+    start = _FRAME_OFFSET + int.from_bytes(data[_FRAME_OFFSET - 4:_FRAME_OFFSET], 'little')
+    start += -(start - 4) % 8  # numbers of eight bytes are aligned behind the encapsulation
+    known = data[:2] == _LITTLE_ENDIAN and len(data) == start + _BODY_BYTES
+    return start if known else None
+
+
+def read_imu(data: bytes) -> ImuSample:
+    """Read one serialised sensor_msgs/Imu; its orientation is not looked at."""
+    start = body_start(data)
+    if start is None:  # a middleware with another serialisation
+        msg = deserialize_message(data, Imu)
+        stamp_ns, gyro, accel = imu_from_msg(msg)
+        return ImuSample(stamp_ns, tuple(gyro), tuple(accel), msg.header.frame_id)
+    seconds, nanoseconds = _STAMP.unpack_from(data, _STAMP_OFFSET)
+    frame = data[_FRAME_OFFSET:start].split(b'\0', 1)[0]
+    return ImuSample(seconds * 1_000_000_000 + nanoseconds,
+                     _VECTOR.unpack_from(data, start + _RATE_OFFSET),
+                     _VECTOR.unpack_from(data, start + _FORCE_OFFSET),
+                     frame.decode(errors='replace'))
+
+
+def with_orientation(data: bytes, quaternion_xyzw: Sequence[float],
+                     covariance: Sequence[float]) -> bytes:
+    """Return a serialised sensor_msgs/Imu with another orientation, its covariance by rows."""
+    orientation = (*quaternion_xyzw, *covariance)
+    start = body_start(data)
+    if start is None:
+        msg = deserialize_message(data, Imu)
+        turn = msg.orientation
+        turn.x, turn.y, turn.z, turn.w = orientation[:4]
+        msg.orientation_covariance = orientation[4:]
+        return serialize_message(msg)
+    changed = bytearray(data)
+    _ORIENTATION.pack_into(changed, start, *orientation)
+    return bytes(changed)
+
+
+class Gate(CallbackGroup):
+    """
+    Keeps a subscription from its executor while it is closed.
+
+    A turn of the executor takes longer than all that is done with a message. Where nothing has to
+    be done at once, messages wait in the subscription's queue and are taken many in a turn.
+    """
+
+    is_open = False
+
+    def can_execute(self, entity: Any) -> bool:
+        """Whether the executor may take messages."""
+        return self.is_open
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Allow it."""
+        return True
+
+    def ending_execution(self, entity: Any) -> None:
+        """Do nothing."""
+
+
+def queued(subscription: Subscription) -> list[tuple[Any, int]]:
+    """Take the messages that wait, each with the time at which it was received, ns."""
+    messages: list[tuple[Any, int]] = []
+    with subscription.handle:
+        while len(messages) < subscription.qos_profile.depth:
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if taken is None:
+                break
+            messages.append((taken[0], taken[1]['received_timestamp']))
+    return messages
+
+
+def gnss_topics(config: Config) -> dict[str, type]:
+    """
+    Return the message types of the topics to read, by topic.
+
+    A ConfigError says that the package of the configured type is not installed.
+    """
+    if config.fix_type == 'NavSatFix':
+        return {FIX_TOPIC: NavSatFix, VELOCITY_TOPIC: VELOCITY_TYPES[config.velocity_type]}
+    package = LIVE_TYPES[config.fix_type].partition('/')[0]
+    try:
+        return {FIX_TOPIC: getattr(import_module(f'{package}.msg'), config.fix_type)}
+    except ModuleNotFoundError:
+        raise ConfigError(
+            f'fix_type is {config.fix_type}, but {package} is not installed: sudo apt install '
+            f'ros-$ROS_DISTRO-{package.replace("_", "-")}, or set fix_type to NavSatFix') from None
+
+
+def gnss_from_msg(topic: str, msg: Any, config: Config) -> Sequence[Fix | Velocity]:
+    """Return what a message of a topic carries; a MessageError says why it cannot be used."""
+    if topic == VELOCITY_TOPIC:
+        return [velocity_from_msg(msg, config)]
+    if config.fix_type == 'NavSatFix':
+        return [fix_from_msg(msg)]
+    return receiver_from_msg(msg, LIVE_TYPES[config.fix_type], config)
