@@ -29,7 +29,7 @@ import termios
 
 from ins_align.cli import main, SCENARIOS
 from ins_align.outputs import labels
-from ins_align.simulation.trajectory import trajectory_of
+from ins_align.simulation.scenarios import trajectory_of
 import pytest
 from recordings import FIX, IMU, messages_of, real_recording, TWIST, write_recording
 

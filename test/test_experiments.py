@@ -13,16 +13,14 @@
 # limitations under the License.
 """The experiments: small runs whose numbers are known, and the errors a user can make."""
 
-from functools import partial
 import json
 import math
 
 from ins_align import experiments
 from ins_align.aligner import Aligner, Attitude, State
 from ins_align.config import Config, PRESETS
-from ins_align.experiments import (
-    bound, common, declare, declare_worse, note, recordings, weak_spots)
-from ins_align.experiments.stream import stream_of
+from ins_align.experiments import bound, common, declare, note, recordings, weak_spots
+from ins_align.experiments.spoilt import stream_of
 from ins_align.geometry.rotation import exp_so3, matrix_from_rpy
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
@@ -78,11 +76,11 @@ def test_bound_is_reached_on_a_navigation_grade_flight(monkeypatch):
 
 
 def test_time_at_which_the_bound_crosses():
-    flight = bound.crossing_time(('flight', 'navigation', 10.0, 1.0, {}))
+    flight = declare.crossing_time(('flight', 'navigation', 10.0, 1.0, {}))
     assert flight == pytest.approx(5.4, abs=0.3)
-    assert bound.crossing_time(('straight', 'mems', 10.0, 1.0, {})) is None
+    assert declare.crossing_time(('straight', 'mems', 10.0, 1.0, {})) is None
     unknown = {'lever_arm_std': 5.0, 'delay_std': 0.5}
-    assert bound.crossing_time(('flight', 'navigation', 10.0, 1.0, unknown)) > flight
+    assert declare.crossing_time(('flight', 'navigation', 10.0, 1.0, unknown)) > flight
 
 
 def test_trials_are_repeatable_and_cover_everything():
@@ -94,26 +92,26 @@ def test_trials_are_repeatable_and_cover_everything():
 
 
 def test_every_combination_of_faults_is_drawn_once():
-    names = {fault for combination in declare_worse.COMBINATIONS for fault in combination}
-    assert names == set(declare_worse.FAULTS)
-    seeds = range(len(declare_worse.COMBINATIONS) * len(declare_worse.SCENARIOS))
-    drawn = [declare_worse.trial(seed) for seed in seeds]
-    assert drawn[7] == declare_worse.trial(7)
+    names = {fault for combination in declare.COMBINATIONS for fault in combination}
+    assert names == set(declare.WORSE)
+    seeds = range(len(declare.COMBINATIONS) * len(declare.SCENARIOS))
+    drawn = [declare.worse_trial(seed) for seed in seeds]
+    assert drawn[7] == declare.worse_trial(7)
     assert len({(d['faults'], d['scenario']) for d in drawn}) == len(drawn)
 
 
 def test_imus_worse_than_configured(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(declare_worse, 'DURATION', 16.0)
-    monkeypatch.setattr(declare_worse, 'STAND_STILL', 0.0)
-    task = declare_worse.trial(5, faults=(), scenario='car')
+    monkeypatch.setattr(declare, 'DURATION', 16.0)
+    monkeypatch.setattr(declare, 'STAND_STILL', 0.0)
+    task = declare.worse_trial(5, faults=(), scenario='car')
     clean = declare.run_trial(task)
     assert clean == declare.run_trial(task)
     assert clean['levelled']['current']['tilt_sigmas'] < 5
-    worse = declare_worse.trial(5, faults=('noise x 3',), scenario='car')
+    worse = declare.worse_trial(5, faults=('noise x 3',), scenario='car')
     noisy = declare.run_trial(worse)
-    assert worse['simulate'] == task['simulate'] | declare_worse.FAULTS['noise x 3']
+    assert worse['simulate'] == task['simulate'] | declare.WORSE['noise x 3']
     assert noisy['levelled'] != clean['levelled']
-    declare_worse.write(tmp_path, [clean])
+    declare.write_worse(tmp_path, [clean])
     assert 'Beyond 3 sigma' in capsys.readouterr().out
     assert len(json.loads((tmp_path / 'declare-worse.json').read_text())['runs']) == 1
 
@@ -121,10 +119,10 @@ def test_imus_worse_than_configured(tmp_path, monkeypatch, capsys):
 def test_shares_beyond_the_limits(tmp_path, capsys):
     def result(faults, sigma):
         angles = {'tilt_sigmas': sigma, 'heading_sigmas': 0.5, 'error_deg': [0.1, -0.2, 0.7]}
-        return {**declare_worse.trial(1, faults, 'car'), 'aligned': None,
+        return {**declare.worse_trial(1, faults, 'car'), 'aligned': None,
                 'levelled': {'t_s': 4.0, 'initial': angles, 'current': angles}}
-    fault = next(iter(declare_worse.FAULTS))
-    declare_worse.write(tmp_path, [result((), 1.0), result((), 4.0), result((fault,), 6.0)])
+    fault = next(iter(declare.WORSE))
+    declare.write_worse(tmp_path, [result((), 1.0), result((), 4.0), result((fault,), 6.0)])
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     none = next(line for line in lines if line[:1] == ['none'])
     assert none[1:] == '2 2 4.0 1 (50.0 %) 0 (0.0 %) 4.0 0.2 0 (0.0 %) 0 (0.0 %) 0.5 0.7'.split()
@@ -176,13 +174,13 @@ def test_window_of_a_recording_against_its_reference(folder):
     assert recordings.recordings_in(folder) == [path, folder / 'hovering']
     recording = recordings.load(path)
     assert recording.duration == pytest.approx(32.0, abs=0.1)
-    window = recordings.run_window(path, 2.0, 25.0, method='bank')
+    window = recordings.run_window((path, 2.0, 25.0, {}))
     assert window.moves and not window.covers_minute
     assert window.declared_s is not None and window.declared.heading_sigmas < 5
     assert window.time[-1] == pytest.approx(25.0, abs=0.5)
     assert np.abs(window.error_deg[-1, 2]) < 3.0
     assert np.nanmedian(np.abs(window.course_deg)) < 3.0
-    assert not recordings.run_window(folder / 'hovering', 0.0, 25.0, method='bank').moves
+    assert not recordings.run_window((folder / 'hovering', 0.0, 25.0, {})).moves
 
 
 def test_recordings_and_their_files(folder, tmp_path, capsys):
@@ -217,15 +215,17 @@ def test_weak_spots_are_judged_by_the_clock_of_the_imu():
         stream = stream_of(s)
         for rows in stream.imu, stream.fix, stream.velocity:
             rows['stamp'] += by_ns
-        aligner = Aligner(common.config_for(s))
-        true = partial(weak_spots.truth, s, stream)
-        result = weak_spots.follow(aligner, weak_spots.messages(stream, Config(), 100), true)
-        assert result['end'] and 0.0 < result['worst_sigmas'] < 5.0
+
+        def judged(turned=np.eye(3)):
+            looks = common.follow(Aligner(common.config_for(s)), stream.messages(Config()))
+            return looks[-1].state, common.while_aligned(
+                looks, int(stream.imu['stamp'][0]),
+                lambda stamps: turned @ s.attitude_at(stream.measured_at(stamps)))
+
+        state, result = judged()
+        assert state is State.ALIGNED and 0.0 < result['worst_sigmas'] < 5.0
         assert result['beyond_s'] == 0.0 and 0.3 < result['aligned_part'] < 0.9
-        turned = exp_so3(np.radians([0.0, 0.0, 20.0]))
-        wrong = weak_spots.follow(
-            Aligner(common.config_for(s)), weak_spots.messages(stream, Config(), 100),
-            lambda stamps: [turned @ C for C in true(stamps)])
+        _, wrong = judged(exp_so3(np.radians([0.0, 0.0, 20.0])))
         assert wrong['declared_sigmas'] > 10.0 and 15.0 < wrong['worst_heading_deg'] < 25.0
         assert wrong['beyond_s'] == pytest.approx(40.0 - wrong['declared_s'], abs=0.5)
 

@@ -17,10 +17,7 @@ import json
 
 from ins_align import experiments
 from ins_align.aligner import Aligner
-from ins_align.experiments import faults
-from ins_align.experiments.common import config_for
-from ins_align.experiments.stream import stream_of
-from ins_align.simulation.simulate import simulate
+from ins_align.experiments import common, faults
 import numpy as np
 import pytest
 
@@ -82,7 +79,7 @@ def spoil(monkeypatch, name, value):
     class Spoilt(Aligner):
         pass
     setattr(Spoilt, name, value)
-    monkeypatch.setattr(faults, 'Aligner', Spoilt)
+    monkeypatch.setattr(common, 'Aligner', Spoilt)
 
 
 def test_an_exception_is_seen(short, monkeypatch):
@@ -91,7 +88,7 @@ def test_an_exception_is_seen(short, monkeypatch):
     spoil(monkeypatch, 'update', update)
     result = faults.run_trial(task_of('none'))
     assert 'ZeroDivisionError: seen' in result['exception']
-    row = faults.row('x', [result])
+    row = {title: value(('x', [result])) for title, _, value in faults.COLUMNS}
     assert row['runs'] == row['exceptions'] == 1 and row['declared'] == 0
 
 
@@ -117,15 +114,13 @@ def test_a_message_that_is_not_counted_is_seen(short, monkeypatch):
 
 def test_a_wrong_declaration_is_seen(short):
     task = task_of('none')
-    simulation = simulate(task['scenario'], **task['simulate'])
-    stream = stream_of(simulation)
-    aligner = Aligner(config_for(simulation))
-    watch = faults.Watch(aligner, stream)
-    faults.feed(watch, np.random.default_rng(0))
-    assert faults.worst(faults.declarations(watch.epochs, stream, simulation)) < 5.0
+    simulation, stream, aligner = common.prepare(task['scenario'], task['simulate'], {})
+    looks = faults.feed(faults.Watch(aligner), stream, np.random.default_rng(0))
+    right = faults.declarations(looks, 5.0, simulation.attitude_at)
+    assert faults.worst(right) < 5.0
     # The truth of a second later is not that of the stamp.
-    stream.shift = (stream.first, stream.last, -1_000_000_000)
-    result = faults.declarations(watch.epochs, stream, simulation)
+    result = faults.declarations(looks, 5.0, lambda stamps: simulation.attitude_at(
+        np.add(stamps, 1_000_000_000)))
     assert faults.worst(result) > 5.0
     assert result['wrong_s'] > 1.0
 

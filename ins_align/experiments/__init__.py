@@ -14,7 +14,7 @@
 """
 Experiments: what is known of the package in numbers, each made by one command.
 
-A module each; ``run`` prints a table and writes ``NAME.md``, ``NAME.json`` and figures.
+Each prints its tables and writes ``NAME.md``, ``NAME.json`` and figures.
 """
 
 from __future__ import annotations
@@ -22,12 +22,14 @@ from __future__ import annotations
 import importlib
 from pathlib import Path
 
-# In the order in which `all` runs them.
-NAMES = ('note', 'bound', 'declare', 'declare-worse', 'faults', 'weak-spots', 'vehicle',
-         'recordings')
+# Module and function of each, in the order in which `all` runs them.
+NAMES = {'note': 'note.run', 'bound': 'bound.run', 'declare': 'declare.run',
+         'declare-worse': 'declare.run_worse', 'faults': 'faults.run',
+         'weak-spots': 'weak_spots.run', 'vehicle': 'weak_spots.run_vehicle',
+         'recordings': 'recordings.run'}
 NEED_DATA = ('recordings',)
 # Only by name: it measures the machine too, and needs ROS.
-MEASUREMENTS = ('bench',)
+MEASUREMENTS = {'bench': 'bench.run'}
 
 
 class ExperimentError(ValueError):
@@ -61,5 +63,6 @@ def run(name: str, out_dir: str | Path, data_dir: str | Path | None = None,
         if each in NEED_DATA and data_dir is None:
             print(f'{each}: left out, it needs recordings (--data DIR)')
             continue
-        module = importlib.import_module(f'ins_align.experiments.{each.replace("-", "_")}')
-        module.run(out, None if data_dir is None else Path(data_dir), runs, jobs)
+        module, function = (NAMES | MEASUREMENTS)[each].split('.')
+        getattr(importlib.import_module(f'ins_align.experiments.{module}'), function)(
+            out, None if data_dir is None else Path(data_dir), runs, jobs)

@@ -23,7 +23,8 @@ nothing, ``republish`` publishes each IMU message unchanged, ``listen`` takes wh
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, ExitStack
+from contextlib import contextmanager, ExitStack, suppress
+from operator import itemgetter
 import os
 from pathlib import Path
 import resource
@@ -52,6 +53,10 @@ from rosbags.highlevel import AnyReader
 with AnyReader([Path(sys.argv[1])]) as reader:
     print(sum(1 for _ in reader.messages()))
 """
+CLI = '-m', 'ins_align.cli'
+BESIDE = '-m', 'ins_align.experiments.bench'
+NODE = '-m', 'ins_align.ros.main', '--ros-args', '-p', 'lever_arm:=[1.0, 1.0, 1.0]'
+DRIVE = '--scenario', 'car', '--imu-rate', '200'
 
 
 def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
@@ -64,9 +69,11 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
     with tempfile.TemporaryDirectory() as folder:
         rows = [replay_against_bare_pass(Path(folder), storage, minutes) for storage in TARGETS]
         rows += node_rows(Path(folder))
-    rows += [*epoch_rows(), start_row()]
+    rows += [*epoch_rows(), row_of(
+        'ins_align --help; start of Python', *medians([*CLI, '--help'], ['-c', 'pass']), 's',
+        'less than 0.5 s longer')]
     report.table('Ours, what it is measured against, their ratio and what it should be at most',
-                 rows)
+                 rows, [(name, '', itemgetter(name)) for name in rows[0]])
     report.write(rows)
 
 
@@ -80,62 +87,50 @@ def row_of(name: str, ours: float, other: float, unit: str, target: str) -> Json
     return cells(name, f'{ours:.3g} {unit}', f'{other:.3g} {unit}', f'{ours / other:.2f}', target)
 
 
-def elapsed(command: Sequence[str]) -> float:
-    """Run a process and return how long it took, s."""
+def elapsed(arguments: Sequence[str]) -> float:
+    """Run a Python process and return how long it took, s."""
     start = time.perf_counter()
-    done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    done = subprocess.run([sys.executable, *arguments], stdout=subprocess.DEVNULL,
+                          stderr=subprocess.PIPE, text=True)
     if done.returncode not in (0, 1):
         raise RuntimeError(done.stderr)
     return time.perf_counter() - start
 
 
-def medians(*commands: Sequence[str]) -> list[float]:
-    """Run commands in turns and return the median time of each, s."""
-    times = [[elapsed(command) for command in commands] for _ in range(REPEATS)]
+def medians(*processes: Sequence[str]) -> list[float]:
+    """Run Python processes in turns and return the median time of each, s."""
+    times = [[elapsed(arguments) for arguments in processes] for _ in range(REPEATS)]
     return [statistics.median(column) for column in zip(*times)]
 
 
 def replay_against_bare_pass(folder: Path, storage: str, minutes: int) -> JsonDict:
     """Replay a recording, and only count its messages."""
-    bag = folder / f'bag_{storage}'
-    _command('simulate', str(bag), '--scenario', 'car', '--imu-rate', '200', '--duration',
-             str(60 * minutes), '--storage', storage)
-    ours, bare = medians(_cli('replay', str(bag), '--params', str(bag / 'ins_align.yaml')),
-                         [sys.executable, '-c', COUNT, str(bag)])
-    return row_of(f'replay of {minutes} min, {storage}; bare pass', ours, bare, 's',
-                  TARGETS[storage])
-
-
-def _cli(*arguments: str) -> list[str]:
-    return [sys.executable, '-m', 'ins_align.cli', *arguments]
-
-
-def _command(*arguments: str) -> None:
-    subprocess.run(_cli(*arguments), check=True, stdout=subprocess.DEVNULL)
+    bag = str(folder / f'bag_{storage}')
+    elapsed([*CLI, 'simulate', bag, *DRIVE, '--duration', f'{60 * minutes}', '--storage', storage])
+    return row_of(f'replay of {minutes} min, {storage}; bare pass', *medians(
+        [*CLI, 'replay', bag, '--params', f'{bag}/ins_align.yaml'], ['-c', COUNT, bag]), 's',
+        TARGETS[storage])
 
 
 def node_rows(folder: Path) -> list[JsonDict]:
     """Compare processor times of nodes."""
     bag = str(folder / 'played')
-    _command('simulate', bag, '--scenario', 'car', '--imu-rate', '200', '--gnss-rate', '10',
-             '--duration', f'{CPU_SECONDS + 15.0}')
-    beside = '-m', 'ins_align.experiments.bench'
+    elapsed([*CLI, 'simulate', bag, *DRIVE, '--gnss-rate', '10',
+             '--duration', f'{CPU_SECONDS + 15.0}'])
     rows = []
     for name, title in (('bare', 'node, nobody listens; node that does nothing'),
                         ('republish', 'node, ~/imu listened to; node that republishes')):
         with ExitStack() as stack:
-            other = stack.enter_context(_process(*beside, name))
-            ours = stack.enter_context(_process(
-                '-m', 'ins_align.ros.main', '--ros-args', '-p', 'lever_arm:=[1.0, 1.0, 1.0]'))
+            nodes = [stack.enter_context(_process(*each)) for each in (NODE, (*BESIDE, name))]
             if name == 'republish':
-                stack.enter_context(_process(*beside, 'listen'))
+                stack.enter_context(_process(*BESIDE, 'listen'))
             time.sleep(3.0)
-            stack.enter_context(_process(*beside, 'play', bag))
+            stack.enter_context(_process(*BESIDE, 'play', bag))
             time.sleep(8.0)
-            before = _cpu_seconds(ours), _cpu_seconds(other)
+            before = [_cpu_seconds(pid) for pid in nodes]
             time.sleep(CPU_SECONDS)
             spent = [100.0 * (_cpu_seconds(pid) - start) / CPU_SECONDS
-                     for pid, start in zip((ours, other), before)]
+                     for pid, start in zip(nodes, before)]
         rows.append(row_of(title, *spent, '% CPU', '1.15'))
     return rows
 
@@ -149,11 +144,10 @@ def _process(*arguments: str) -> Iterator[int]:
         yield process.pid
     finally:
         process.send_signal(signal.SIGINT)
-        try:
+        with suppress(subprocess.TimeoutExpired):
             process.wait(20.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        process.kill()
+        process.wait()
 
 
 def _cpu_seconds(pid: int) -> float:
@@ -183,12 +177,6 @@ def epoch_rows() -> list[JsonDict]:
                   'them', f'{resident[-1]:.0f} MB', f'{grown:.1f} MB')]
 
 
-def start_row() -> JsonDict:
-    """Compare the start of the command with that of Python."""
-    ours, other = medians(_cli('--help'), [sys.executable, '-c', 'pass'])
-    return row_of('ins_align --help; start of Python', ours, other, 's', 'less than 0.5 s longer')
-
-
 # The processes beside the node
 
 def _types() -> dict[str, Any]:
@@ -198,27 +186,23 @@ def _types() -> dict[str, Any]:
     return {'/imu/data_raw': Imu, '/fix': NavSatFix, '/fix_velocity': TwistWithCovarianceStamped}
 
 
-def _nothing(msg: Any) -> None:
-    pass
-
-
 def _spin(name: str) -> None:
     import rclpy
     from rclpy.qos import QoSProfile, ReliabilityPolicy
 
+    def nothing(msg: Any) -> None:
+        pass
+
     node, types = rclpy.create_node(name), _types()
     imu_type = types['/imu/data_raw']
-    if name == 'listen':
-        for topic in ('/republish/imu', '/ins_align/imu'):
-            node.create_subscription(imu_type, topic, _nothing, 100, raw=True)
-    else:
-        callbacks = dict.fromkeys(types, _nothing)
-        if name == 'republish':
-            callbacks['/imu/data_raw'] = node.create_publisher(imu_type, '~/imu', 100).publish
-        for topic, callback in callbacks.items():
-            node.create_subscription(types[topic], topic, callback, QoSProfile(
-                depth=2000 if types[topic] is imu_type else 200,
-                reliability=ReliabilityPolicy.BEST_EFFORT))
+    for topic in ('/republish/imu', '/ins_align/imu') if name == 'listen' else ():
+        node.create_subscription(imu_type, topic, nothing, 100, raw=True)
+    for topic, kind in types.items() if name != 'listen' else ():
+        take = nothing
+        if (name, kind) == ('republish', imu_type):
+            take = node.create_publisher(imu_type, '~/imu', 100).publish
+        node.create_subscription(kind, topic, take, QoSProfile(
+            depth=2000 if kind is imu_type else 200, reliability=ReliabilityPolicy.BEST_EFFORT))
     # A signal between two waits of the executor would not be seen.
     node.create_timer(1.0, lambda: None)
     rclpy.spin(node)
@@ -248,13 +232,8 @@ def main(name: str, *arguments: str) -> int:
     from rclpy.executors import ExternalShutdownException
 
     rclpy.init()
-    try:
-        if name == 'play':
-            _play(*arguments)
-        else:
-            _spin(name)
-    except ExternalShutdownException:
-        pass
+    with suppress(ExternalShutdownException):
+        _play(*arguments) if name == 'play' else _spin(name)
     return 0
 
 

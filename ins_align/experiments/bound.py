@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 from ins_align.aligner import Aligner
 from ins_align.experiments import dense
 from ins_align.experiments.common import (
-    draw, error_of, exact_config_for, GRADES, JsonDict, parallel, Report, rms)
+    Column, draw, error_of, exact_config_for, GRADES, JsonDict, parallel, Report, rms)
 from ins_align.geometry.rotation import Array
 from ins_align.simulation.simulate import epochs_of, simulate
 import numpy as np
@@ -89,19 +89,18 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
     report.table(
         f'Targets: ratio of error and bound at most {RATIO_LIMIT:g}, NEES/3 within '
         f'{NEES_RANGE[0]:g} to {NEES_RANGE[1]:g}; beyond chance: by more than two of its sigmas', [
-            reached(title, [result for result in summaries if result['title'] == title])
-            for title in dict.fromkeys(case.title for case in CASES)])
+            (title, [result for result in summaries if result['title'] == title])
+            for title in dict.fromkeys(case.title for case in CASES)], TARGET_COLUMNS)
     report.table('Root mean square errors, bounds and their ratios', [
-        row(result, time) for result in summaries for time in TABLE_TIMES])
+        (result, TIMES.index(time)) for result in summaries for time in TABLE_TIMES], ROW_COLUMNS)
     report.table(
         f'Lever arm (prior {LEVER_STD:g} m per axis) and delay (true {DELAY:g} s, prior '
         f'{DELAY_STD:g} s) as unknowns on `flight`, after {TIMES[-1]:g} s; above, the bound knows '
-        'no more than the aligner', [
-            {'case': result['title'], 'IMU': result['grade'],
-             'rms error (m or s)': f"{result['nuisance_rms']:.2g}",
-             'stated sigma': f"{result['nuisance_std']:.2g}",
-             'rms of error/sigma': f"{result['nuisance_sigmas']:.2f}"}
-            for result in summaries if result['unknown']])
+        'no more than the aligner', [result for result in summaries if result['unknown']], [
+            ('case', '', lambda r: r['title']), ('IMU', '', lambda r: r['grade']),
+            ('rms error (m or s)', '.2g', lambda r: r['nuisance_rms']),
+            ('stated sigma', '.2g', lambda r: r['nuisance_std']),
+            ('rms of error/sigma', '.2f', lambda r: r['nuisance_sigmas'])])
     report.figure(draw(11.0, 7.5, [[panel(summaries, scenario, angle) for scenario in (
         'flight', 'car')] for angle in ('tilt', 'heading')], sharex=True), '',
         'Errors of the attitude at t0 (dots: rms; lines: Cramer-Rao bound), GNSS velocity')
@@ -134,14 +133,11 @@ def run_case(task: tuple[Case, int]) -> JsonDict:
     simulation = simulate(case.scenario, imu_grade=case.grade, seed=seed, duration=TIMES[-1] + 0.5,
                           **arguments)
     aligner = Aligner(exact_config_for(simulation, **config))
-    attitudes: list[Any] = [None] * len(TIMES)
-    for epoch in epochs_of(aligner, simulation, velocity=not case.position_only):
-        for k, time in enumerate(TIMES):
-            if epoch.t_s <= time + 1e-6:
-                attitudes[k] = epoch.initial
+    epochs = list(epochs_of(aligner, simulation, velocity=not case.position_only))
     error, nees = np.full((len(TIMES), 3), np.nan), np.full(len(TIMES), np.nan)
-    for k, attitude in enumerate(attitudes):
-        if attitude is not None:
+    for k, time in enumerate(TIMES):
+        last = [epoch.initial for epoch in epochs if epoch.t_s <= time + 1e-6][-1:]
+        for attitude in filter(None, last):
             error[k], _, nees[k], *_ = error_of(attitude,
                                                 simulation.attitude_at(attitude.stamp_ns))
     status = aligner.status()
@@ -151,28 +147,16 @@ def run_case(task: tuple[Case, int]) -> JsonDict:
     return {'error': error, 'nees': nees, 'nuisance': nuisance}
 
 
-def crossing_time(task: tuple[str, str, float, float, dict[str, float]]) -> float | None:
-    """
-    Return when the bound of the heading crosses a threshold, None if it does not.
-
-    The task: scenario, grade, seconds to look at, degrees, what of `dense.bound` is unknown.
-    """
-    scenario, grade, horizon, threshold_deg, unknown = task
-    bound = dense.bound(simulate(scenario, imu_grade=grade, duration=horizon), **unknown)
-    good = np.degrees(np.sqrt(bound.covariance[:, 2, 2])) <= threshold_deg
-    return float(bound.time[np.argmax(good)]) if good.any() else None
-
-
 def summary(case: Case, bound: tuple[Array, Array], runs: list[JsonDict]) -> JsonDict:
     """Return the statistics of a case's runs over time."""
     error = np.array([each['error'] for each in runs])
-    tilt, heading = rms(np.hypot(error[..., 0], error[..., 1]), axis=0), rms(error[..., 2], axis=0)
     result = {'title': case.title, 'scenario': case.scenario, 'grade': case.grade,
-              'unknown': case.unknown, 'runs': len(runs),
-              'tilt_deg': tilt, 'tilt_bound_deg': bound[0], 'tilt_ratio': tilt / bound[0],
-              'heading_deg': heading, 'heading_bound_deg': bound[1],
-              'heading_ratio': heading / bound[1],
-              'nees': np.mean([each['nees'] for each in runs], axis=0) / 3}
+              'unknown': case.unknown, 'runs': len(runs)}
+    for angle, limit, errors in zip(('tilt', 'heading'), bound, (
+            np.hypot(error[..., 0], error[..., 1]), error[..., 2])):
+        result |= {f'{angle}_deg': rms(errors, axis=0), f'{angle}_bound_deg': limit,
+                   f'{angle}_ratio': rms(errors, axis=0) / limit}
+    result['nees'] = np.mean([each['nees'] for each in runs], axis=0) / 3
     if case.unknown:
         errors, stds = (np.array([each['nuisance'][place] for each in runs]) for place in (0, 1))
         result |= {'nuisance_rms': rms(errors), 'nuisance_std': rms(stds),
@@ -185,42 +169,49 @@ def chances(runs: int) -> tuple[float, float]:
     return 1 / np.sqrt(2 * runs), np.sqrt(2 / 3 / runs)
 
 
-def reached(title: str, results: list[JsonDict]) -> JsonDict:
-    """Say how many of the table's figures of like cases meet their targets."""
-    places = [TIMES.index(time) for time in TABLE_TIMES]
-    slack = 2 * chances(results[0]['runs'])[0]
-    nees = np.array([result['nees'][places] for result in results])
-    cells = {'case': title, 'figures': nees.size}
-    for angle in ('tilt', 'heading'):
-        ratio = np.array([result[f'{angle}_ratio'][places] for result in results])
-        cells |= {f'{angle} met': int(np.sum(ratio <= RATIO_LIMIT)),
-                  f'{angle} beyond chance': int(np.sum(ratio > RATIO_LIMIT + slack)),
-                  f'{angle} mean': f'{np.mean(ratio):.2f}',
-                  f'{angle} largest': f'{np.max(ratio):.2f}'}
-    low, high = NEES_RANGE
-    return cells | {'NEES/3 met': int(np.sum((nees >= low) & (nees <= high))),
-                    'mean': f'{np.mean(nees):.2f}',
-                    'range': f'{np.min(nees):.2f} to {np.max(nees):.2f}'}
+def figures(results: list[JsonDict], name: str) -> Array:
+    """Return the table's figures of like cases."""
+    return np.array([result[name][TIMES.index(time)] for result in results
+                     for time in TABLE_TIMES])
 
 
-def row(result: JsonDict, time: float) -> JsonDict:
-    """Return a case at a time as a row of the table."""
-    at = {name: values[TIMES.index(time)] for name, values in result.items()
-          if isinstance(values, np.ndarray) and values.shape == (len(TIMES),)}
-    ratio, nees = chances(result['runs'])
-    cells = {'case': f"{result['title']}, {result['scenario']}, {result['grade']}",
-             't, s': f'{time:g}'}
-    for angle in ('tilt', 'heading'):
-        cells |= {f'{angle}, deg': f"{at[f'{angle}_deg']:.2g}",
-                  f'{angle} bound': f"{at[f'{angle}_bound_deg']:.2g}",
-                  f'{angle} ratio': f"{at[f'{angle}_ratio']:.2f}"}
-    return cells | {'NEES/3': f"{at['nees']:.2f}", 'runs': result['runs'],
-                    '+- ratio': f'{ratio:.2f}', '+- NEES/3': f'{nees:.2f}'}
+def _target_columns(angle: str) -> list[Column]:
+    """Return how many ratios of like cases meet their target, of a title and its results."""
+    name = f'{angle}_ratio'
+    return [
+        (f'{angle} met', '', lambda g: np.sum(figures(g[1], name) <= RATIO_LIMIT)),
+        (f'{angle} beyond chance', '', lambda g: np.sum(
+            figures(g[1], name) > RATIO_LIMIT + 2 * chances(g[1][0]['runs'])[0])),
+        (f'{angle} mean', '.2f', lambda g: np.mean(figures(g[1], name))),
+        (f'{angle} largest', '.2f', lambda g: np.max(figures(g[1], name)))]
+
+
+def _row_columns(angle: str) -> list[Column]:
+    """Return a case's errors at a time, of its result and the place of the time."""
+    return [(f'{angle}{title}', digits, lambda r, name=name: r[0][angle + name][r[1]])
+            for title, digits, name in ((', deg', '.2g', '_deg'), (' bound', '.2g', '_bound_deg'),
+                                        (' ratio', '.2f', '_ratio'))]
+
+
+TARGET_COLUMNS: list[Column] = [
+    ('case', '', lambda g: g[0]), ('figures', '', lambda g: len(figures(g[1], 'nees'))),
+    *_target_columns('tilt'), *_target_columns('heading'),
+    ('NEES/3 met', '', lambda g: np.sum((figures(g[1], 'nees') >= NEES_RANGE[0])
+                                        & (figures(g[1], 'nees') <= NEES_RANGE[1]))),
+    ('mean', '.2f', lambda g: np.mean(figures(g[1], 'nees'))),
+    ('range', '', lambda g: '{:.2f} to {:.2f}'.format(
+        np.min(figures(g[1], 'nees')), np.max(figures(g[1], 'nees'))))]
+ROW_COLUMNS: list[Column] = [
+    ('case', '', lambda r: '{title}, {scenario}, {grade}'.format(**r[0])),
+    ('t, s', 'g', lambda r: TIMES[r[1]]), *_row_columns('tilt'), *_row_columns('heading'),
+    ('NEES/3', '.2f', lambda r: r[0]['nees'][r[1]]), ('runs', '', lambda r: r[0]['runs']),
+    ('+- ratio', '.2f', lambda r: chances(r[0]['runs'])[0]),
+    ('+- NEES/3', '.2f', lambda r: chances(r[0]['runs'])[1])]
 
 
 def panel(results: list[JsonDict], scenario: str, angle: str) -> JsonDict:
     """Return errors and bounds over time for `draw`."""
-    lines = []
+    lines: list[Any] = []
     for grade, colour in zip(GRADES, ('#0072B2', '#E69F00', '#D55E00')):
         result = next(result for result in results if (
             result['title'], result['scenario'], result['grade']) == ('velocity', scenario, grade))

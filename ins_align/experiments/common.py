@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What the experiments share: parallel runs, errors against truth, and the files they write."""
+"""What the experiments share: runs, how they are judged, tables and pages."""
 
 from __future__ import annotations
 
@@ -23,23 +23,29 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ins_align.aligner import Attitude, Epoch
+from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
+from ins_align.experiments.spoilt import Message, SECOND, SENSORS, Stream, stream_of
 from ins_align.geometry.rotation import Array, log_so3
 from ins_align.outputs import write_whole
 from ins_align.processes import pool, processors
 from ins_align.report import format_table, new_figure
-from ins_align.simulation.simulate import Simulation
+from ins_align.simulation.simulate import give, simulate, Simulation
 import numpy as np
 
 # Of simulated data nothing comes late, but an unknown delay wants IMU samples beyond the stamp.
 LATENESS = 0.5
 GRADES = ('navigation', 'tactical', 'mems')
-COLOURS = 64        # of a figure
-BINS = (3.0, 5.0)   # sigmas that are counted
+BINS = (3.0, 5.0)       # sigmas that are counted
+COLOURS = 64            # of a figure
+UPDATE_EVERY = 5.0      # s
+LONGEST = 5.0           # s that a look stands for
+ANGLES = {'tilt': slice(0, 2), 'heading': slice(2, 3)}      # what is counted, and its axes
 
 JsonDict = dict[str, Any]
-Groups = list[tuple[str, list[JsonDict]]]      # of trials, with names
+Groups = list[tuple[str, list[JsonDict]]]       # of trials, with names
+Column = tuple[str, str, Callable[[Any], Any]]  # title, format, and the value of a row's object
+Truth = Callable[[Any], Any]                    # attitudes at stamps
 
 
 def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jobs: int | None,
@@ -65,6 +71,8 @@ def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jo
         return grouped(executor.map(function, every,
                                     chunksize=max(1, min(10, len(every) // (4 * jobs)))))
 
+
+# What is run
 
 def combination(index: int, seed: Sequence[int], *axes: Iterable[Any]) -> Any:
     """Return one of the combinations of `axes`; each comes once before any comes twice."""
@@ -99,7 +107,64 @@ def exact_config_for(simulation: Simulation, **changes: Any) -> Config:
         'lever_arm_std': 0.0, 'gnss_delay_std': 0.0, **changes})
 
 
-# Errors against the truth
+def prepare(scenario: str, arguments: JsonDict, config: JsonDict, frame: str = 'enu',
+            spoil: Callable[[Stream], Any] | None = None) -> tuple[Simulation, Stream, Aligner]:
+    """Simulate, spoil the messages, and configure an aligner for what is left of the truth."""
+    simulation = simulate(scenario, **arguments)
+    stream = stream_of(simulation, frame)
+    if spoil is not None:
+        spoil(stream)
+    return simulation, stream, Aligner(config_for(simulation, **{**stream.config, **config}))
+
+
+class Look(NamedTuple):
+    """What an aligner says at an epoch, or between epochs: there `t_s` is None."""
+
+    stamp_ns: int
+    t_s: float | None
+    state: State
+    initial: Attitude | None
+    current: Attitude | None
+
+
+def follow(aligner: Aligner, sent: Iterable[Message], every_s: float = UPDATE_EVERY,
+           between: bool = False, watch: Callable[[list[Epoch]], Any] | None = None) -> list[Look]:
+    """
+    Give an aligner messages in the order of arrival, and look at what it says every so often.
+
+    Without epochs it is looked at as well, so that silence counts; `every_s` 0: when the messages
+    have an 'update'. `between` asks for the attitude after every message instead of looking at
+    epochs; `watch` gets the epochs of each update.
+    """
+    looks: list[Look] = []
+
+    def look(epochs: list[Epoch]) -> None:
+        if watch is not None:
+            watch(epochs)
+        if epochs and not between:
+            looks.extend(Look(*(getattr(epoch, name) for name in Look._fields))
+                         for epoch in epochs)
+        elif aligner.newest_imu_ns is not None:
+            status = aligner.status()
+            looks.append(Look(aligner.newest_imu_ns, None, status.state, status.initial,
+                              aligner.attitude_now() if between else status.current))
+
+    due = 0.0 if every_s else math.inf
+    for now, kind, payload in sent:
+        if kind in SENSORS:
+            give(aligner, kind, payload)
+        elif kind == 'reject':
+            aligner.reject(payload)
+        if between or now >= due or kind in ('update', 'reset'):
+            look(aligner.update())
+            due = now + every_s * SECOND if every_s else math.inf
+        if kind == 'reset':
+            aligner.reset()
+    look(aligner.flush())
+    return looks
+
+
+# How it is judged
 
 class Error(NamedTuple):
     """Error of an attitude against the truth."""
@@ -138,17 +203,51 @@ def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Array | None = No
                  float(np.max(sigmas[:2])), float(sigmas[2]))
 
 
-# What is counted of a moment, and its axes.
-ANGLES = {'tilt': slice(0, 2), 'heading': slice(2, 3)}
-
-
-def judged(epoch: Epoch | None, true: Callable[[Any], Array]) -> JsonDict | None:
-    """Compare the attitudes of an epoch with the truth at their stamps."""
-    if epoch is None or epoch.initial is None or epoch.current is None:
+def judged(look: Look | None, true: Truth) -> JsonDict | None:
+    """Compare the attitudes of a look with the truth at their stamps."""
+    if look is None or look.initial is None or look.current is None:
         return None
-    return {'t_s': epoch.t_s} | {
+    return {'t_s': look.t_s} | {
         name: error_of(attitude, true(attitude.stamp_ns)).to_json()
-        for name, attitude in (('initial', epoch.initial), ('current', epoch.current))}
+        for name, attitude in (('initial', look.initial), ('current', look.current))}
+
+
+def moments(looks: Iterable[Look], true: Truth) -> JsonDict:
+    """Judge the first epoch that is levelled, the last if it is aligned, every declaration."""
+    epochs = [look for look in looks if look.t_s is not None]
+    aligned = [look.state is State.ALIGNED for look in epochs]
+    levelled = (look for look in epochs if look.state in (State.LEVELLED, State.ALIGNED))
+    declared = [judged(look, true) for look, before, now in zip(
+        epochs, [False, *aligned], aligned) if now and not before]
+    return {'levelled': judged(next(levelled, None), true),
+            'aligned': declared[0] if declared else None, 'declared': declared,
+            'final': judged(epochs[-1], true) if any(aligned[-1:]) else None}
+
+
+def while_aligned(looks: Sequence[Look], start_ns: int, true: Truth,
+                  std_deg: Array | None = None) -> JsonDict:
+    """
+    Judge the current attitude whenever it is called aligned.
+
+    `true` may have None where nothing is known, `std_deg` (3,) says how well; `start_ns` is the
+    stamp of the first sample.
+    """
+    stamps = np.array([look.stamp_ns for look in looks], np.int64)
+    held = np.clip(np.diff(stamps, append=stamps[-1:]) / SECOND, 0.0, LONGEST)
+    aligned = {k: look.current for k, look in enumerate(looks)
+               if look.state is State.ALIGNED and look.current is not None}
+    truths = true([attitude.stamp_ns for attitude in aligned.values()]) if aligned else []
+    errors = {k: error_of(attitude, C_true, std_deg)
+              for (k, attitude), C_true in zip(aligned.items(), truths) if C_true is not None}
+    first = next(iter(errors), None)
+    wrong = [k for k, error in errors.items() if error.worst_sigmas > BINS[1]]
+    return {'declared_s': None if first is None else (stamps[first] - start_ns) / SECOND,
+            'declared_sigmas': None if first is None else errors[first].worst_sigmas,
+            'worst_sigmas': max((e.worst_sigmas for e in errors.values()), default=0.0),
+            'worst_heading_deg': max((abs(e.angles_deg[2]) for e in errors.values()),
+                                     default=0.0),
+            'beyond_s': np.sum(held[wrong]),
+            'aligned_part': np.sum(held[[*aligned]]) / max(np.sum(held), 1e-9)}
 
 
 def worse(moment: JsonDict | None, *angles: str) -> float:
@@ -162,25 +261,24 @@ def worse(moment: JsonDict | None, *angles: str) -> float:
         for angle in angles or ANGLES)
 
 
-def first_in(epochs: Iterable[Epoch], *states: Any) -> Epoch | None:
-    """Return the first epoch in one of the states."""
-    return next((epoch for epoch in epochs if epoch.state in states), None)
+def most(values: Iterable[float]) -> float | None:
+    """Return the largest value, None if there is none."""
+    return max(values, default=None)
 
 
-def most(values: Iterable[float], digits: str) -> str | None:
-    """Return the largest value as text, None if there is none."""
-    values = list(values)
-    return format(max(values), digits) if values else None
-
-
-def without(trials: list[JsonDict], *omitted: str) -> list[JsonDict]:
-    """Return trials without what need not be written."""
-    return [{key: value for key, value in t.items() if key not in omitted} for t in trials]
+def median(values: Any) -> float | None:
+    """Return the median, None if there is nothing."""
+    return float(np.median(values)) if len(values) else None
 
 
 def rms(values: Any, axis: Any = None) -> Any:
     """Root mean square."""
     return np.sqrt(np.mean(np.square(values), axis=axis))
+
+
+def without(trials: list[JsonDict], *omitted: str) -> list[JsonDict]:
+    """Return trials without what need not be written."""
+    return [{key: value for key, value in t.items() if key not in omitted} for t in trials]
 
 
 # Pages
@@ -200,12 +298,13 @@ class Report:
         self._parts.append(text)
         print(text + '\n')
 
-    def table(self, title: str, rows: Iterable[JsonDict]) -> None:
-        """Add a table of rows that have their columns' names."""
-        rows = list(rows)
-        table = format_table([list(row.values()) for row in rows], list(rows[0]) if rows else ())
+    def table(self, title: str, objects: Iterable[Any], columns: Sequence[Column]) -> None:
+        """Add a table with a row for each object; a value that is None becomes a dash."""
+        rows = [[None if (value := value_of(each)) is None else format(value, digits)
+                 for _, digits, value_of in columns] for each in objects]
+        table = format_table(rows, [name for name, *_ in columns]) if rows else 'none'
         self._parts.append(f'{title}\n\n```text\n{table}\n```' if rows else f'{title}: none.')
-        print(f'{title}\n\n{table or "none"}\n', flush=True)
+        print(f'{title}\n\n{table}\n', flush=True)
 
     def figure(self, figure: Any, suffix: str, caption: str) -> None:
         """Write a figure as PNG and refer to it."""
@@ -228,48 +327,16 @@ class Report:
             write_whole(self._out / f'{self._name}.{suffix}', lambda file: file.write(content))
 
 
+def whose() -> list[Column]:
+    """Return the columns that say which trial it is."""
+    return [(title, '', lambda t, key=key: t[key]) for title, key in (
+        ('index', 'index'), ('fault', 'fault'), ('scenario', 'scenario'), ('IMU', 'imu'))]
+
+
 def groups_of(trials: list[JsonDict], faults: Iterable[str]) -> Groups:
     """Group trials by fault; the last group is all."""
     return [*((name, [t for t in trials if t['fault'] == name]) for name in faults),
             ('all', trials)]
-
-
-def moment_table(report: Report, title: str, groups: Groups, moment: str) -> None:
-    """Print when groups of trials came to a moment, and how many were beyond the limits."""
-    rows = []
-    for name, trials in groups:
-        declared = [t[moment] for t in trials if t[moment] is not None]
-        times = [each['t_s'] for each in declared]
-        row = {'fault': name, 'runs': len(trials), 'declared': len(declared),
-               'median, s': f'{np.median(times):.1f}' if times else None}
-        for angle, axes in ANGLES.items():
-            sigmas = np.array([worse(each, angle) for each in declared])
-            for limit in BINS:
-                share = f'{np.sum(sigmas > limit)} ({100 * np.mean(sigmas > limit):.1f} %)' \
-                    if declared else None
-                row[f'{angle} beyond {limit:g}'] = share
-            row[f'worst {angle}, sigma'] = most(sigmas, '.1f')
-            row[f'{angle}, deg'] = most(
-                (np.max(np.abs(each[which]['error_deg'][axes])) for each in declared
-                 for which in ('initial', 'current')), '.2g')
-        rows.append(row)
-    report.table(title, rows)
-
-
-def whose(trial: JsonDict) -> JsonDict:
-    """Return the columns that say which trial it is."""
-    return {'index': trial['index'], 'fault': trial['fault'], 'scenario': trial['scenario'],
-            'IMU': trial['imu']}
-
-
-def offender_table(report: Report, trials: list[JsonDict], *moments: str) -> list[JsonDict]:
-    """Print and return the trials that are beyond the first of `BINS` at one of the moments."""
-    report.table(f'Beyond {BINS[0]:g} sigma', [
-        {**whose(t), 'moment': moment,
-         **{f'{angle}, sigma': f'{worse(t[moment], angle):.1f}' for angle in ANGLES},
-         'after, s': f"{t[moment]['t_s']:.1f}"}
-        for moment in moments for t in trials if worse(t[moment]) > BINS[0]])
-    return [t for t in trials if max(worse(t[moment]) for moment in moments) > BINS[0]]
 
 
 def draw(width: float, height: float, panels: Sequence[Sequence[JsonDict]], **shared: Any) -> Any:

@@ -27,9 +27,9 @@ from typing import Any
 from ins_align.aligner import Aligner
 from ins_align.experiments import dense
 from ins_align.experiments.common import (
-    draw, exact_config_for, JsonDict, parallel, Report, rms)
+    Column, draw, exact_config_for, JsonDict, parallel, Report, rms)
 from ins_align.geometry.earth import EARTH_RATE, earth_rate_n, LocalLevel
-from ins_align.geometry.rotation import Array, cross, roll_pitch_yaw, skew
+from ins_align.geometry.rotation import apply, Array, cross, roll_pitch_yaw, skew
 from ins_align.simulation.simulate import epochs_of, simulate
 import numpy as np
 
@@ -111,14 +111,19 @@ def rms_table(report: Report, errors: Errors, bounds: dict[str, Array],
     places = [int(np.argmin(np.abs(time - t))) for t in TABLE_TIMES]
     numbers = {}
     for grade, variants in errors.items():
-        for name, error in variants.items():
-            numbers[f'{grade}: {name}'] = rms(error[:, places, 2], axis=0)
+        numbers |= {f'{grade}: {name}': rms(error[:, places, 2], axis=0)
+                    for name, error in variants.items()}
         numbers[f'{grade}: Cramer-Rao bound'] = bounds[grade][places, 1]
     report.table('Heading error, rms in deg. Without "free start" and bank: free_start false, '
-                 'the note to the letter', [
-                     {'variant': name, **{f'{t:g} s': f'{value:.2g}' for t, value in zip(
-                         TABLE_TIMES, values)}} for name, values in numbers.items()])
+                 'the note to the letter', numbers.items(),
+                 _columns([f'{t:g} s' for t in TABLE_TIMES]))
     return numbers
+
+
+def _columns(titles: list[str]) -> list[Column]:
+    """Return columns of a variant and its numbers."""
+    return [('variant', '', lambda each: each[0]), *(
+        (title, '.2g', lambda each, k=k: each[1][k]) for k, title in enumerate(titles))]
 
 
 def peak_table(report: Report, errors: dict[str, Array], time: Array) -> dict[str, list[float]]:
@@ -130,12 +135,11 @@ def peak_table(report: Report, errors: dict[str, Array], time: Array) -> dict[st
         mean, apart = np.mean(errors[name], axis=0), np.mean(errors[name] - none, axis=0)
         numbers[name] = [*np.max(np.abs(mean[early]), axis=0), *np.abs(mean[-1]),
                          *np.max(np.abs(apart[early]), axis=0)]
-    columns = [f'{angle}{when}' for when in ('', ', end', ', apart') for angle in ANGLES]
     report.table(
         f'Mean error, deg: largest from {PEAK_FROM:g} to {PEAK_TO:g} s, at {DURATION:g} s, and '
-        'largest difference early from that of zero lever arm with the same noise', [
-            {'variant': name, **{column: f'{value:.2g}' for column, value in zip(
-                columns, values)}} for name, values in numbers.items()])
+        'largest difference early from that of zero lever arm with the same noise',
+        numbers.items(),
+        _columns([f'{angle}{when}' for when in ('', ', end', ', apart') for angle in ANGLES]))
     chance = np.max(np.std(none, axis=0, ddof=1)[early], axis=0) / np.sqrt(len(none))
     report.text(
         "The note's Fig. 1 shows early peaks without compensation, gone with it, and compensated "
@@ -202,17 +206,16 @@ def remarks_of(duration: float) -> tuple[Array, Array, Array, Array, Array]:
     """
     truth = simulate('flight', ideal=True, duration=duration, gnss_rate=1.0)
     time = (truth.truth_stamps_ns - truth.truth_stamps_ns[0]) * 1e-9
-    lever_b = np.array(LEVER)
+    lever_b, C_nb = np.array(LEVER), truth.truth_C_nb
     latitude, longitude = np.radians(truth.truth_lla[:, :2]).T
-    C_nb = truth.truth_C_nb
     C_b0b = C_nb[0].T @ LocalLevel(latitude[0], longitude[0]).matrix(
         time, latitude, longitude) @ C_nb
     omega_ie_n = earth_rate_n(latitude)
     omega_eb_b = truth.truth_gyro - np.einsum('nji,nj->ni', C_nb, omega_ie_n)
     remainder = exact_lever_remainder(time, C_b0b, omega_eb_b, C_nb[0].T @ omega_ie_n[0],
                                       lever_b)
-    turned = np.einsum('nij,nj->ni', C_b0b, cross(truth.truth_gyro, lever_b))
-    integral = dense.cumulative(time, np.einsum('nij,nj->ni', C_b0b, truth.truth_accel))
+    turned = apply(C_b0b, cross(truth.truth_gyro, lever_b))
+    integral = dense.cumulative(time, apply(C_b0b, truth.truth_accel))
     return (time, np.linalg.norm(remainder, axis=1),
             2 * EARTH_RATE ** 2 * time * np.linalg.norm(lever_b),
             np.linalg.norm(turned - turned[0], axis=1), np.linalg.norm(integral, axis=1))

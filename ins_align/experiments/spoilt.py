@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Faults of real drivers, put into the messages of a simulation before anything has seen them.
+Messages of a simulated vehicle as drivers send them, and what real drivers get wrong in them.
 
 A fault changes a `Stream` in place: it drops, repeats, delays, restamps and spoils messages, and
 notes which counters of the aligner have to show it.
@@ -20,20 +20,174 @@ notes which counters of the aligner have to show it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 from ins_align.config import Config
-from ins_align.experiments.stream import (
-    between, directions, GNSS, Random, SECOND, some, Stream, Window)
+from ins_align.geometry.rotation import Array
+from ins_align.gnss.messages import ENU_FROM_NED, fixes, MessageError, velocities
+from ins_align.simulation.scenarios import displaced
+from ins_align.simulation.simulate import Simulation
 import numpy as np
 
+Random = np.random.Generator
+Window = tuple[int, int]            # ns
+Message = tuple[int, str, Any]      # when it arrives (ns), what it is, and itself
+
+SECOND = 1_000_000_000
 HOUR = 3600 * SECOND
 GRAVITY = 9.80665  # m/s^2
 LATENESS = round(Config().gnss_lateness * SECOND)
+LOT = 100       # IMU samples given at once, in which the lateness of their stamps is taken for one
+GNSS = 'fix', 'velocity'
+SENSORS = 'imu', *GNSS
+_IMU = np.dtype([('arrival', 'i8'), ('stamp', 'i8'), ('gyro', 'f8', 3), ('accel', 'f8', 3)])
+_FIX = np.dtype([('arrival', 'i8'), ('stamp', 'i8'), ('lla', 'f8', 3),
+                 ('covariance', 'f8', (3, 3)), ('covariance_type', 'i4'), ('status', 'i4')])
+_VELOCITY = np.dtype([('arrival', 'i8'), ('stamp', 'i8'), ('velocity', 'f8', 3),
+                      ('covariance', 'f8', (3, 3)), ('frame_id', 'U16')])
 
 
-# GNSS
+@dataclass
+class Stream:
+    """
+    What the drivers send: a row a message, with ``arrival`` and ``stamp`` in ns.
+
+    Everything else is as in the ROS messages, in the frame that the configuration names.
+    """
+
+    imu: np.ndarray
+    fix: np.ndarray
+    velocity: np.ndarray
+    first: int              # stamps between which the vehicle is simulated
+    last: int
+    config: dict[str, Any] = field(default_factory=dict)        # what else is configured
+    resets: list[int] = field(default_factory=list)     # when somebody asks for a new start
+    update_every: float = 0.0       # s, in the mean; 0: regularly, once a second
+    expected: dict[str, int] = field(default_factory=dict)      # counters known beforehand
+    # Stamps from the first on and before the second are off by the third.
+    shift: tuple[int, int, int] = 0, 0, 0
+
+    def true_stamps(self, stamps: Any) -> Any:
+        """When what bears these stamps has been, by the simulation's clock."""
+        start, end, shift = self.shift
+        stamps = np.asarray(stamps)
+        moved = np.where((stamps >= start) & (stamps < end), stamps - shift, stamps)
+        return np.clip(moved, self.first, self.last)
+
+    def measured_at(self, stamps: Any) -> Any:
+        """When IMU samples with such stamps were measured, if they are stamped late or ahead."""
+        late = self.imu['stamp'] - self.imu['arrival']
+        medians = np.array([int(np.median(late[k:k + LOT])) for k in range(0, len(late), LOT)])
+        places = np.searchsorted(self.imu['stamp'][::LOT], stamps) - 1
+        return np.clip(stamps - medians[np.maximum(places, 0)], self.first, self.last)
+
+    def moment(self, random: Random, low: float = 0.1, high: float = 0.9) -> int:
+        """Draw an instant from a part of the recording."""
+        return self.first + int(random.uniform(low, high) * (self.last - self.first))
+
+    def windows(self, random: Random, number: int, shortest: float,
+                longest: float) -> list[Window]:
+        """Draw windows with a length within limits, in seconds."""
+        starts = [self.moment(random) for _ in range(number)]
+        return [(start, start + int(random.uniform(shortest, longest) * SECOND))
+                for start in starts]
+
+    def seconds(self, name: str) -> Array:
+        """Return when messages were sent or samples taken, s since the start."""
+        return np.asarray((getattr(self, name)['arrival'] - self.first) / SECOND)
+
+    def keep(self, name: str, chosen: np.ndarray) -> None:
+        """Lose all but the chosen messages."""
+        setattr(self, name, getattr(self, name)[chosen])
+
+    def lose(self, names: Iterable[str], windows: Iterable[Window]) -> None:
+        """Lose the messages with stamps within windows."""
+        for window in windows:
+            for name in names:
+                self.keep(name, ~within(getattr(self, name), window))
+
+    def displace(self, chosen: np.ndarray, away: Array) -> None:
+        """Move positions by ENU offsets in metres, or by one for all."""
+        here = self.fix['lla'][chosen]
+        self.fix['lla'][chosen] = displaced(here, np.broadcast_to(away, here.shape))
+
+    def messages(self, config: Config, lot: int = LOT, update: Any = ()) -> Iterator[Message]:
+        """
+        Yield what an aligner is given, in the order of arrival; IMU samples in lots.
+
+        Kinds are the names of the arrays, 'update' at the times given, 'reset', and 'reject' with
+        the reason for a message that cannot be used.
+        """
+        kinds = *SENSORS, 'update', 'reset'
+        arrivals = [*(getattr(self, name)['arrival'] for name in SENSORS),
+                    np.asarray(update, np.int64), np.array(self.resets, np.int64)]
+        lengths = [len(times) for times in arrivals]
+        order = np.argsort(np.concatenate(arrivals), kind='stable')
+        kind = np.repeat(range(len(kinds)), lengths)[order]
+        places = order - (np.cumsum(lengths) - lengths)[kind]
+        for block in np.split(np.arange(len(order)), np.flatnonzero(np.diff(kind)) + 1):
+            what = kind[block[0]]
+            size = lot if what == 0 else 1
+            for start in range(0, len(block), size):
+                chosen = places[block[start:start + size]]
+                yield (int(arrivals[what][chosen[-1]]),
+                       *self._payload(config, kinds[what], chosen))
+
+    def _payload(self, config: Config, kind: str, chosen: np.ndarray) -> tuple[str, Any]:
+        if kind not in SENSORS:
+            return kind, None
+        rows = getattr(self, kind)[chosen]
+        if kind == 'imu':
+            return kind, (rows['stamp'], rows['gyro'], rows['accel'])
+        if kind == 'fix':
+            return kind, fixes(rows['stamp'], rows['lla'], rows['covariance'],
+                               rows['covariance_type'], rows['status'])[0]
+        stated = None if config.velocity_type == 'TwistStamped' else rows['covariance']
+        try:
+            return kind, velocities(rows['stamp'], str(rows['frame_id'][0]), rows['velocity'],
+                                    stated, config)[0]
+        except MessageError:
+            return 'reject', 'velocity_body_frame'
+
+
+def stream_of(simulation: Simulation, frame: str = 'enu') -> Stream:
+    """Return the messages of a simulation, velocities in ENU or NED."""
+    turn = ENU_FROM_NED if frame == 'ned' else np.eye(3)
+    imu = np.zeros(len(simulation.imu_stamps_ns), _IMU)
+    imu['arrival'] = imu['stamp'] = simulation.imu_stamps_ns
+    imu['gyro'], imu['accel'] = simulation.gyro, simulation.accel
+    fix = np.zeros(len(simulation.gnss_stamps_ns), _FIX)
+    velocity = np.zeros(len(fix), _VELOCITY)
+    for rows in fix, velocity:
+        rows['arrival'], rows['stamp'] = simulation.gnss_arrival_ns, simulation.gnss_stamps_ns
+    fix['lla'], fix['covariance'] = simulation.lla_deg, simulation.position_covariance
+    fix['covariance_type'] = 3
+    velocity['velocity'] = simulation.velocity @ turn
+    velocity['covariance'] = turn @ simulation.velocity_covariance @ turn
+    return Stream(imu, fix, velocity, int(simulation.imu_stamps_ns[0]),
+                  int(simulation.imu_stamps_ns[-1]), {'velocity_frame': frame})
+
+
+def within(rows: np.ndarray, window: Window) -> np.ndarray:
+    """Whether messages have stamps within a window."""
+    return (rows['stamp'] >= window[0]) & (rows['stamp'] < window[1])
+
+
+def some(random: Random, rows: np.ndarray, least: float, most: float) -> Array:
+    """Choose a part of the rows, one at least."""
+    number = max(1, round(random.uniform(least, most) * len(rows)))
+    return np.sort(random.choice(len(rows), number, replace=False))
+
+
+def directions(random: Random, number: int) -> Array:
+    """Draw unit vectors, shape (number, 3)."""
+    vectors = random.standard_normal((number, 3))
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1)[:, None])
+
+
+# Faults of GNSS
 
 def _outliers(stream: Stream, random: Random) -> None:
     chosen = some(random, stream.fix, 0.01, 0.1)
@@ -68,33 +222,26 @@ def _unknown_status(stream: Stream, random: Random) -> None:
     stream.expected['fix_status_unknown'] = len(stream.fix)
 
 
-def _put_somewhere(random: Random, values: Any, vectors: np.ndarray, chosen: np.ndarray) -> Any:
-    """Put values into one component each of the chosen vectors; return both."""
-    drawn, axes = random.choice(values, len(chosen)), random.integers(0, 3, len(chosen))
-    vectors[chosen, axes] = drawn
-    return drawn, axes
-
-
 def _broken_gnss(stream: Stream, random: Random) -> None:
     """Send nan, inf and what is nowhere."""
-    worthless = np.array([np.nan, np.inf, -np.inf, 1e300, -1e7])
-    chosen = some(random, stream.fix, 0.02, 0.5)
-    values, axes = _put_somewhere(random, worthless, stream.fix['lla'], chosen)
-    no_altitude = np.count_nonzero((axes == 2) & np.isnan(values))
-    stream.expected['fix_no_altitude'] = no_altitude
-    stream.expected['fix_nan'] = len(chosen) - no_altitude
-    chosen = some(random, stream.velocity, 0.02, 0.5)
-    values, axes = _put_somewhere(random, worthless, stream.velocity['velocity'], chosen)
-    # The vertical alone may be missing: the rest is used.
-    stream.expected['velocity_nan'] = np.count_nonzero((axes < 2) | ~np.isnan(values))
+    missing = {}
+    for name, vector in ('fix', 'lla'), ('velocity', 'velocity'):
+        rows = getattr(stream, name)
+        chosen = some(random, rows, 0.02, 0.5)
+        values = random.choice(np.array([np.nan, np.inf, -np.inf, 1e300, -1e7]), len(chosen))
+        axes = random.integers(0, 3, len(chosen))
+        rows[vector][chosen, axes] = values
+        # The vertical alone may be missing: the rest is used.
+        missing[name] = np.count_nonzero((axes == 2) & np.isnan(values))
+        stream.expected[f'{name}_nan'] = len(chosen) - missing[name]
+    stream.expected['fix_no_altitude'] = missing['fix']
 
 
 def _unknown_covariance(stream: Stream, random: Random) -> None:
     """Mark covariances as unknown in the ways in which drivers do."""
-    marks = np.array([0.0, -1.0, np.nan])
     for rows in stream.fix, stream.velocity:
         chosen = some(random, rows, 0.5, 1.0)
-        mark = random.choice(marks)
+        mark = random.choice(np.array([0.0, -1.0, np.nan]))
         rows['covariance'][chosen] = 0.0
         for axis in range(random.integers(1, 4)):
             rows['covariance'][chosen, axis, axis] = mark
@@ -166,7 +313,7 @@ def _body_frame(stream: Stream, random: Random) -> None:
     stream.expected['velocity_body_frame'] = len(stream.velocity)
 
 
-# IMU
+# Faults of the IMU
 
 def _imu_jitter(stream: Stream, random: Random) -> None:
     interval = np.median(np.diff(stream.imu['stamp']))
@@ -221,7 +368,7 @@ def _imu_spikes(stream: Stream, random: Random) -> None:
 def _freeze(stream: Stream, windows: list[Window], *fields: str) -> None:
     """Let IMU samples repeat what the first of a window has."""
     for window in windows:
-        chosen = np.flatnonzero(between(stream.imu, window))
+        chosen = np.flatnonzero(within(stream.imu, window))
         for name in fields:
             stream.imu[name][chosen] = stream.imu[name][chosen[0]]
 
@@ -234,12 +381,12 @@ def _imu_wild_stamps(stream: Stream, random: Random) -> None:
             int(stream.imu['stamp'][index]) + 5 * SECOND])
 
 
-# Clock and callers
+# Faults of clocks and callers
 
 def _clock_loop(stream: Stream, random: Random) -> None:
     """Play the beginning, then everything: a bag that loops."""
     end = stream.moment(random, 0.2, 0.6)
-    for name in 'imu', *GNSS:
+    for name in SENSORS:
         rows = getattr(stream, name)
         again = rows.copy()
         again['arrival'] += end - stream.first

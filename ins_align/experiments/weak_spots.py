@@ -12,40 +12,36 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Experiment ``weak-spots``: the cases in which an alignment is most easily wrong and sure of itself.
+Experiments ``weak-spots`` and ``vehicle``: where an alignment is easily wrong and sure of itself.
 
-Searches have found them one by one; here each is a row of one table, so that versions can be
-compared. An aligner is asked nothing but what everybody can ask it.
+Searches have found the weak spots one by one; here each is a row of one table, so that versions
+can be compared. ``vehicle`` has a car that goes straight on, and motions that are not what the
+parameter ``vehicle`` says. The recorded car is run in both if it is there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise, product
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ins_align.aligner import Aligner, Attitude, Epoch, State
+from ins_align.aligner import Aligner, State
 from ins_align.config import Config, PRESETS
-from ins_align.experiments import recordings
 from ins_align.experiments.common import (
-    BINS, config_for, error_of, JsonDict, most, parallel, Report)
-from ins_align.experiments.stream import (
-    directions, GNSS, payloads, Random, SECOND, Stream, stream_of)
+    BINS, Column, follow, JsonDict, median, most, parallel, prepare, Report, while_aligned)
+from ins_align.experiments.spoilt import directions, GNSS, LOT, Random, SECOND, Stream
 from ins_align.geometry.rotation import Array
-from ins_align.simulation.simulate import give, simulate, Simulation
 import numpy as np
 
 RUNS = 24
 DURATION = 90.0         # s, unless a case says otherwise
-LOT = 100               # IMU samples given at once
-UPDATE_EVERY = 5.0      # s
-LONGEST = 5.0           # s that an epoch stands for
+BETWEEN_LOT = 7         # IMU samples given at once where the attitude between epochs is judged
 RECORDING, STARTS = 'car_drive0708', (0.0, 100.0, 200.0, 300.0, 400.0)      # s
-
-Message = tuple[int, str, Any]      # when it arrives, ns, what it is, and itself
+WINDOW, EVERY = 120.0, 10.0     # s of the recorded car in `vehicle`, from start to start
+MOUNT_STD_DEG = 1.0
 
 
 # What spoils a stream; the arrival of an IMU sample stays, which is when it was measured.
@@ -193,15 +189,16 @@ def _bias_jump(stream: Stream, random: Random, sensor: str, size: float, at_s: f
 
 
 class Case(NamedTuple):
-    """One row of the table."""
+    """A row of a table: what is simulated, how its messages are spoilt, what is configured."""
 
     name: str
     motions: tuple[tuple[str, str], ...]    # scenario and grade of IMU, run in turn
-    spoil: Callable[[Stream, Random], None] | None = None
+    spoil: Callable[[Stream, Random], Any] | None = None
     simulate: JsonDict = {}     # arguments of `simulate`
-    config: JsonDict = {}       # what the aligner is told in place of the truth
+    config: JsonDict = {}       # in place of the truth
     part: int = 1               # there are so many times fewer runs, because they are long
     between: bool = False       # the attitude between epochs is judged
+    drawn: Callable[[int], JsonDict] = lambda index: {}     # arguments that the seed draws
 
 
 CAR, FLIGHT, HOVER, LAUNCH = (((scenario, 'mems'),)
@@ -305,20 +302,110 @@ CASES = (
 )
 
 
-def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
-    """Run every case with `runs`, or a part of it, and those of the recording if it is there."""
-    runs = runs or RUNS
+# What a vehicle knows of its motion
+
+def _mounted(seed: int, mount_deg: tuple[float, ...] = ()) -> JsonDict:
+    """Draw the course and, unless it is given, the error of the mounting."""
+    random = np.random.default_rng([8, seed])
+    drawn = MOUNT_STD_DEG * random.standard_normal(3) * [0.0, 1.0, 1.0]
+    return {'heading_deg': float(random.uniform(-180.0, 180.0)),
+            'mount_rpy_deg': mount_deg or drawn.tolist()}
+
+
+def _vehicle(name: str, scenario: str, arguments: JsonDict, vehicle: str = 'car',
+             mount_deg: tuple[float, ...] = (), trust: bool = True) -> Case:
+    return Case(name, ((scenario, 'mems'),), None, arguments, {
+        'vehicle': vehicle, 'mount_yaw_std': MOUNT_STD_DEG, 'trust_imu_axes': trust,
+        'heading_std_threshold': 2.0}, drawn=partial(_mounted, mount_deg=mount_deg))
+
+
+ROAD, STREETS, OFF = {'duration': 40.0}, {'duration': 60.0}, (0.0, 0.0, 5.0)
+VEHICLE_CASES = (
+    _vehicle('straight road, 10 m/s', 'highway', ROAD),
+    _vehicle('the same, vehicle: none', 'highway', ROAD, 'none'),
+    _vehicle('the same, axes not trusted', 'highway', ROAD, trust=False),
+    _vehicle('the same, 10 s at rest before', 'highway', {'duration': 50.0, 'stand_still': 10.0}),
+    _vehicle('the same, boat', 'highway', ROAD, 'boat'),
+    _vehicle('streets', 'car', STREETS),
+    _vehicle('streets, vehicle: none', 'car', STREETS, 'none'),
+    _vehicle('backing out, then streets', 'reverse', STREETS),
+    _vehicle('flight with 8 deg of crab, aeroplane', 'flight', {**STREETS, 'crab_deg': 8.0},
+             'aeroplane'),
+    _vehicle('boat that yaws by 20 deg, boat', 'swing', STREETS, 'boat'),
+    # Not what `vehicle` says
+    _vehicle('streets, mounted 5 deg off', 'car', STREETS, mount_deg=OFF),
+    _vehicle('straight road, mounted 5 deg off', 'highway', ROAD, mount_deg=OFF),
+    _vehicle('streets backwards', 'car', {**STREETS, 'crab_deg': 180.0}),
+    _vehicle('a drift of 20 deg to and fro', 'swing', STREETS),
+    _vehicle('towed 70 deg across', 'car', {**STREETS, 'crab_deg': 70.0}),
+    _vehicle('on a ferry, 70 deg across, in waves', 'swing', {**STREETS, 'crab_deg': 70.0}),
+)
+RECORDED: tuple[JsonDict, ...] = ({}, {'vehicle': 'car'},
+                                  {'vehicle': 'car', 'heading_std_threshold': 2.0})
+
+
+# Runs
+
+def run_case(task: tuple[str, int]) -> JsonDict:
+    """Simulate one run of the case with a name, spoil it, feed it and judge what comes out."""
+    name, index = task
+    case = next(case for case in (*CASES, *VEHICLE_CASES) if case.name == name)
+    scenario, grade = case.motions[index % len(case.motions)]
+    spoil = case.spoil and (lambda stream: case.spoil(stream, np.random.default_rng([6, index])))
+    simulation, stream, aligner = prepare(scenario, {
+        'imu_grade': grade, 'seed': index, 'duration': DURATION, **case.drawn(index),
+        **case.simulate}, case.config, spoil=spoil)
+    sent = stream.messages(aligner.config, BETWEEN_LOT if case.between else LOT)
+    looks = follow(aligner, sent, between=case.between)
+    status = aligner.status()
+    return {'scenario': scenario, 'grade': grade, 'seed': index, 'reason': status.reason,
+            'end': status.state is State.ALIGNED,
+            **while_aligned(looks, int(stream.imu['stamp'][0]), lambda stamps:
+                            simulation.attitude_at(stream.measured_at(stamps)))}
+
+
+def run_cases(cases: Sequence[Case], runs: int, jobs: int | None,
+              name: str) -> dict[str, list[JsonDict]]:
+    """Run every case with `runs`, or a part of it."""
     results = parallel(run_case, [
-        [(number, index) for index in range(max(1, runs // case.part))]
-        for number, case in enumerate(CASES)], jobs, 'weak spots')
-    found = [(case.name, each) for case, each in zip(CASES, results)]
-    paths = sorted(data_dir.glob(f'{RECORDING}*')) if data_dir else []
-    found += [(f'recorded car, {name}', [run_recorded(paths[0], start, sign, told)
-                                         for start in STARTS])
-              for name, sign, told in (('lever arm told to 3 cm', 1.0, {'lever_arm_std': 0.03}),
-                                       ('gyro z reversed', -1.0, {})) if paths]
+        [(case.name, index) for index in range(max(1, runs // case.part))] for case in cases],
+        jobs, name)
+    return {case.name: each for case, each in zip(cases, results)}
+
+
+def recorded_car(data_dir: Path | None) -> Path | None:
+    """Return the recording of the car if it is in the folder."""
+    return next(iter(sorted(data_dir.glob(f'{RECORDING}*'))), None) if data_dir else None
+
+
+def run_recorded(path: Path, start_s: float, z_sign: float, config: JsonDict) -> JsonDict:
+    """Align a recording from some time to its end."""
+    from ins_align.experiments.recordings import KNOWN_LEVER_ARMS, load
+
+    recording = load(path)
+    signs = np.array([1.0, 1.0, z_sign])
+    first = recording.sample_at(start_s)
+    sent = ((now, kind, (payload[0], payload[1] * signs, payload[2]) if kind == 'imu' else payload)
+            for now, kind, payload in recording.sent(first, int(recording.imu_before[-1])))
+    aligner = Aligner(Config(lever_arm=KNOWN_LEVER_ARMS[RECORDING], **config))
+    looks = follow(aligner, sent)
+    return {'start_s': start_s, 'end': aligner.status().state is State.ALIGNED, **while_aligned(
+        looks, int(recording.imu.stamps_ns[first]), recording.attitudes_at,
+        recording.reference_std_deg)}
+
+
+def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
+    """Run ``weak-spots``, and its cases of the recorded car if it is there."""
+    runs, path = runs or RUNS, recorded_car(data_dir)
+    found = run_cases(CASES, runs, jobs, 'weak spots')
+    if path is not None:
+        found |= {f'recorded car, {name}': [run_recorded(path, start, sign, config)
+                                            for start in STARTS]
+                  for name, sign, config in (
+                      ('lever arm told to 3 cm', 1.0, {'lever_arm_std': 0.03}),
+                      ('gyro z reversed', -1.0, {}))}
     report = Report('weak-spots', 'Where it is wrong and sure of itself', out,
-                    f' --runs {runs}' + (' --data DIR' if paths else ''))
+                    f' --runs {runs}' + (' --data DIR' if path else ''))
     report.text(
         f'{runs} runs of each case, fewer where they are long, of {DURATION:g} s unless the case '
         'needs more. Car and flight in turn, or a hover, a throw, all of these; MEMS grade unless '
@@ -328,125 +415,56 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
         f'{BINS[0]:g} and {BINS[1]:g}, the seconds beyond {BINS[1]:g} of the longest, the worst '
         'error in sigmas and, of heading, in degrees, the part of the time at which it was '
         'ALIGNED, and after how many seconds of data it was declared, the median.')
-    if not paths:
+    if path is None:
         report.text('The recorded car is left out: --data DIR names the folder of it.')
-    report.table('Weak spots', [row(*case) for case in found])
-    report.write({'runs': runs, 'cases': dict(found)})
+    report.table('Weak spots', found.items(), COLUMNS)
+    report.write({'runs': runs, 'cases': found})
 
 
-def run_case(task: tuple[int, int]) -> JsonDict:
-    """Simulate one run of a case, spoil it, feed it and judge what comes out."""
-    number, index = task
-    case = CASES[number]
-    scenario, grade = case.motions[index % len(case.motions)]
-    simulation = simulate(scenario, **{'imu_grade': grade, 'seed': index, 'duration': DURATION,
-                                       **case.simulate})
-    stream = stream_of(simulation)
-    if case.spoil is not None:
-        case.spoil(stream, np.random.default_rng([6, index]))
-    aligner = Aligner(config_for(simulation, **{**stream.config, **case.config}))
-    result = follow(aligner, messages(stream, aligner.config, 7 if case.between else LOT),
-                    partial(truth, simulation, stream), case.between)
-    return {'scenario': scenario, 'grade': grade, 'seed': index, **result}
+def run_vehicle(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
+    """Run ``vehicle``, and the recorded car if it is there."""
+    runs, path = runs or RUNS, recorded_car(data_dir)
+    found = run_cases(VEHICLE_CASES, runs, jobs, 'vehicle')
+    report = Report('vehicle', 'What a vehicle knows of its motion', out,
+                    f' --runs {runs}' + (' --data DIR' if path else ''))
+    report.text(
+        f'{runs} runs of each case, MEMS, GNSS velocity 0.1 m/s at 5 Hz, the mounting off by '
+        f'{MOUNT_STD_DEG:g} deg (1 sigma, pitch and yaw) and stated so, `vehicle: car` unless the '
+        'case says otherwise, `trust_imu_axes` and a heading threshold of 2 deg. Columns as in '
+        'weak-spots; "not used": the runs at whose end the reason says that the motion '
+        'contradicts `vehicle`.')
+    report.table('Simulated', found.items(), [*COLUMNS, (
+        'not used', '', lambda c: sum('contradicts vehicle' in r['reason'] for r in c[1]))])
+    if path is not None:
+        from ins_align.experiments.recordings import DECLARED_COLUMNS, load, run_window
+
+        starts = np.arange(0.0, max(load(path).duration - EVERY, 0.0), EVERY)
+        windows = parallel(run_window, [[(path, start, WINDOW, config)
+                                         for start in starts.tolist()]
+                                        for config in RECORDED], jobs, 'recorded car')
+        report.table(f'The recorded car, started anew every {EVERY:g} s', [
+            (', '.join(f'{name}: {value}' for name, value in config.items()) or 'none', each)
+            for config, each in zip(RECORDED, windows)], DECLARED_COLUMNS)
+    report.write({'runs': runs, 'cases': found})
 
 
-def messages(stream: Stream, config: Config, lot: int) -> Iterator[Message]:
-    """Yield what is sent in the order of arrival, IMU samples in lots."""
-    for kind, rows in stream.sent():
-        size = lot if kind == 'imu' else 1
-        for first in range(0, len(rows), size):
-            chosen = rows[first:first + size]
-            [payload] = payloads(config, kind, chosen)
-            yield chosen['arrival'][-1], kind, payload
+def of_declared(key: str, results: list[JsonDict]) -> list[float]:
+    """Return a number of the runs in which something was declared."""
+    return [result[key] for result in results if result['declared_s'] is not None]
 
 
-def truth(simulation: Simulation, stream: Stream, stamps: list[int]) -> list[Array]:
-    """Return true attitudes at stamps of the IMU's clock, which may be late or set."""
-    late = stream.imu['stamp'] - stream.imu['arrival']
-    places = np.searchsorted(stream.imu['stamp'][::LOT], stamps) - 1
-    medians = [int(np.median(late[k:k + LOT])) for k in range(0, len(late), LOT)]
-    true = np.array(stamps) - np.array(medians)[np.maximum(places, 0)]
-    return list(simulation.attitude_at(np.clip(true, stream.first, stream.last)))
-
-
-def run_recorded(path: Path, start_s: float, z_sign: float, told: JsonDict) -> JsonDict:
-    """Align a recording from some time to its end."""
-    recording = recordings.load(path)
-    signs = np.array([1.0, 1.0, z_sign])
-    first = int(np.searchsorted(recording.imu.stamps_ns,
-                                recording.start_ns + round(start_s * SECOND)))
-    sent = ((now, kind, (payload[0], payload[1] * signs, payload[2]) if kind == 'imu' else payload)
-            for now, kind, payload in recording.sent(first, int(recording.imu_before[-1])))
-    aligner = Aligner(Config(lever_arm=recordings.KNOWN_LEVER_ARMS[RECORDING], **told))
-    return {'start_s': start_s, **follow(
-        aligner, sent, lambda stamps: [recording.reference.attitude_at(s) for s in stamps],
-        std_deg=recording.reference_std_deg)}
-
-
-def follow(aligner: Aligner, sent: Iterator[Message],
-           true: Callable[[list[int]], list[Array | None]], between: bool = False,
-           std_deg: Array | None = None) -> JsonDict:
-    """
-    Feed messages, in the order of arrival, to a new aligner and judge what it declares.
-
-    `true` gives the attitudes at stamps, None where they are not known, `std_deg` (3,) how well;
-    `between` asks for the attitude after every message instead of looking at the epochs.
-    """
-    seen: list[tuple[int, Attitude | None]] = []    # when, and what is called aligned then
-    start = due = 0
-    for now, kind, payload in sent:
-        if kind == 'imu':
-            start = start or int(payload[0][0])
-        give(aligner, kind, payload)
-        if between or now >= due:
-            seen += look(aligner, aligner.update(), between)
-            due = now + round(UPDATE_EVERY * SECOND)
-    seen += look(aligner, aligner.flush(), between)
-    stamps = np.array([stamp for stamp, _ in seen], np.int64)
-    held = np.clip(np.diff(stamps, append=stamps[-1:]) / SECOND, 0.0, LONGEST)
-    aligned = [(k, attitude) for k, (_, attitude) in enumerate(seen) if attitude is not None]
-    truths = true([attitude.stamp_ns for _, attitude in aligned]) if aligned else []
-    errors = {k: error_of(attitude, C_true, std_deg)
-              for (k, attitude), C_true in zip(aligned, truths) if C_true is not None}
-    first = next(iter(errors), None)
-    return {'end': aligner.status().state is State.ALIGNED,
-            'declared_s': None if first is None else (stamps[first] - start) / SECOND,
-            'declared_sigmas': None if first is None else errors[first].worst_sigmas,
-            'worst_sigmas': max((e.worst_sigmas for e in errors.values()), default=0.0),
-            'worst_heading_deg': max((abs(e.angles_deg[2]) for e in errors.values()),
-                                     default=0.0),
-            'beyond_s': np.sum(held[[k for k, e in errors.items()
-                                     if e.worst_sigmas > BINS[1]]]),
-            'aligned_part': np.sum(held[[k for k, _ in aligned]]) / max(np.sum(held), 1e-9)}
-
-
-def look(aligner: Aligner, epochs: list[Epoch],
-         between: bool) -> list[tuple[int, Attitude | None]]:
-    """Return what is called aligned: of the epochs, or where there are none of the moment."""
-    if epochs and not between:
-        return [(epoch.stamp_ns, epoch.current if epoch.state is State.ALIGNED else None)
-                for epoch in epochs]
-    status, newest = aligner.status(), aligner.newest_imu_ns
-    attitude = aligner.attitude_now() if between else status.current
-    return [] if newest is None else [
-        (newest, attitude if status.state is State.ALIGNED else None)]
-
-
-def row(name: str, results: list[JsonDict]) -> JsonDict:
-    """Return a row of the table."""
-    declared = [result for result in results if result['declared_s'] is not None]
-    times = [result['declared_s'] for result in declared]
-
-    def worst(key: str, digits: str) -> str | None:
-        return most((result[key] for result in declared), digits)
-
-    return {'case': name, 'runs': len(results), 'declared': len(declared),
-            'at the end': sum(result['end'] for result in results),
-            'declared beyond 3': sum(r['declared_sigmas'] > BINS[0] for r in declared),
-            **{f'beyond {limit:g}': sum(result['worst_sigmas'] > limit for result in declared)
-               for limit in BINS},
-            f'beyond {BINS[1]:g}, s': worst('beyond_s', '.1f'),
-            'worst, sigma': worst('worst_sigmas', '.1f'),
-            'heading, deg': worst('worst_heading_deg', '.2g'),
-            'aligned, %': f"{100 * np.mean([result['aligned_part'] for result in results]):.0f}",
-            'after, s': f'{np.median(times):.1f}' if declared else None}
+# Of the name of a case and its results.
+COLUMNS: list[Column] = [
+    ('case', '', lambda c: c[0]), ('runs', '', lambda c: len(c[1])),
+    ('declared', '', lambda c: len(of_declared('declared_s', c[1]))),
+    ('at the end', '', lambda c: sum(result['end'] for result in c[1])),
+    *((title, '', lambda c, key=key, limit=limit: sum(
+        sigmas > limit for sigmas in of_declared(key, c[1]))) for title, key, limit in (
+            ('declared beyond 3', 'declared_sigmas', BINS[0]),
+            ('beyond 3', 'worst_sigmas', BINS[0]), ('beyond 5', 'worst_sigmas', BINS[1]))),
+    *((title, digits, lambda c, key=key: most(of_declared(key, c[1])))
+      for title, digits, key in (
+          ('beyond 5, s', '.1f', 'beyond_s'), ('worst, sigma', '.1f', 'worst_sigmas'),
+          ('heading, deg', '.2g', 'worst_heading_deg'))),
+    ('aligned, %', '.0f', lambda c: 100 * np.mean([result['aligned_part'] for result in c[1]])),
+    ('after, s', '.1f', lambda c: median(of_declared('declared_s', c[1])))]

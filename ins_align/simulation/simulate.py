@@ -14,7 +14,7 @@
 """
 Simulated recordings: sensors of a moving vehicle with truth.
 
-Perfect sensors come from `trajectory`; here they get their errors, the GNSS receiver its rate,
+Perfect sensors come from `scenarios`; here they get their errors, the GNSS receiver its rate,
 latency, outages and outliers, and the whole becomes a recording.
 """
 
@@ -37,7 +37,7 @@ from ins_align.geometry.rotation import Array, matrix_from_rpy, quaternion_from_
 from ins_align.gnss.messages import ENU_FROM_NED, Fix, Velocity
 from ins_align.simulation import scenarios
 from ins_align.simulation.arguments import Arguments, IMU_AXES, LATENESS_MARGIN, SimulationError
-from ins_align.simulation.trajectory import displaced, START_NS, Trajectory, trajectory_of, wrapped
+from ins_align.simulation.scenarios import displaced, START_NS, Trajectory, trajectory_of, wrapped
 import numpy as np
 
 # Those that campaigns draw from: with one more all their runs would be others.
@@ -148,10 +148,8 @@ def give(aligner: Any, kind: str, payload: Any) -> None:
     """Give an aligner one of the messages of a simulation."""
     if kind == 'imu':
         aligner.add_imu(*payload)
-    elif kind == 'fix':
-        aligner.add_fix(payload)
     else:
-        aligner.add_velocity(payload)
+        getattr(aligner, f'add_{kind}')(payload)
 
 
 def simulate(scenario: str, **options: Any) -> Simulation:
