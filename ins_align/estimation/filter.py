@@ -36,7 +36,8 @@ import numpy as np
 
 # Normalised innovation squared of three rows above which a measurement is an outlier: one good
 # one in 60 000 is (chi-square with three degrees of freedom). To the weights it counts as this
-# much, so whatever else rejects a measurement must not leave its value below.
+# much, so whatever else rejects a measurement must not leave its value below. A measurement beyond
+# 5 sigma in any direction is beyond this.
 GATE = 25.0
 # Log likelihood ratio of a motion that fits a vehicle, to one whose slips are so much larger that
 # a normalised innovation squared of twice this, of two rows, is as likely.

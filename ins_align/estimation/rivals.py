@@ -230,7 +230,12 @@ class Rivals:
         if level[worst] - fits > MARGIN * max(misfit, 1.0):
             return in_words(self.table[filters.ids[worst]], filters.x[filters.lead[worst]],
                             self._gnss_delay), True
-        return 'the signs of the IMU axes are not confirmed by the motion yet: turn', False
+        rival = self.table[filters.ids[worst]]
+        if min(rival.signs) < 0:
+            what, otherwise = 'the signs of the IMU axes are', ''
+        else:
+            what, otherwise = 'what is configured for certain is', f', or {rival.advice}'
+        return f'{what} not confirmed by the motion yet: turn and change speed{otherwise}', False
 
 
 @dataclass
