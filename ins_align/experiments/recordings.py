@@ -39,7 +39,7 @@ from ins_align.geometry.rotation import apply, Array
 from ins_align.gnss.messages import Velocity
 from ins_align.recordings import BagError
 from ins_align.recordings.decode import ImuSamples, Orientations, Refused
-from ins_align.recordings.reader import read, Request
+from ins_align.recordings.reader import read, REFERENCE_TOPIC, Request
 from ins_align.results import Reference
 import numpy as np
 
@@ -51,7 +51,6 @@ REFERENCE_STD_DEG = {'uav_thor75': (0.6, 1.0), 'car_drive0708': (0.2, 0.5),
                      'quad_dot08': (1.0, 2.0)}
 MOTION_SPEED, MOTION_TIME = 5.0, 60.0       # m/s of change within so many s is real motion
 STEP, LENGTH = 10.0, 120.0      # s
-REFERENCE = '/reference/imu'
 SHORTEST = 10.0                 # s of data that a window has to have
 TIMES = (30.0, 60.0, 120.0)
 METHODS: dict[str, JsonDict] = {
@@ -116,7 +115,7 @@ def load(path: Path) -> Recording:
     """Read and decode a recording; the last few are kept."""
     parts = list(read(Request(path)))
     if parts[0].topics.reference is None:
-        raise BagError(f'it has no reference attitude on {REFERENCE}')
+        raise BagError(f'it has no reference attitude on {REFERENCE_TOPIC}')
     imu = ImuSamples(*map(np.concatenate, zip(*(part.imu for part in parts))))
     orientations = Orientations(
         *map(np.concatenate, zip(*(part.orientations for part in parts))))
@@ -220,7 +219,7 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
     assert data_dir is not None
     paths = recordings_in(data_dir)
     if not paths:
-        raise ExperimentError(f'no recording with {REFERENCE} in {data_dir}')
+        raise ExperimentError(f'no recording with {REFERENCE_TOPIC} in {data_dir}')
     report = Report('recordings', 'Real recordings', out, ' --data DIR')
     report.text(
         f'An alignment starts every {STEP:g} s and runs for up to {LENGTH:g} s with the defaults '
