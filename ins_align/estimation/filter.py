@@ -21,17 +21,19 @@ and the rotation of the Earth are in the GNSS side s_v, s_p (`track.InertialTrac
 propagation is pure integration of preintegrated intervals. u and w are those which a receiver
 whose measurements are late by its delay sees. Errors are
 
-    C_true = C exp(phi)    u_true = u + C xi    w_true = w + C rho    C0_true = C0 exp(phi0)
+    C_true = C exp(phi)    u_true = u + C J xi    w_true = w + C J rho    C0_true = C0 exp(phi0)
 
-Neither their propagation nor a measurement's derivative holds an attitude, so all means that
-differ in their heading share one covariance (docs, "Theory").
+with J the left Jacobian of SO(3) at phi: (phi, xi, rho) is the logarithm of an error in SE2(3).
+Neither their propagation, which is exact but for noise, nor a measurement's derivative holds an
+attitude, so all means that differ in their heading share one covariance (docs, "Theory").
 """
 
 import math
 from typing import NamedTuple
 
 from ins_align.estimation.states import FIRST, GYRO, Linearised, Measured, PHI, PHI0, RHO, XI
-from ins_align.geometry.rotation import apply, Array, exp_so3, Index, log_so3
+from ins_align.geometry.rotation import (
+    apply, Array, exp_and_left_jacobian, exp_so3, Index, log_so3, skew)
 import numpy as np
 
 # Normalised innovation squared of three rows above which a measurement is an outlier: one good
@@ -45,8 +47,10 @@ FITS = 3.0
 # What is less likely than the first is no part of a mixture. Its mean is found when all attitudes
 # are so close to it (rad) that rotations add up like vectors, or it moves no more (rad).
 NEGLIGIBLE, CLOSE, SETTLED = 1e-6, 0.01, 1e-8
-# Turns so small (rad) leave the axes of the errors as they are.
+# Corrections so small (rad) leave the axes of the errors as they are.
 NO_TURN = 1e-4
+# What is beyond first order in an innovation counts from so much of the receiver's noise on.
+BENT = 0.1
 _EYE = np.eye(3)
 
 
@@ -62,11 +66,12 @@ class Innovation(NamedTuple):
 class _Test(NamedTuple):
     """An innovation of r rows against what B means of M rivals expect."""
 
-    HP: Array               # (M, r, n)
+    HP: Array               # (B, r, n)
     S: Array                # (B, r, r), its covariance
     inverse: Array          # of S
     weighted: Array         # (B, r), S^-1 times the innovation
     nis: Array              # (B,), normalised innovation squared
+    second_order: bool
 
 
 class Filters:
@@ -224,16 +229,16 @@ class Filters:
         missing = measured.s[k, kind] - (self.w if kind else self.u)
         innovation = (apply(C.swapaxes(1, 2), missing) + model.expected[k, kind][q]
                       - apply(H[q][..., FIRST:], self.x - model.point[q]))
-        test = self._test(H, stated, innovation)
+        test = self._test(H, stated, innovation, self._second_order(stated, innovation))
         good = test.nis < GATE
         # By the means before the measurement, which an outlier must not choose.
         taken = self._by_most(good)
         self.evidence = self.evidence + self._weigh(
             -0.5 * (np.minimum(test.nis, GATE) + np.log(np.linalg.det(test.S))))
-        gain = self._reduce(test.HP, test.inverse[lead], taken)
+        gain = self._reduce(test.HP[lead], test.inverse[lead], taken)
         if kind == 0:
             self._forget_feigned(gain, test.inverse[lead], C[lead][:, 2], taken)
-        self._move(test, good & taken[q])
+        self._move(test, good & taken[q], lead)
         best = self.best
         i = lead[best]
         sigmas = np.sqrt((C[i] @ test.S[i] @ C[i].T).diagonal())
@@ -261,7 +266,7 @@ class Filters:
             Whether z of the base points down.
 
         """
-        q = self.place
+        q, lead = self.place, self.lead
         test = self._test(H, variance[q][:, None, None] * np.eye(2), innovation)
         nis = test.nis + backwards ** 2 / test.S[:, 0, 0]
         nis = held[q] * np.where(tumbled, GATE, np.minimum(nis, GATE))
@@ -271,15 +276,33 @@ class Filters:
         self.evidence = self.evidence + held * (FITS - 0.5 * nis[self.lead])
         good = nis < GATE
         taken = held & self._by_most(good)
-        self._reduce(test.HP, test.inverse[self.lead], taken)
-        self._move(test, good & taken[q])
+        self._reduce(test.HP[lead], test.inverse[lead], taken)
+        self._move(test, good & taken[q], lead)
 
-    def _test(self, H: Array, noise: Array, innovation: Array) -> _Test:
-        HP = H @ self.P
-        S: Array = (HP @ H.swapaxes(1, 2))[self.place] + noise
+    def _second_order(self, noise: Array, innovation: Array) -> Array | None:
+        """
+        Return what derivatives to phi lack, shape (B, 3, 3); None where the noise hides it.
+
+        An innovation z is J of what is linear in the errors, which therefore is
+        ``J^-1 z ~ z - phi x z / 2``.
+        """
+        variance = np.trace(self.P[:, PHI, PHI], axis1=1, axis2=2)[self.place]
+        square = np.einsum('bi,bi->b', innovation, innovation)
+        if np.all(variance * square <= BENT ** 2 * np.trace(noise, axis1=1, axis2=2)):
+            return None
+        return -0.5 * skew(innovation)
+
+    def _test(self, H: Array, noise: Array, innovation: Array,
+              second_order: Array | None = None) -> _Test:
+        HP, H = (H @ self.P)[self.place], H[self.place]
+        if second_order is not None:
+            HP, H = HP + second_order @ self.P[:, PHI][self.place], H.copy()
+            H[..., PHI] += second_order
+        S: Array = HP @ H.swapaxes(1, 2) + noise
         inverse = np.asarray(np.linalg.inv(S), float)
         weighted = apply(inverse, innovation)
-        return _Test(HP, S, inverse, weighted, np.einsum('ij,ij->i', innovation, weighted))
+        return _Test(HP, S, inverse, weighted, np.einsum('ij,ij->i', innovation, weighted),
+                     second_order is not None)
 
     def _reduce(self, HP: Array, inverse: Array, taken: np.ndarray) -> Array:
         """Take what was measured off the covariances; return the gains, shape (M, r, n)."""
@@ -312,19 +335,19 @@ class Filters:
             total = np.add.reduceat(np.exp(self.weight), self.first)
             self.weight -= np.log(total)[self.place]
 
-    def _move(self, test: _Test, use: np.ndarray) -> None:
-        """Correct the means, and turn the covariances' frames with the likeliest of them."""
-        d = ((test.weighted * use[:, None])[:, None] @ test.HP[self.place])[:, 0]
-        C, C0, turn = self.C, self.C0, d[self.lead]
+    def _move(self, test: _Test, use: np.ndarray, lead: Index) -> None:
+        """Correct the means, and take the covariances to where those that lead have gone."""
+        d = ((test.weighted * use[:, None])[:, None] @ test.HP)[:, 0]
         self._shift(d)
-        phi, phi0 = turn[:, PHI], turn[:, PHI0]
-        if max(np.abs(phi).max(), np.abs(phi0).max()) <= NO_TURN:
+        d = d[lead]
+        turn = np.stack([d[:, PHI], d[:, PHI0]])
+        if not test.second_order and np.abs(turn).max() <= NO_TURN:
             return
-        start = apply(C[self.lead].swapaxes(1, 2) @ C0[self.lead], phi0)
-        G = np.zeros((len(turn), FIRST, FIRST))
-        G[:, PHI, PHI], G[:, XI, XI], G[:, PHI0, PHI0] = exp_so3(
-            np.stack([0.5 * start - phi, -phi, -0.5 * phi0]))
-        G[:, RHO, RHO] = G[:, XI, XI]
+        # exp(d)^-1 exp(d + e) ~ exp(G e)
+        G = np.zeros((len(d), FIRST, FIRST))
+        G[:, PHI, PHI], G[:, PHI0, PHI0] = exp_so3(-0.5 * turn)
+        G[:, XI, XI] = G[:, RHO, RHO] = G[:, PHI, PHI]
+        G[:, XI, PHI], G[:, RHO, PHI] = -0.5 * skew(d[:, XI]), -0.5 * skew(d[:, RHO])
         rows = G @ self.P[:, :FIRST]
         self.P[:, :FIRST] = rows
         self.P[:, FIRST:, :FIRST] = rows[:, :, FIRST:].swapaxes(1, 2)
@@ -333,10 +356,10 @@ class Filters:
     def _shift(self, d: Array) -> None:
         """Correct the means by errors, shape (B, n)."""
         B = len(d)
-        moved = d[:, 3:9].reshape(-1, 2, 3) @ self.C.swapaxes(1, 2)
+        turns, J = exp_and_left_jacobian(np.concatenate([d[:, PHI], d[:, PHI0]]))
+        moved = d[:, 3:9].reshape(-1, 2, 3) @ (self.C @ J[:B]).swapaxes(1, 2)
         self.u, self.w = self.u + moved[:, 0], self.w + moved[:, 1]
         self.x = self.x + d[:, FIRST:]
-        turns = exp_so3(np.concatenate([d[:, PHI], d[:, PHI0]]))
         self.C, self.C0 = self.C @ turns[:B], self.C0 @ turns[B:]
 
     # What does not depend on a measurement

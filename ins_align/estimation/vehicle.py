@@ -29,7 +29,7 @@ import math
 from ins_align.config import Config
 from ins_align.estimation.filter import Filters, log_sum
 from ins_align.estimation.states import (
-    DRIFT, FIRST, Linearised, MARGIN, Measured, MOUNT, OF_VEHICLE, PHI, XI)
+    DRIFT, FIRST, Linearised, MARGIN, Measured, MOUNT, OF_VEHICLE, PHI)
 from ins_align.geometry.rotation import apply, Array, Index, skew, Transform
 import numpy as np
 
@@ -104,8 +104,8 @@ class Vehicle:
         # A rival whose heading is open sets out in its direction; later it may turn back. The
         # derivatives are those at motion along x.
         open_ = np.bincount(filters.rival)[ids] > 1
-        fast = np.linalg.norm(v_n0[lead], axis=1)
-        moves = fast > MOVES * np.sqrt(np.trace(filters.P[:, XI, XI], axis1=1, axis2=2) / 3)
+        fast = np.linalg.norm(v_b[lead], axis=1)
+        moves = fast > MOVES * np.sqrt(np.einsum('mij,mjk,mik->m', H_v, filters.P, H_v) / 3)
         speed = np.where(open_, along * fast, v[lead, 0] * (along != 0))
         against = np.maximum(self._against[ids],
                              0.5 * (np.minimum(speed, 0.0) / BACKWARDS_SPEED) ** 2)
