@@ -32,8 +32,7 @@ import math
 from typing import NamedTuple
 
 from ins_align.estimation.states import FIRST, GYRO, Linearised, Measured, PHI, PHI0, RHO, XI
-from ins_align.geometry.rotation import (
-    apply, Array, exp_and_left_jacobian, exp_so3, Index, log_so3, skew)
+from ins_align.geometry.rotation import apply, Array, exp_so3, Index, log_so3, skew
 import numpy as np
 
 # Normalised innovation squared of three rows above which a measurement is an outlier: one good
@@ -48,7 +47,7 @@ FITS = 3.0
 # are so close to it (rad) that rotations add up like vectors, or it moves no more (rad).
 NEGLIGIBLE, CLOSE, SETTLED = 1e-6, 0.01, 1e-8
 # Corrections so small (rad) leave the axes of the errors as they are.
-NO_TURN = 1e-4
+NO_TURN = 3e-3
 # What is beyond first order in an innovation counts from so much of the receiver's noise on.
 BENT = 0.1
 _EYE = np.eye(3)
@@ -341,7 +340,7 @@ class Filters:
         self._shift(d)
         d = d[lead]
         turn = np.stack([d[:, PHI], d[:, PHI0]])
-        if not test.second_order and np.abs(turn).max() <= NO_TURN:
+        if not test.second_order and np.abs(turn).max() < NO_TURN:
             return
         # exp(d)^-1 exp(d + e) ~ exp(G e)
         G = np.zeros((len(d), FIRST, FIRST))
@@ -355,12 +354,12 @@ class Filters:
 
     def _shift(self, d: Array) -> None:
         """Correct the means by errors, shape (B, n)."""
-        B = len(d)
-        turns, J = exp_and_left_jacobian(np.concatenate([d[:, PHI], d[:, PHI0]]))
-        moved = d[:, 3:9].reshape(-1, 2, 3) @ (self.C @ J[:B]).swapaxes(1, 2)
+        phi = d[:, PHI]
+        turn, turn0, J = exp_so3(np.stack([phi, d[:, PHI0], 0.5 * phi]))    # J but for phi^2 / 24
+        moved = d[:, 3:9].reshape(-1, 2, 3) @ (self.C @ J).swapaxes(1, 2)
         self.u, self.w = self.u + moved[:, 0], self.w + moved[:, 1]
         self.x = self.x + d[:, FIRST:]
-        self.C, self.C0 = self.C @ turns[:B], self.C0 @ turns[B:]
+        self.C, self.C0 = self.C @ turn, self.C0 @ turn0
 
     # What does not depend on a measurement
 
