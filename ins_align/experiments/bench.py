@@ -41,7 +41,6 @@ from ins_align.experiments.common import config_for, JsonDict, Report
 from ins_align.simulation.simulate import give, simulate
 import numpy as np
 
-MINUTES = 60
 REPEATS = 3
 CPU_SECONDS = 20.0
 EPOCH_SECONDS = 600.0
@@ -59,22 +58,20 @@ NODE = '-m', 'ins_align.ros.main', '--ros-args', '-p', 'lever_arm:=[1.0, 1.0, 1.
 DRIVE = '--scenario', 'car', '--imu-rate', '200'
 
 
-def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
+def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Measure everything one after the other, without anything else beside it."""
-    minutes = runs or MINUTES
-    report = Report('bench', 'Speed', out, f' --runs {minutes}')
     report.text('Ratios against something measured in the same run on the same machine; for '
                 'replay and start the median of three goes, for the node processor time of the '
                 'whole process while both run beside each other on the same messages.')
     with tempfile.TemporaryDirectory() as folder:
-        rows = [replay_against_bare_pass(Path(folder), storage, minutes) for storage in TARGETS]
+        rows = [replay_against_bare_pass(Path(folder), storage, runs) for storage in TARGETS]
         rows += node_rows(Path(folder))
     rows += [*epoch_rows(), row_of(
         'ins_align --help; start of Python', *medians([*CLI, '--help'], ['-c', 'pass']), 's',
         'less than 0.5 s longer')]
     report.table('Ours, what it is measured against, their ratio and what it should be at most',
                  rows, [(name, '', itemgetter(name)) for name in rows[0]])
-    report.write(rows)
+    return rows
 
 
 def cells(name: str, ours: str, other: str, ratio: str = '', target: str = '') -> JsonDict:

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 from ins_align.aligner import Aligner
 from ins_align.experiments import dense
 from ins_align.experiments.common import (
-    Column, draw, error_of, exact_config_for, GRADES, JsonDict, parallel, Report, rms)
+    Column, draw, error_of, exact_config_for, field, GRADES, JsonDict, parallel, Report, rms)
 from ins_align.geometry.rotation import Array
 from ins_align.simulation.simulate import epochs_of, simulate
 import numpy as np
@@ -70,15 +70,14 @@ CASES = (
     Case('standing: north from the Earth rate', 'static', 'navigation', share=0.25))
 
 
-def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
+def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run every case and print ratios and normalised errors."""
-    runs = runs or 100
     [bounds] = parallel(bounds_of, [CASES], jobs, 'bounds')
     results = parallel(run_case, [
         [(case, seed) for seed in range(max(1, round(case.share * runs)))] for case in CASES],
         jobs, 'runs')
     summaries = [summary(*each) for each in zip(CASES, bounds, results)]
-    report = Report('bound', 'The estimator at the Cramer-Rao bound', out, f' --runs {runs}')
+    rows = [row for result in summaries for row in rows_of(result)]
     report.text(
         'GNSS 5 Hz, 0.1 m/s, lever arm [1 1 1] m unless said otherwise. Errors of the attitude at '
         't0; tilt: both axes. The bound comes from the dense reference on the true motion. '
@@ -89,22 +88,21 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
     report.table(
         f'Targets: ratio of error and bound at most {RATIO_LIMIT:g}, NEES/3 within '
         f'{NEES_RANGE[0]:g} to {NEES_RANGE[1]:g}; beyond chance: by more than two of its sigmas', [
-            (title, [result for result in summaries if result['title'] == title])
+            (title, [row for row in rows if row['title'] == title])
             for title in dict.fromkeys(case.title for case in CASES)], TARGET_COLUMNS)
-    report.table('Root mean square errors, bounds and their ratios', [
-        (result, TIMES.index(time)) for result in summaries for time in TABLE_TIMES], ROW_COLUMNS)
+    report.table('Root mean square errors, bounds and their ratios', rows, ROW_COLUMNS)
     report.table(
         f'Lever arm (prior {LEVER_STD:g} m per axis) and delay (true {DELAY:g} s, prior '
         f'{DELAY_STD:g} s) as unknowns on `flight`, after {TIMES[-1]:g} s; above, the bound knows '
         'no more than the aligner', [result for result in summaries if result['unknown']], [
-            ('case', '', lambda r: r['title']), ('IMU', '', lambda r: r['grade']),
-            ('rms error (m or s)', '.2g', lambda r: r['nuisance_rms']),
-            ('stated sigma', '.2g', lambda r: r['nuisance_std']),
-            ('rms of error/sigma', '.2f', lambda r: r['nuisance_sigmas'])])
+            field('case', 'title'), field('IMU', 'grade'),
+            field('rms error (m or s)', 'nuisance_rms', '.2g'),
+            field('stated sigma', 'nuisance_std', '.2g'),
+            field('rms of error/sigma', 'nuisance_sigmas', '.2f')])
     report.figure(draw(11.0, 7.5, [[panel(summaries, scenario, angle) for scenario in (
         'flight', 'car')] for angle in ('tilt', 'heading')], sharex=True), '',
         'Errors of the attitude at t0 (dots: rms; lines: Cramer-Rao bound), GNSS velocity')
-    report.write({'runs': runs, 'times_s': TIMES, 'cases': summaries})
+    return {'runs': runs, 'times_s': TIMES, 'cases': summaries}
 
 
 def bounds_of(case: Case) -> tuple[Array, Array]:
@@ -164,49 +162,42 @@ def summary(case: Case, bound: tuple[Array, Array], runs: list[JsonDict]) -> Jso
     return result
 
 
-def chances(runs: int) -> tuple[float, float]:
-    """Return the standard deviations of a heading's ratio and of NEES/3 in so many runs."""
-    return 1 / np.sqrt(2 * runs), np.sqrt(2 / 3 / runs)
-
-
-def figures(results: list[JsonDict], name: str) -> Array:
-    """Return the table's figures of like cases."""
-    return np.array([result[name][TIMES.index(time)] for result in results
-                     for time in TABLE_TIMES])
+def rows_of(result: JsonDict) -> list[JsonDict]:
+    """Return the statistics of a case at each time of the table, and what chance leaves."""
+    runs = result['runs']
+    return [{**{name: value[TIMES.index(time)] if np.ndim(value) else value
+                for name, value in result.items()},
+             'time': time, 'ratio_chance': 1 / np.sqrt(2 * runs),
+             'nees_chance': np.sqrt(2 / 3 / runs)} for time in TABLE_TIMES]
 
 
 def _target_columns(angle: str) -> list[Column]:
-    """Return how many ratios of like cases meet their target, of a title and its results."""
+    """Return how many ratios of like cases meet their target, of a title and its rows."""
     name = f'{angle}_ratio'
     return [
-        (f'{angle} met', '', lambda g: np.sum(figures(g[1], name) <= RATIO_LIMIT)),
-        (f'{angle} beyond chance', '', lambda g: np.sum(
-            figures(g[1], name) > RATIO_LIMIT + 2 * chances(g[1][0]['runs'])[0])),
-        (f'{angle} mean', '.2f', lambda g: np.mean(figures(g[1], name))),
-        (f'{angle} largest', '.2f', lambda g: np.max(figures(g[1], name)))]
-
-
-def _row_columns(angle: str) -> list[Column]:
-    """Return a case's errors at a time, of its result and the place of the time."""
-    return [(f'{angle}{title}', digits, lambda r, name=name: r[0][angle + name][r[1]])
-            for title, digits, name in ((', deg', '.2g', '_deg'), (' bound', '.2g', '_bound_deg'),
-                                        (' ratio', '.2f', '_ratio'))]
+        (f'{angle} met', '', lambda g: sum(row[name] <= RATIO_LIMIT for row in g[1])),
+        (f'{angle} beyond chance', '', lambda g: sum(
+            row[name] > RATIO_LIMIT + 2 * row['ratio_chance'] for row in g[1])),
+        (f'{angle} mean', '.2f', lambda g: np.mean([row[name] for row in g[1]])),
+        (f'{angle} largest', '.2f', lambda g: max(row[name] for row in g[1]))]
 
 
 TARGET_COLUMNS: list[Column] = [
-    ('case', '', lambda g: g[0]), ('figures', '', lambda g: len(figures(g[1], 'nees'))),
+    ('case', '', lambda g: g[0]), ('figures', '', lambda g: len(g[1])),
     *_target_columns('tilt'), *_target_columns('heading'),
-    ('NEES/3 met', '', lambda g: np.sum((figures(g[1], 'nees') >= NEES_RANGE[0])
-                                        & (figures(g[1], 'nees') <= NEES_RANGE[1]))),
-    ('mean', '.2f', lambda g: np.mean(figures(g[1], 'nees'))),
-    ('range', '', lambda g: '{:.2f} to {:.2f}'.format(
-        np.min(figures(g[1], 'nees')), np.max(figures(g[1], 'nees'))))]
+    ('NEES/3 met', '', lambda g: sum(
+        NEES_RANGE[0] <= row['nees'] <= NEES_RANGE[1] for row in g[1])),
+    ('mean', '.2f', lambda g: np.mean([row['nees'] for row in g[1]])),
+    *((title, '.2f', lambda g, choose=choose: choose(row['nees'] for row in g[1]))
+      for title, choose in (('least', min), ('largest', max)))]
 ROW_COLUMNS: list[Column] = [
-    ('case', '', lambda r: '{title}, {scenario}, {grade}'.format(**r[0])),
-    ('t, s', 'g', lambda r: TIMES[r[1]]), *_row_columns('tilt'), *_row_columns('heading'),
-    ('NEES/3', '.2f', lambda r: r[0]['nees'][r[1]]), ('runs', '', lambda r: r[0]['runs']),
-    ('+- ratio', '.2f', lambda r: chances(r[0]['runs'])[0]),
-    ('+- NEES/3', '.2f', lambda r: chances(r[0]['runs'])[1])]
+    ('case', '', lambda row: '{title}, {scenario}, {grade}'.format(**row)),
+    field('t, s', 'time', 'g'),
+    *(field(f'{angle}{title}', f'{angle}{name}', digits) for angle in ('tilt', 'heading')
+      for title, name, digits in ((', deg', '_deg', '.2g'), (' bound', '_bound_deg', '.2g'),
+                                  (' ratio', '_ratio', '.2f'))),
+    field('NEES/3', 'nees', '.2f'), field('runs', 'runs'),
+    field('+- ratio', 'ratio_chance', '.2f'), field('+- NEES/3', 'nees_chance', '.2f')]
 
 
 def panel(results: list[JsonDict], scenario: str, angle: str) -> JsonDict:

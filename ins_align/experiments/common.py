@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What the experiments share: runs, how they are judged, tables and pages."""
+"""What the experiments share: processes, errors against truth, tables and pages."""
 
 from __future__ import annotations
 
@@ -23,14 +23,13 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
-from ins_align.experiments.spoilt import Message, SECOND, SENSORS, Stream, stream_of
 from ins_align.geometry.rotation import Array, log_so3
 from ins_align.outputs import write_whole
 from ins_align.processes import pool, processors
 from ins_align.report import format_table, new_figure
-from ins_align.simulation.simulate import give, simulate, Simulation
+from ins_align.results import Attitude
+from ins_align.simulation.simulate import Simulation
 import numpy as np
 
 # Of simulated data nothing comes late, but an unknown delay wants IMU samples beyond the stamp.
@@ -38,14 +37,9 @@ LATENESS = 0.5
 GRADES = ('navigation', 'tactical', 'mems')
 BINS = (3.0, 5.0)       # sigmas that are counted
 COLOURS = 64            # of a figure
-UPDATE_EVERY = 5.0      # s
-LONGEST = 5.0           # s that a look stands for
-ANGLES = {'tilt': slice(0, 2), 'heading': slice(2, 3)}      # what is counted, and its axes
 
 JsonDict = dict[str, Any]
-Groups = list[tuple[str, list[JsonDict]]]       # of trials, with names
 Column = tuple[str, str, Callable[[Any], Any]]  # title, format, and the value of a row's object
-Truth = Callable[[Any], Any]                    # attitudes at stamps
 
 
 def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jobs: int | None,
@@ -72,23 +66,6 @@ def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jo
                                     chunksize=max(1, min(10, len(every) // (4 * jobs)))))
 
 
-# What is run
-
-def combination(index: int, seed: Sequence[int], *axes: Iterable[Any]) -> Any:
-    """Return one of the combinations of `axes`; each comes once before any comes twice."""
-    combinations = list(itertools.product(*axes))
-    turn, place = divmod(index, len(combinations))
-    order = np.random.default_rng([*seed, turn]).permutation(len(combinations))
-    return combinations[order[place]]
-
-
-def setup(random: np.random.Generator) -> JsonDict:
-    """Draw heading, latitude, lever arm and mount as arguments of `simulate`."""
-    return {'heading_deg': random.uniform(-180, 180), 'latitude_deg': random.uniform(-75, 75),
-            'lever_arm': random.uniform(-1.5, 1.5, 3).tolist(),
-            'mount_rpy_deg': random.uniform(-20, 20, 3).tolist()}
-
-
 def config_for(simulation: Simulation, **changes: Any) -> Config:
     """Return the defaults with a simulation's IMU grade and lever arm."""
     return Config(**{'lever_arm': tuple(simulation.lever_arm.tolist()), 'gnss_lateness': LATENESS,
@@ -107,72 +84,12 @@ def exact_config_for(simulation: Simulation, **changes: Any) -> Config:
         'lever_arm_std': 0.0, 'gnss_delay_std': 0.0, **changes})
 
 
-def prepare(scenario: str, arguments: JsonDict, config: JsonDict, frame: str = 'enu',
-            spoil: Callable[[Stream], Any] | None = None) -> tuple[Simulation, Stream, Aligner]:
-    """Simulate, spoil the messages, and configure an aligner for what is left of the truth."""
-    simulation = simulate(scenario, **arguments)
-    stream = stream_of(simulation, frame)
-    if spoil is not None:
-        spoil(stream)
-    return simulation, stream, Aligner(config_for(simulation, **{**stream.config, **config}))
-
-
-class Look(NamedTuple):
-    """What an aligner says at an epoch, or between epochs: there `t_s` is None."""
-
-    stamp_ns: int
-    t_s: float | None
-    state: State
-    initial: Attitude | None
-    current: Attitude | None
-
-
-def follow(aligner: Aligner, sent: Iterable[Message], every_s: float = UPDATE_EVERY,
-           between: bool = False, watch: Callable[[list[Epoch]], Any] | None = None) -> list[Look]:
-    """
-    Give an aligner messages in the order of arrival, and look at what it says every so often.
-
-    Without epochs it is looked at as well, so that silence counts; `every_s` 0: when the messages
-    have an 'update'. `between` asks for the attitude after every message instead of looking at
-    epochs; `watch` gets the epochs of each update.
-    """
-    looks: list[Look] = []
-
-    def look(epochs: list[Epoch]) -> None:
-        if watch is not None:
-            watch(epochs)
-        if epochs and not between:
-            looks.extend(Look(*(getattr(epoch, name) for name in Look._fields))
-                         for epoch in epochs)
-        elif aligner.newest_imu_ns is not None:
-            status = aligner.status()
-            looks.append(Look(aligner.newest_imu_ns, None, status.state, status.initial,
-                              aligner.attitude_now() if between else status.current))
-
-    due = 0.0 if every_s else math.inf
-    for now, kind, payload in sent:
-        if kind in SENSORS:
-            give(aligner, kind, payload)
-        elif kind == 'reject':
-            aligner.reject(payload)
-        if between or now >= due or kind in ('update', 'reset'):
-            look(aligner.update())
-            due = now + every_s * SECOND if every_s else math.inf
-        if kind == 'reset':
-            aligner.reset()
-    look(aligner.flush())
-    return looks
-
-
-# How it is judged
-
 class Error(NamedTuple):
     """Error of an attitude against the truth."""
 
     angles_deg: Array       # (3,), about east, north, up
-    sigma_deg: Array        # (3,), stated
     nees: float             # normalised squared error of the three angles
-    tilt_sigmas: float      # the larger one of two, each in its sigma
+    tilt_sigmas: float      # the larger one of two, each in its stated sigma
     heading_sigmas: float
 
     @property
@@ -185,80 +102,24 @@ class Error(NamedTuple):
         """Angle between the verticals."""
         return float(np.hypot(*self.angles_deg[:2]))
 
-    def to_json(self) -> JsonDict:
-        """Return plain numbers."""
-        return {'error_deg': self.angles_deg.tolist(), 'sigma_deg': self.sigma_deg.tolist(),
-                'tilt_sigmas': self.tilt_sigmas, 'heading_sigmas': self.heading_sigmas}
+    @property
+    def heading_deg(self) -> float:
+        """Size of the angle about the vertical."""
+        return float(abs(self.angles_deg[2]))
 
 
-def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Array | None = None) -> Error:
+def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Any = 0.0) -> Error:
     """Compare an attitude with ``C_nb``, whose own sigma (3,), if any, is added in quadrature."""
     phi = log_so3(C_true @ attitude.C_nb.T)
-    covariance = attitude.covariance
-    if extra_std_deg is not None:
-        covariance = covariance + np.diag(np.radians(extra_std_deg) ** 2)
-    angles, sigma = np.degrees(phi), np.degrees(np.sqrt(np.diag(covariance)))
-    sigmas = np.abs(angles) / sigma
-    return Error(angles, sigma, float(phi @ np.linalg.solve(covariance, phi)),
+    covariance = attitude.covariance + np.diag(np.radians(np.broadcast_to(extra_std_deg, 3)) ** 2)
+    sigmas = np.abs(phi) / np.sqrt(np.diag(covariance))
+    return Error(np.degrees(phi), float(phi @ np.linalg.solve(covariance, phi)),
                  float(np.max(sigmas[:2])), float(sigmas[2]))
 
 
-def judged(look: Look | None, true: Truth) -> JsonDict | None:
-    """Compare the attitudes of a look with the truth at their stamps."""
-    if look is None or look.initial is None or look.current is None:
-        return None
-    return {'t_s': look.t_s} | {
-        name: error_of(attitude, true(attitude.stamp_ns)).to_json()
-        for name, attitude in (('initial', look.initial), ('current', look.current))}
-
-
-def moments(looks: Iterable[Look], true: Truth) -> JsonDict:
-    """Judge the first epoch that is levelled, the last if it is aligned, every declaration."""
-    epochs = [look for look in looks if look.t_s is not None]
-    aligned = [look.state is State.ALIGNED for look in epochs]
-    levelled = (look for look in epochs if look.state in (State.LEVELLED, State.ALIGNED))
-    declared = [judged(look, true) for look, before, now in zip(
-        epochs, [False, *aligned], aligned) if now and not before]
-    return {'levelled': judged(next(levelled, None), true),
-            'aligned': declared[0] if declared else None, 'declared': declared,
-            'final': judged(epochs[-1], true) if any(aligned[-1:]) else None}
-
-
-def while_aligned(looks: Sequence[Look], start_ns: int, true: Truth,
-                  std_deg: Array | None = None) -> JsonDict:
-    """
-    Judge the current attitude whenever it is called aligned.
-
-    `true` may have None where nothing is known, `std_deg` (3,) says how well; `start_ns` is the
-    stamp of the first sample.
-    """
-    stamps = np.array([look.stamp_ns for look in looks], np.int64)
-    held = np.clip(np.diff(stamps, append=stamps[-1:]) / SECOND, 0.0, LONGEST)
-    aligned = {k: look.current for k, look in enumerate(looks)
-               if look.state is State.ALIGNED and look.current is not None}
-    truths = true([attitude.stamp_ns for attitude in aligned.values()]) if aligned else []
-    errors = {k: error_of(attitude, C_true, std_deg)
-              for (k, attitude), C_true in zip(aligned.items(), truths) if C_true is not None}
-    first = next(iter(errors), None)
-    wrong = [k for k, error in errors.items() if error.worst_sigmas > BINS[1]]
-    return {'declared_s': None if first is None else (stamps[first] - start_ns) / SECOND,
-            'declared_sigmas': None if first is None else errors[first].worst_sigmas,
-            'worst_sigmas': max((e.worst_sigmas for e in errors.values()), default=0.0),
-            'worst_heading_deg': max((abs(e.angles_deg[2]) for e in errors.values()),
-                                     default=0.0),
-            'beyond_s': np.sum(held[wrong]),
-            'aligned_part': np.sum(held[[*aligned]]) / max(np.sum(held), 1e-9)}
-
-
-def worse(moment: JsonDict | None, *angles: str) -> float:
-    """
-    Error of a judged moment in sigmas; -1 if there was none.
-
-    The worse of the attitude at t0 and the current one, of any of `ANGLES` or of all.
-    """
-    return -1.0 if moment is None else max(
-        moment[name][f'{angle}_sigmas'] for name in ('initial', 'current')
-        for angle in angles or ANGLES)
+def field(title: str, name: str, digits: str = '') -> Column:
+    """Return the column of what rows, which are dictionaries, have under a name."""
+    return title, digits, lambda row: row[name]
 
 
 def most(values: Iterable[float]) -> float | None:
@@ -275,13 +136,6 @@ def rms(values: Any, axis: Any = None) -> Any:
     """Root mean square."""
     return np.sqrt(np.mean(np.square(values), axis=axis))
 
-
-def without(trials: list[JsonDict], *omitted: str) -> list[JsonDict]:
-    """Return trials without what need not be written."""
-    return [{key: value for key, value in t.items() if key not in omitted} for t in trials]
-
-
-# Pages
 
 class Report:
     """Collects the text of an experiment, prints it, writes it with the command that makes it."""
@@ -325,18 +179,6 @@ class Report:
                              ('json', json.dumps(_plain(numbers), indent=1))):
             content = f'{text}\n'.encode()
             write_whole(self._out / f'{self._name}.{suffix}', lambda file: file.write(content))
-
-
-def whose() -> list[Column]:
-    """Return the columns that say which trial it is."""
-    return [(title, '', lambda t, key=key: t[key]) for title, key in (
-        ('index', 'index'), ('fault', 'fault'), ('scenario', 'scenario'), ('IMU', 'imu'))]
-
-
-def groups_of(trials: list[JsonDict], faults: Iterable[str]) -> Groups:
-    """Group trials by fault; the last group is all."""
-    return [*((name, [t for t in trials if t['fault'] == name]) for name in faults),
-            ('all', trials)]
 
 
 def draw(width: float, height: float, panels: Sequence[Sequence[JsonDict]], **shared: Any) -> Any:

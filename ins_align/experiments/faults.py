@@ -20,7 +20,6 @@ that is not counted; and what is declared all the same has to be right.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import math
 from pathlib import Path
 import pickle
@@ -29,12 +28,12 @@ import traceback
 from typing import Any
 import warnings
 
-from ins_align.aligner import Aligner, Attitude, Epoch, State
+from ins_align.aligner import Aligner, Attitude, Epoch
 from ins_align.config import Config
-from ins_align.experiments.common import (
-    BINS, Column, combination, error_of, follow, GRADES, groups_of, JsonDict, Look, moments, most,
-    parallel, prepare, Report, setup, Truth, whose, without, worse)
-from ins_align.experiments.spoilt import FAULTS, Random, SECOND, SENSORS, Stream
+from ins_align.experiments.cases import (
+    beyond, Case, combination, follow, groups_of, outcome, prepare, setup, worst)
+from ins_align.experiments.common import BINS, Column, GRADES, JsonDict, most, parallel, Report
+from ins_align.experiments.spoilt import FAULTS, Random, SECOND, SENSORS, Stream, turn_to_ned
 from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
 
@@ -46,62 +45,57 @@ MAX_HELD = 8_000_000
 # Reasons for which a message is not used.
 REFUSED = {'fix': ('no_fix', 'nan', 'late', 'ahead', 'duplicate'),
            'velocity': ('nan', 'late', 'ahead', 'duplicate')}
-# `trial` draws the first three again from the index; the counts are only looked at.
-OMITTED = 'simulate', 'config', 'frame', 'counts', 'levelled', 'aligned'
 
 
-def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
+def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run the campaign and write its tables."""
-    [trials] = parallel(run_trial, [[trial(index) for index in range(runs or 1000)]], jobs,
-                        'faults')
-    write(out, trials)
+    [found] = parallel(run_watched, [range(runs)], jobs, 'faults')
+    report.text(
+        f'{runs} runs of {DURATION:g} s over {len(FAULTS)} faults, all scenarios '
+        f'({", ".join(SCENARIOS)}) and grades of IMU, with random heading, latitude, mount, '
+        'lever arm, velocity message and frame. The fault is in the messages; nothing is told to '
+        'the aligner but what the name of the fault says. Samples come one by one or many at a '
+        'time.')
+    report.text(
+        f"{count(found, 'exception')} runs ended with an exception, "
+        f"{count(found, 'non_finite')} gave a number that is not finite or an attitude that is "
+        f"no rotation, in {count(found, 'miscounted')} the counters do not fit what was sent, "
+        f"{count(found, 'warnings')} made numpy warn (target: none). An aligner "
+        f"never held more than {max(each['held'] for each in found) * 1e-6:.2f} MB (pickled, "
+        f'every {WEIGH_EVERY} updates; limit {MAX_HELD * 1e-6:g}); the processes that ran them '
+        f"grew to {max(each['resident_kb'] for each in found) / 1024:.0f} MB.")
+    declared, share, gross = (beyond(map(error, found), limit) for limit in (-math.inf, *BINS))
+    report.text(
+        f'{declared} runs were declared ALIGNED at some time, {share} of them '
+        f'({share / max(declared, 1):.1%}) beyond {BINS[0]:g} sigma, '
+        f'{gross} beyond {BINS[1]:g} (target: at most 1 % and none). The error is '
+        'the largest, in stated sigmas, of tilt and heading, of the attitude at t0 and the '
+        'current one, at each declaration and at the end where that is still ALIGNED. The time '
+        f'is that during which, within a run, the current attitude was beyond {BINS[1]:g} sigma '
+        'and still called aligned, the longest.')
+    report.table('What became of it, by fault', [
+        group for group in groups_of(found, FAULTS) if group[1]], COLUMNS)
+    return {'runs': found}
 
 
-def trial(index: int) -> JsonDict:
-    """Draw a run: its fault, what is simulated, the frame of the velocities, the parameters."""
+def draw(index: int) -> Case:
+    """Draw a run; what spoils it draws too how its samples come, and when results are taken."""
     fault, scenario, grade = combination(index, [3], FAULTS, SCENARIOS, GRADES)
     random = np.random.default_rng([4, index])
     arguments = {'imu_grade': grade, 'seed': index, 'duration': DURATION, **setup(random)}
     config = {'gnss_lateness': Config().gnss_lateness, 'velocity_type': str(random.choice(
         ['TwistWithCovarianceStamped', 'TwistStamped', 'Odometry']))}
-    return {'index': index, 'fault': fault, 'scenario': scenario, 'imu': grade,
-            'simulate': arguments, 'config': config, 'frame': str(random.choice(['enu', 'ned']))}
+    ned = random.choice(['enu', 'ned']) == 'ned'
 
+    def spoil(stream: Stream) -> None:
+        random = np.random.default_rng([5, index])
+        if ned:
+            turn_to_ned(stream)
+        FAULTS[fault](stream, random)
+        stream.lot = 1 if random.random() < 0.5 else len(stream.imu) + 1
+        stream.updates = update_times(stream, random)
 
-def run_trial(task: JsonDict) -> JsonDict:
-    """Run what `trial` drew and look at everything that comes out."""
-    random = np.random.default_rng([5, task['index']])
-    simulation, stream, aligner = prepare(
-        task['scenario'], task['simulate'], task['config'], task['frame'],
-        lambda stream: FAULTS[task['fault']](stream, random))
-    watch = Watch(aligner)
-    exception = ''
-    with warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter('always')
-        try:
-            looks = feed(watch, stream, random)
-        except Exception:  # whatever it is, it is what this experiment looks for
-            exception = traceback.format_exc(limit=-3)
-    result: JsonDict = {**task, 'exception': exception,
-                        'warnings': sorted({str(warning.message) for warning in warned}),
-                        'non_finite': watch.non_finite, 'held': watch.held,
-                        'resident_kb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
-    if not exception:
-        status = aligner.status()
-        result |= {'state': status.state.value, 'reason': status.reason, 'counts': status.counts,
-                   'miscounted': miscounted(status.counts, stream),
-                   **declarations(looks, simulation.meta['gnss_rate'], lambda stamps:
-                                  simulation.attitude_at(stream.true_stamps(stamps)))}
-    return result
-
-
-def feed(watch: 'Watch', stream: Stream, random: Random) -> list[Look]:
-    """Give the messages to the aligner in the order of arrival, one by one or in blocks."""
-    lot = 1 if random.random() < 0.5 else len(stream.imu) + 1
-    looks = follow(watch.aligner, stream.messages(watch.aligner.config, lot,
-                                                  update_times(stream, random)), 0.0, watch=watch)
-    watch.weigh()
-    return looks
+    return Case(fault, scenario, arguments, config, spoil)
 
 
 def update_times(stream: Stream, random: Random) -> np.ndarray:
@@ -115,6 +109,32 @@ def update_times(stream: Stream, random: Random) -> np.ndarray:
         steps = random.exponential(stream.update_every,
                                    int(2 * duration / stream.update_every) + 1)
     return stream.first + np.rint(np.cumsum(steps) * SECOND).astype(np.int64)
+
+
+def run_watched(index: int) -> JsonDict:
+    """Run what is drawn, and look at everything that comes out."""
+    case = draw(index)
+    simulation, stream, aligner = prepare(case)
+    watch = Watch(aligner)
+    epochs: list[Epoch] = []
+    exception = ''
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter('always')
+        try:
+            for each in follow(aligner, stream.messages(aligner.config), math.inf):
+                watch(each)
+                epochs += each
+            watch.weigh()
+        except Exception:  # whatever it is, it is what this experiment looks for
+            exception = traceback.format_exc(limit=-3)
+    result = {'name': case.name, 'seed': index, 'declared': [], 'final': [], 'beyond_s': 0.0,
+              'exception': exception, 'non_finite': watch.non_finite, 'held': watch.held,
+              'miscounted': [], 'warnings': sorted({str(each.message) for each in warned}),
+              'resident_kb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
+    if not exception:
+        result |= outcome(case, simulation, stream, aligner, epochs)
+        result['miscounted'] = miscounted(result['counts'], stream)
+    return result
 
 
 # What is looked at
@@ -133,9 +153,10 @@ class Watch:
         """Look at the epochs of an update, and at what can be asked for at any time."""
         for epoch in epochs:
             # An innovation that was not tested is nan by its definition, never infinite.
-            self._check('epoch', [epoch.t_s, epoch.gyro_bias, epoch.accel_bias,
-                                  np.nan_to_num(epoch.innovation, posinf=np.inf,
-                                                neginf=np.inf)], epoch.initial, epoch.current)
+            self._check('epoch', [0.0 if epoch.dry else epoch.t_s, epoch.gyro_bias,
+                                  epoch.accel_bias, np.nan_to_num(
+                                      epoch.innovation, posinf=np.inf, neginf=np.inf)],
+                        epoch.initial, epoch.current)
         status = self.aligner.status()
         self._check('status', [value for name, value in vars(status).items() if name in (
             'gyro_bias', 'gyro_bias_std', 'accel_bias', 'accel_bias_std', 'lever_arm',
@@ -187,86 +208,24 @@ def miscounted(counts: dict[str, int], stream: Stream) -> list[str]:
     return wrong
 
 
-def declarations(looks: Sequence[Look], gnss_rate: float, true: Truth) -> JsonDict:
-    """
-    Judge each declaration and the last epoch if it is aligned.
-
-    ``wrong_s`` is how long the current attitude was beyond the last of `BINS` and called aligned.
-    """
-    held = [look.current for look in looks if look.t_s is not None
-            and look.state is State.ALIGNED and look.current is not None]
-    wrong = sum(error_of(attitude, C_true).worst_sigmas > BINS[1] for attitude, C_true in zip(
-        held, true([attitude.stamp_ns for attitude in held]))) if held else 0
-    return {**moments(looks, true), 'wrong_s': wrong / gnss_rate}
+def error(run: JsonDict) -> float | None:
+    """Return the largest error in sigmas at any declaration and at the end, None without."""
+    return worst([*run['declared'], *run['final']])
 
 
-# Tables
-
-def worst(result: JsonDict) -> float:
-    """Largest error in sigmas at any declaration and at the end; nan if there was none."""
-    judged = [*result.get('declared', ()), *filter(None, [result.get('final')])]
-    return max(map(worse, judged), default=math.nan)
-
-
-def beyond(trials: list[JsonDict], limit: float) -> int:
-    """Count the trials that were declared and wrong."""
-    return sum(worst(t) > limit for t in trials)
-
-
-def count(trials: list[JsonDict], what: str) -> int:
-    """Count the trials in which there was an exception, say."""
-    return sum(bool(t.get(what)) for t in trials)
+def count(runs: list[JsonDict], what: str) -> int:
+    """Count the runs in which there was an exception, say."""
+    return sum(bool(each[what]) for each in runs)
 
 
 COLUMNS: list[Column] = [
-    ('fault', '', lambda g: g[0]), ('runs', '', lambda g: len(g[1])),
-    ('exceptions', '', lambda g: count(g[1], 'exception')),
-    ('non-finite', '', lambda g: count(g[1], 'non_finite')),
-    ('miscounted', '', lambda g: count(g[1], 'miscounted')),
-    ('declared', '', lambda g: beyond(g[1], -math.inf)),
-    *((f'beyond {limit:g}', '', lambda g, limit=limit: beyond(g[1], limit)) for limit in BINS),
-    ('worst, sigma', '.1f', lambda g: most(w for t in g[1] if math.isfinite(w := worst(t)))),
-    ('aligned beyond 5, s', '.1f', lambda g: most(t.get('wrong_s', 0.0) for t in g[1])),
-    ('held, MB', '.2f', lambda g: np.median([t['held'] for t in g[1]]) * 1e-6)]
-
-
-def write(out: Path, trials: list[JsonDict]) -> None:
-    """Print tables and write them."""
-    report = Report('faults', 'What drivers get wrong', out, f' --runs {len(trials)}')
-    report.text(
-        f'{len(trials)} runs of {DURATION:g} s over {len(FAULTS)} faults, all scenarios '
-        f'({", ".join(SCENARIOS)}) and grades of IMU, with random heading, latitude, mount, '
-        'lever arm, velocity message and frame. The fault is in the messages; nothing is told to '
-        'the aligner but what the name of the fault says. Samples come one by one or many at a '
-        'time.')
-    report.text(
-        f"{count(trials, 'exception')} runs ended with an exception, "
-        f"{count(trials, 'non_finite')} gave a number that is not finite or an attitude that is "
-        f"no rotation, in {count(trials, 'miscounted')} the counters do not fit what was sent, "
-        f"{count(trials, 'warnings')} made numpy warn (target: none). An aligner "
-        f"never held more than {max(t['held'] for t in trials) * 1e-6:.2f} MB (pickled, every "
-        f'{WEIGH_EVERY} updates; limit {MAX_HELD * 1e-6:g}); the processes that ran them grew to '
-        f"{max(t['resident_kb'] for t in trials) / 1024:.0f} MB.")
-    declared, share, gross = (beyond(trials, limit) for limit in (-math.inf, *BINS))
-    report.text(
-        f'{declared} runs were declared ALIGNED at some time, {share} of them '
-        f'({share / max(declared, 1):.1%}) beyond {BINS[0]:g} sigma, '
-        f'{gross} beyond {BINS[1]:g} (target: at most 1 % and none). The error is '
-        'the largest, in stated sigmas, of tilt and heading, of the attitude at t0 and the '
-        'current one, at each declaration and at the end where that is still ALIGNED. The time '
-        f'is that during which, within a run, the current attitude was beyond {BINS[1]:g} sigma '
-        'and still called aligned, the longest.')
-    report.table('What became of it, by fault', [
-        group for group in groups_of(trials, FAULTS) if group[1]], COLUMNS)
-    report.table(
-        f'Declared and beyond {BINS[0]:g} sigma', [t for t in trials if worst(t) > BINS[0]], [
-            *whose(), ('sigma', '.1f', worst),
-            ('declared, sigma', '.1f', lambda t: most(map(worse, t['declared']))),
-            ('end, sigma', '.1f', lambda t: t['final'] and worse(t['final'])),
-            ('aligned beyond 5, s', '.1f', lambda t: t['wrong_s'])])
-    broken = [{**t, 'what': what} for t in trials for what in (
-        *t['exception'].strip().splitlines()[-1:], *sorted(set(t['non_finite'])),
-        *t.get('miscounted', ()), *t['warnings'])]
-    if broken:
-        report.table('What broke', broken, [*whose(), ('what', '', lambda t: t['what'])])
-    report.write({'runs': len(trials), 'trials': without(trials, *OMITTED)})
+    ('fault', '', lambda group: group[0]), ('runs', '', lambda group: len(group[1])),
+    *((title, '', lambda group, what=what: count(group[1], what)) for title, what in (
+        ('exceptions', 'exception'), ('non-finite', 'non_finite'), ('miscounted', 'miscounted'))),
+    *((title, '', lambda group, limit=limit: beyond(map(error, group[1]), limit))
+      for title, limit in (('declared', -math.inf),
+                           *((f'beyond {limit:g}', limit) for limit in BINS))),
+    ('worst, sigma', '.1f', lambda group: most(
+        sigmas for sigmas in map(error, group[1]) if sigmas is not None)),
+    ('aligned beyond 5, s', '.1f', lambda group: most(each['beyond_s'] for each in group[1])),
+    ('held, MB', '.2f', lambda group: np.median([each['held'] for each in group[1]]) * 1e-6)]

@@ -20,14 +20,13 @@ which it does not describe. Here: scenario `flight`, navigation grade, velocity 
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 from typing import Any
 
 from ins_align.aligner import Aligner
 from ins_align.experiments import dense
 from ins_align.experiments.common import (
-    Column, draw, exact_config_for, JsonDict, parallel, Report, rms)
+    draw, exact_config_for, field, JsonDict, parallel, Report, rms)
 from ins_align.geometry.earth import EARTH_RATE, earth_rate_n, LocalLevel
 from ins_align.geometry.rotation import apply, Array, cross, roll_pitch_yaw, skew
 from ins_align.simulation.simulate import epochs_of, simulate
@@ -41,7 +40,7 @@ REMARK_DURATION = 1000.0
 ANGLES = ('roll', 'pitch', 'heading')
 LEVER, NO_LEVER = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 # Name, lever arm of the vehicle, what the aligner is told beside the grade.
-VARIANTS: dict[str, tuple[tuple[float, ...], dict[str, Any]]] = {
+VARIANTS: dict[str, tuple[tuple[float, ...], JsonDict]] = {
     'not compensated': (LEVER, {'method': 'vif', 'free_start': False, 'lever_arm': NO_LEVER}),
     'compensated': (LEVER, {'method': 'vif', 'free_start': False}),
     'zero lever arm': (NO_LEVER, {'method': 'vif', 'free_start': False}),
@@ -49,37 +48,47 @@ VARIANTS: dict[str, tuple[tuple[float, ...], dict[str, Any]]] = {
     'compensated, free start': (LEVER, {'method': 'vif'}),
     'bank': (LEVER, {'method': 'bank'}),
 }
-SHOWN = 'not compensated', 'compensated', 'zero lever arm'
-ADDED = ('compensated', 'compensated, free start', 'bank')
-COLOURS = {'not compensated': '#D55E00', 'compensated': '#0072B2', 'zero lever arm': '#009E73',
-           'compensated, free start': '#E69F00', 'bank': '#CC79A7'}
-
-Errors = dict[str, dict[str, Array]]    # by grade and variant: (runs, K, 3), degrees
+RUNS = (*(('navigation', name) for name in VARIANTS), ('mems', 'compensated'),
+        ('mems', 'compensated, free start'), ('mems', 'bank'))
+# Those of the figure, as in the note.
+SHOWN = {'not compensated': '#D55E00', 'compensated': '#0072B2', 'zero lever arm': '#009E73'}
 
 
-def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
+def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run all variants, navigation grade; the note, its free start and bank with MEMS too."""
-    runs = runs or 100
-    pairs = [*itertools.product(['navigation'], VARIANTS), *itertools.product(['mems'], ADDED)]
-    errors: Errors = {'navigation': {}, 'mems': {}}
-    for (grade, name), each in zip(pairs, parallel(run_one, [
-            [(*pair, seed) for seed in range(runs)] for pair in pairs], jobs, 'runs')):
-        errors[grade][name] = np.array(each)
-    time = np.arange(errors['navigation']['bank'].shape[1]) / 5.0
-    bounds = {grade: bound_of(grade) for grade in errors}
-    report = Report('note', "The note's experiment", out, f' --runs {runs}')
     report.text(
         'Scenario `flight` (100 m/s, S-turns with 40 s period, oscillation of 2 to 3 deg about '
         f'all axes), IMU 100 Hz, GNSS velocity 5 Hz, 0.1 m/s; lever arm {list(LEVER)} m; {runs} '
         'runs. The note does not give its own set-up. Errors of the attitude at t0.')
-    numbers: JsonDict = {'rms_heading_deg': rms_table(report, errors, bounds, time),
-                         'peak_deg': peak_table(report, errors['navigation'], time)}
-    report.figure(note_figure(errors['navigation'], time), '', f'Mean errors of {runs} runs, '
-                  'method `vif` without free start, as in Fig. 1 of the note')
-    report.figure(added_figure(errors, bounds, time), '_added', 'Root mean square errors: the '
-                  'note, its free start, bank, and the Cramer-Rao bound')
-    numbers['remark_2_1'] = remarks_text(report)
-    report.write({'runs': runs, **numbers})
+    errors = dict(zip(RUNS, map(np.array, parallel(
+        run_one, [[(*each, seed) for seed in range(runs)] for each in RUNS], jobs, 'runs'))))
+    time = np.arange(errors['navigation', 'bank'].shape[1]) / 5.0
+    heading = [(f'{grade}: {name}', rms(each[..., 2], axis=0))
+               for (grade, name), each in errors.items()]
+    heading += [(f'{grade}: Cramer-Rao bound', bound_of(grade))
+                for grade in ('navigation', 'mems')]
+    table = {name: {f'{t:g} s': each[np.argmin(np.abs(time - t))] for t in TABLE_TIMES}
+             for name, each in heading}
+    peaks = peaks_of(errors, time)
+    for title, numbers in (
+            ('Heading error, rms in deg. Without "free start" and bank: free_start false, the '
+             'note to the letter', table),
+            (f'Mean error, deg: largest from {PEAK_FROM:g} to {PEAK_TO:g} s, at {DURATION:g} s, '
+             'and largest difference early from that of zero lever arm with the same noise',
+             peaks)):
+        report.table(title, [{'variant': name, **row} for name, row in numbers.items()], [
+            field('variant', 'variant'),
+            *(field(name, name, '.2g') for name in next(iter(numbers.values())))])
+    none = errors['navigation', 'zero lever arm']
+    chance = np.max(np.std(none, axis=0, ddof=1)[early(time)], axis=0) / np.sqrt(len(none))
+    report.text(
+        "The note's Fig. 1 shows early peaks without compensation, gone with it, and compensated "
+        'like zero lever arm. What the noise alone leaves in these means (1 sigma): '
+        + ', '.join(f'{angle} {value:.2g}' for angle, value in zip(ANGLES, chance)) + ' deg.')
+    report.figure(figure(errors, time), '', f'Mean errors of {runs} runs, method `vif` without '
+                  'free start, as in Fig. 1 of the note')
+    return {'runs': runs, 'rms_heading_deg': table, 'peak_deg': peaks,
+            'remark_2_1': remarks_text(report)}
 
 
 def run_one(task: tuple[str, str, int]) -> Array:
@@ -100,86 +109,41 @@ def run_one(task: tuple[str, str, int]) -> Array:
 
 
 def bound_of(grade: str) -> Array:
-    """Bound of tilt per axis (root mean square of both) and heading at every epoch, degrees."""
+    """Bound of the heading at every epoch, degrees."""
     P = dense.bound(simulate('flight', imu_grade=grade, duration=DURATION)).covariance
-    return np.degrees(np.sqrt(np.stack([(P[:, 0, 0] + P[:, 1, 1]) / 2, P[:, 2, 2]], axis=-1)))
+    return np.degrees(np.sqrt(P[:, 2, 2]))
 
 
-def rms_table(report: Report, errors: Errors, bounds: dict[str, Array],
-              time: Array) -> dict[str, Array]:
-    """Print the heading's rms over time."""
-    places = [int(np.argmin(np.abs(time - t))) for t in TABLE_TIMES]
-    numbers = {}
-    for grade, variants in errors.items():
-        numbers |= {f'{grade}: {name}': rms(error[:, places, 2], axis=0)
-                    for name, error in variants.items()}
-        numbers[f'{grade}: Cramer-Rao bound'] = bounds[grade][places, 1]
-    report.table('Heading error, rms in deg. Without "free start" and bank: free_start false, '
-                 'the note to the letter', numbers.items(),
-                 _columns([f'{t:g} s' for t in TABLE_TIMES]))
-    return numbers
+def early(time: Array) -> Array:
+    """Whether it is the time in which the note has its lumps."""
+    return (time >= PEAK_FROM) & (time <= PEAK_TO)
 
 
-def _columns(titles: list[str]) -> list[Column]:
-    """Return columns of a variant and its numbers."""
-    return [('variant', '', lambda each: each[0]), *(
-        (title, '.2g', lambda each, k=k: each[1][k]) for k, title in enumerate(titles))]
+def peaks_of(errors: dict[tuple[str, str], Array], time: Array) -> dict[str, dict[str, float]]:
+    """Return the largest mean errors early on, and how far they are from those of no lever arm."""
+    means = {name: np.mean(errors['navigation', name], axis=0) for name in SHOWN}
+    apart = {name: mean - means['zero lever arm'] for name, mean in means.items()}
+    return {name: {
+        f'{angle}{when}': np.max(np.abs(values[rows, axis]))
+        for when, values, rows in (('', mean, early(time)), (', end', mean, time == time[-1]),
+                                   (', apart', apart[name], early(time)))
+        for axis, angle in enumerate(ANGLES)} for name, mean in means.items()}
 
 
-def peak_table(report: Report, errors: dict[str, Array], time: Array) -> dict[str, list[float]]:
-    """Print the largest mean errors early on, and how far they are from those of no lever arm."""
-    early = (time >= PEAK_FROM) & (time <= PEAK_TO)
-    none = errors['zero lever arm']
-    numbers = {}
-    for name in SHOWN:
-        mean, apart = np.mean(errors[name], axis=0), np.mean(errors[name] - none, axis=0)
-        numbers[name] = [*np.max(np.abs(mean[early]), axis=0), *np.abs(mean[-1]),
-                         *np.max(np.abs(apart[early]), axis=0)]
-    report.table(
-        f'Mean error, deg: largest from {PEAK_FROM:g} to {PEAK_TO:g} s, at {DURATION:g} s, and '
-        'largest difference early from that of zero lever arm with the same noise',
-        numbers.items(),
-        _columns([f'{angle}{when}' for when in ('', ', end', ', apart') for angle in ANGLES]))
-    chance = np.max(np.std(none, axis=0, ddof=1)[early], axis=0) / np.sqrt(len(none))
-    report.text(
-        "The note's Fig. 1 shows early peaks without compensation, gone with it, and compensated "
-        'like zero lever arm. What the noise alone leaves in these means (1 sigma): '
-        + ', '.join(f'{angle} {value:.2g}' for angle, value in zip(ANGLES, chance)) + ' deg.')
-    return numbers
-
-
-def note_figure(errors: dict[str, Array], time: Array) -> Any:
+def figure(errors: dict[tuple[str, str], Array], time: Array) -> Any:
     """Draw mean errors over time."""
-    means = {name: np.mean(errors[name], axis=0) for name in SHOWN}
-    panels = []
-    for column, angle in enumerate(ANGLES):
-        limit = 1.1 * max(np.nanmax(np.abs(mean[time >= SHOWN_FROM, column]))
-                          for mean in means.values())
-        panels.append([{
-            'ylabel': f'{angle} (deg)', 'ylim': (-limit, limit), 'xlim': (0.0, DURATION),
-            'lines': [(time, mean[:, column], {
-                'color': COLOURS[name], 'label': name,
-                'linestyle': '--' if name == 'zero lever arm' else '-'})
-                for name, mean in means.items()]}])
-    panels[0][0]['title'] = f'mean alignment error (scaled to what is seen after {SHOWN_FROM:g} s)'
-    return draw(8.0, 8.0, panels, sharex=True)
-
-
-def added_figure(errors: Errors, bounds: dict[str, Array], time: Array) -> Any:
-    """Draw rms errors and bounds over time."""
-    shown = time >= 1.0
-    return draw(11.0, 7.5, [[{
-        'title': f'{grade} IMU: {angle}', 'ylabel': 'rms error (deg)', 'yscale': 'log',
-        'lines': [
-            *((time[shown], rms(variants[name][:, shown, chosen], axis=(0, 2)), {
-                'color': COLOURS[name], 'label': 'the note' if name == 'compensated' else name})
-              for name in ADDED),
-            (time[shown], bounds[grade][shown, line],
-             {'color': 'k', 'linestyle': '--', 'label': 'Cramer-Rao bound'})]}
-        for grade, variants in errors.items()]
-        for line, (angle, chosen) in enumerate((('tilt, per axis', slice(0, 2)),
-                                                ('heading', slice(2, 3))))],
-        sharex=True, sharey='row')
+    means = {name: np.mean(errors['navigation', name], axis=0) for name in SHOWN}
+    shown = np.max([np.nanmax(np.abs(mean[time >= SHOWN_FROM]), axis=0)
+                    for mean in means.values()], axis=0)
+    return draw(8.0, 8.0, [[{
+        'title': '' if column else
+        f'mean alignment error (scaled to what is seen after {SHOWN_FROM:g} s)',
+        'ylabel': f'{angle} (deg)', 'ylim': 1.1 * shown[column] * np.array([-1.0, 1.0]),
+        'xlim': (0.0, DURATION), 'lines': [(time, mean[:, column], {
+            'color': SHOWN[name], 'label': name,
+            'linestyle': '--' if name == 'zero lever arm' else '-'})
+            for name, mean in means.items()]}]
+        for column, angle in enumerate(ANGLES)], sharex=True)
 
 
 def remarks_text(report: Report) -> JsonDict:

@@ -62,26 +62,31 @@ class Stream:
     velocity: np.ndarray
     first: int              # stamps between which the vehicle is simulated
     last: int
+    lot: int = LOT          # IMU samples given at once
     config: dict[str, Any] = field(default_factory=dict)        # what else is configured
     resets: list[int] = field(default_factory=list)     # when somebody asks for a new start
+    updates: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))  # or for results
     update_every: float = 0.0       # s, in the mean; 0: regularly, once a second
     expected: dict[str, int] = field(default_factory=dict)      # counters known beforehand
-    # Stamps from the first on and before the second are off by the third.
-    shift: tuple[int, int, int] = 0, 0, 0
+    # Stamps behind each of the former are off by one of the latter, of which there is one more.
+    clock: tuple[Any, Any] = (), (0,)
+
+    @property
+    def start_ns(self) -> int:
+        """Return the stamp of the first IMU sample."""
+        return int(next(iter(self.imu['stamp']), self.first))
 
     def true_stamps(self, stamps: Any) -> Any:
         """When what bears these stamps has been, by the simulation's clock."""
-        start, end, shift = self.shift
-        stamps = np.asarray(stamps)
-        moved = np.where((stamps >= start) & (stamps < end), stamps - shift, stamps)
-        return np.clip(moved, self.first, self.last)
+        edges, offsets = map(np.asarray, self.clock)
+        return np.clip(stamps - offsets[np.searchsorted(edges, stamps)], self.first, self.last)
 
-    def measured_at(self, stamps: Any) -> Any:
-        """When IMU samples with such stamps were measured, if they are stamped late or ahead."""
-        late = self.imu['stamp'] - self.imu['arrival']
-        medians = np.array([int(np.median(late[k:k + LOT])) for k in range(0, len(late), LOT)])
-        places = np.searchsorted(self.imu['stamp'][::LOT], stamps) - 1
-        return np.clip(stamps - medians[np.maximum(places, 0)], self.first, self.last)
+    def stamp_imu(self, stamps: np.ndarray) -> None:
+        """Stamp IMU samples otherwise than when they are measured, which is when they arrive."""
+        self.imu['stamp'] = stamps
+        late = stamps - self.imu['arrival']
+        self.clock = stamps[::LOT][1:], [int(np.median(late[k:k + LOT]))
+                                         for k in range(0, len(late), LOT)]
 
     def moment(self, random: Random, low: float = 0.1, high: float = 0.9) -> int:
         """Draw an instant from a part of the recording."""
@@ -113,23 +118,23 @@ class Stream:
         here = self.fix['lla'][chosen]
         self.fix['lla'][chosen] = displaced(here, np.broadcast_to(away, here.shape))
 
-    def messages(self, config: Config, lot: int = LOT, update: Any = ()) -> Iterator[Message]:
+    def messages(self, config: Config) -> Iterator[Message]:
         """
         Yield what an aligner is given, in the order of arrival; IMU samples in lots.
 
-        Kinds are the names of the arrays, 'update' at the times given, 'reset', and 'reject' with
-        the reason for a message that cannot be used.
+        Kinds are the names of the arrays, 'update', 'reset', and 'reject' with the reason for a
+        message that cannot be used.
         """
         kinds = *SENSORS, 'update', 'reset'
         arrivals = [*(getattr(self, name)['arrival'] for name in SENSORS),
-                    np.asarray(update, np.int64), np.array(self.resets, np.int64)]
+                    self.updates, np.array(self.resets, np.int64)]
         lengths = [len(times) for times in arrivals]
         order = np.argsort(np.concatenate(arrivals), kind='stable')
         kind = np.repeat(range(len(kinds)), lengths)[order]
         places = order - (np.cumsum(lengths) - lengths)[kind]
         for block in np.split(np.arange(len(order)), np.flatnonzero(np.diff(kind)) + 1):
             what = kind[block[0]]
-            size = lot if what == 0 else 1
+            size = self.lot if what == 0 else 1
             for start in range(0, len(block), size):
                 chosen = places[block[start:start + size]]
                 yield (int(arrivals[what][chosen[-1]]),
@@ -152,9 +157,8 @@ class Stream:
             return 'reject', 'velocity_body_frame'
 
 
-def stream_of(simulation: Simulation, frame: str = 'enu') -> Stream:
-    """Return the messages of a simulation, velocities in ENU or NED."""
-    turn = ENU_FROM_NED if frame == 'ned' else np.eye(3)
+def stream_of(simulation: Simulation, lot: int = LOT) -> Stream:
+    """Return the messages of a simulation, velocities in ENU."""
     imu = np.zeros(len(simulation.imu_stamps_ns), _IMU)
     imu['arrival'] = imu['stamp'] = simulation.imu_stamps_ns
     imu['gyro'], imu['accel'] = simulation.gyro, simulation.accel
@@ -164,10 +168,18 @@ def stream_of(simulation: Simulation, frame: str = 'enu') -> Stream:
         rows['arrival'], rows['stamp'] = simulation.gnss_arrival_ns, simulation.gnss_stamps_ns
     fix['lla'], fix['covariance'] = simulation.lla_deg, simulation.position_covariance
     fix['covariance_type'] = 3
-    velocity['velocity'] = simulation.velocity @ turn
-    velocity['covariance'] = turn @ simulation.velocity_covariance @ turn
+    velocity['velocity'] = simulation.velocity
+    velocity['covariance'] = simulation.velocity_covariance
     return Stream(imu, fix, velocity, int(simulation.imu_stamps_ns[0]),
-                  int(simulation.imu_stamps_ns[-1]), {'velocity_frame': frame})
+                  int(simulation.imu_stamps_ns[-1]), lot, {'velocity_frame': 'enu'})
+
+
+def turn_to_ned(stream: Stream) -> None:
+    """Send velocities in NED, and configure it."""
+    rows = stream.velocity
+    rows['velocity'] = rows['velocity'] @ ENU_FROM_NED
+    rows['covariance'] = ENU_FROM_NED @ rows['covariance'] @ ENU_FROM_NED
+    stream.config['velocity_frame'] = 'ned'
 
 
 def within(rows: np.ndarray, window: Window) -> np.ndarray:
@@ -398,7 +410,7 @@ def _set_clock(stream: Stream, moment: int, shift: int, **expected: int) -> None
     """Put all stamps from a moment on off by something."""
     for rows in stream.imu, stream.fix, stream.velocity:
         rows['stamp'][rows['stamp'] >= moment] += shift
-    stream.shift = (moment + shift, stream.last + shift + SECOND, shift)
+    stream.clock = [moment + shift, stream.last + shift + SECOND], [0, shift, 0]
     stream.expected |= expected
 
 
