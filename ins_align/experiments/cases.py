@@ -25,9 +25,9 @@ import itertools
 import math
 from typing import Any, NamedTuple
 
-from ins_align.aligner import Aligner, Attitude, Epoch, State
+from ins_align.aligner import Aligner, Epoch, State
 from ins_align.experiments.common import (
-    BINS, Column, config_for, error_of, JsonDict, median, most)
+    BINS, Column, config_for, Error, error_of, JsonDict, median, most)
 from ins_align.experiments.spoilt import LOT, Message, SECOND, SENSORS, Stream, stream_of
 from ins_align.geometry.rotation import Array
 from ins_align.simulation.simulate import give, simulate, Simulation
@@ -142,8 +142,8 @@ def moments(epochs: Iterable[Epoch], true: Truth) -> JsonDict:
     """
     Judge the first epoch that is levelled, every declaration, the last epoch if it is aligned.
 
-    Of each moment: s since t0, and of tilt and heading the largest errors of the attitude at t0
-    and the current one, in their stated sigmas and degrees. Lists, empty where there was none.
+    The errors are the larger ones of the attitude at t0 and the current one. Lists, empty where
+    there was none.
     """
     epochs = [epoch for epoch in epochs if not epoch.dry]
     aligned = [epoch.state is State.ALIGNED for epoch in epochs]
@@ -153,42 +153,51 @@ def moments(epochs: Iterable[Epoch], true: Truth) -> JsonDict:
         'declared': [epoch for epoch, before, now in zip(epochs, [False, *aligned], aligned)
                      if now and not before],
         'final': epochs[-1:] if any(aligned[-1:]) else []}
-    return {name: [_moment(epoch.t_s, [epoch.initial, epoch.current], true) for epoch in each
-                   if epoch.initial is not None and epoch.current is not None]
+    return {name: [moment(epoch.t_s, errors_of([epoch.initial, epoch.current], true))
+                   for epoch in each if epoch.initial is not None and epoch.current is not None]
             for name, each in chosen.items()}
 
 
-def _moment(t_s: float, attitudes: list[Attitude], true: Truth) -> JsonDict:
-    errors = [error_of(attitude, C_true) for attitude, C_true in zip(
-        attitudes, true([attitude.stamp_ns for attitude in attitudes]))]
-    return {'t_s': t_s, 'tilt_sigmas': max(error.tilt_sigmas for error in errors),
-            'heading_sigmas': max(error.heading_sigmas for error in errors),
-            'tilt_deg': max(np.abs(error.angles_deg[:2]).max() for error in errors),
-            'heading_deg': max(error.heading_deg for error in errors)}
+def moment(t_s: float, errors: list[Error | None]) -> JsonDict:
+    """Return a time, s since t0, and the largest errors of tilt and heading."""
+    return {'t_s': t_s, **{name: max(getattr(error, name) for error in errors) for name in (
+        'tilt_sigmas', 'heading_sigmas', 'tilt_deg', 'heading_deg')}}
 
 
-def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth,
-                  std_deg: Any = 0.0) -> JsonDict:
+def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth, std_deg: Any = 0.0,
+                  times: Iterable[float] = ()) -> JsonDict:
     """
-    Judge the current attitude whenever it is called aligned.
+    Judge the current attitude whenever it is called aligned, and after some times since t0.
 
     `std_deg` (3,) says how well the truth is known; `start_ns` is the stamp of the first sample.
     """
     stamps = np.array([epoch.stamp_ns for epoch in epochs], np.int64)
     held = np.clip(np.diff(stamps, append=stamps[-1:]) / SECOND, 0.0, LONGEST)
-    aligned = {k: epoch.current for k, epoch in enumerate(epochs)
-               if epoch.state is State.ALIGNED and epoch.current is not None}
-    truths = true([attitude.stamp_ns for attitude in aligned.values()]) if aligned else []
-    errors = {k: error_of(attitude, C_true, std_deg)
-              for (k, attitude), C_true in zip(aligned.items(), truths) if C_true is not None}
-    first = next(iter(errors), None)
-    wrong = [k for k, error in errors.items() if error.worst_sigmas > BINS[1]]
-    return {'declared_s': None if first is None else (stamps[first] - start_ns) / SECOND,
-            'declared_sigmas': None if first is None else errors[first].worst_sigmas,
-            'worst_sigmas': most(error.worst_sigmas for error in errors.values()),
-            'worst_heading_deg': most(error.heading_deg for error in errors.values()),
-            'beyond_s': np.sum(held[wrong]),
-            'aligned_part': np.sum(held[[*aligned]]) / max(np.sum(held), 1e-9)}
+    known = [k for k, epoch in enumerate(epochs) if epoch.current is not None]
+    errors = {k: error for k, error in zip(known, errors_of(
+        [epochs[k].current for k in known], true, std_deg)) if error is not None}
+    aligned = [k for k in errors if epochs[k].state is State.ALIGNED]
+    sigmas = {k: errors[k].worst_sigmas for k in aligned}
+    last_s = max((epochs[k].t_s for k in errors), default=-math.inf)
+    at = {f'{time:g}': [moment(epochs[k].t_s, [errors[k]]) for k in [
+        k for k in errors if epochs[k].t_s <= time + 1e-6][-1:]]
+        for time in times if last_s >= time - 1.5}
+    return {'first': [moment(epochs[k].t_s, [errors[k]]) for k in aligned[:1]],
+            'declared_s': next(((stamps[k] - start_ns) / SECOND for k in aligned), None),
+            'epochs': len(aligned), 'worst_sigmas': most(sigmas.values()),
+            'worst_heading_deg': most(errors[k].heading_deg for k in aligned),
+            'beyond': [beyond(sigmas.values(), limit) for limit in BINS],
+            'beyond_s': np.sum(held[[k for k in aligned if sigmas[k] > BINS[1]]]),
+            'aligned_part': np.sum(held[[
+                k for k in known if epochs[k].state is State.ALIGNED]]) / max(np.sum(held), 1e-9),
+            'at': at}
+
+
+def errors_of(attitudes: list[Any], true: Truth, std_deg: Any = 0.0) -> list[Error | None]:
+    """Compare attitudes with the truth; None where that is not known."""
+    truths = true([attitude.stamp_ns for attitude in attitudes]) if attitudes else ()
+    return [None if C_true is None else error_of(attitude, C_true, std_deg)
+            for attitude, C_true in zip(attitudes, truths)]
 
 
 # Columns of tables, whose rows are a name and its runs
@@ -242,10 +251,10 @@ ALIGNED_COLUMNS: list[Column] = [
     ('case', '', lambda group: group[0]), ('runs', '', lambda group: len(group[1])),
     ('declared', '', _each('declared_s', len)),
     ('at the end', '', _each('state', lambda states: states.count(State.ALIGNED.value))),
-    *((title, '', _each(name, lambda values, limit=limit: beyond(values, limit)))
-      for title, name, limit in (
-          ('declared beyond 3', 'declared_sigmas', BINS[0]),
-          ('beyond 3', 'worst_sigmas', BINS[0]), ('beyond 5', 'worst_sigmas', BINS[1]))),
+    ('declared beyond 3', '', lambda group: beyond(
+        (worst(run['first']) for run in group[1]), BINS[0])),
+    *((f'beyond {limit:g}', '', _each('worst_sigmas', lambda values, limit=limit: beyond(
+        values, limit))) for limit in BINS),
     ('beyond 5, s', '.1f', lambda group: most(
         run['beyond_s'] for run in group[1] if run['declared_s'] is not None)),
     ('worst, sigma', '.1f', _each('worst_sigmas', most)),

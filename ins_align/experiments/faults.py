@@ -28,7 +28,7 @@ import traceback
 from typing import Any
 import warnings
 
-from ins_align.aligner import Aligner, Attitude, Epoch
+from ins_align.aligner import Aligner, Epoch
 from ins_align.config import Config
 from ins_align.experiments.cases import (
     beyond, Case, combination, follow, groups_of, outcome, prepare, setup, worst)
@@ -115,20 +115,23 @@ def run_watched(index: int) -> JsonDict:
     """Run what is drawn, and look at everything that comes out."""
     case = draw(index)
     simulation, stream, aligner = prepare(case)
-    watch = Watch(aligner)
     epochs: list[Epoch] = []
-    exception = ''
+    non_finite: set[str] = set()
+    held, exception = 0, ''
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter('always')
         try:
-            for each in follow(aligner, stream.messages(aligner.config), math.inf):
-                watch(each)
+            for update, each in enumerate(
+                    follow(aligner, stream.messages(aligner.config), math.inf), 1):
                 epochs += each
-            watch.weigh()
+                non_finite.update(broken(aligner, each))
+                aligner.take_events()
+                held = max(held, 0 if update % WEIGH_EVERY else weight(aligner))
+            held = max(held, weight(aligner))
         except Exception:  # whatever it is, it is what this experiment looks for
             exception = traceback.format_exc(limit=-3)
     result = {'name': case.name, 'seed': index, 'declared': [], 'final': [], 'beyond_s': 0.0,
-              'exception': exception, 'non_finite': watch.non_finite, 'held': watch.held,
+              'exception': exception, 'non_finite': sorted(non_finite), 'held': held,
               'miscounted': [], 'warnings': sorted({str(each.message) for each in warned}),
               'resident_kb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
     if not exception:
@@ -139,52 +142,34 @@ def run_watched(index: int) -> JsonDict:
 
 # What is looked at
 
-class Watch:
-    """Looks at what an aligner gives and at what it keeps."""
+def weight(aligner: Aligner) -> int:
+    """Return how much an aligner holds, bytes, pickled."""
+    return len(pickle.dumps(vars(aligner)))
 
-    def __init__(self, aligner: Aligner) -> None:
-        """Start with nothing seen."""
-        self.aligner = aligner
-        self.non_finite: list[str] = []
-        self.held = 0
-        self._updates = 0
 
-    def __call__(self, epochs: list[Epoch]) -> None:
-        """Look at the epochs of an update, and at what can be asked for at any time."""
-        for epoch in epochs:
-            # An innovation that was not tested is nan by its definition, never infinite.
-            self._check('epoch', [0.0 if epoch.dry else epoch.t_s, epoch.gyro_bias,
-                                  epoch.accel_bias, np.nan_to_num(
-                                      epoch.innovation, posinf=np.inf, neginf=np.inf)],
-                        epoch.initial, epoch.current)
-        status = self.aligner.status()
-        self._check('status', [value for name, value in vars(status).items() if name in (
-            'gyro_bias', 'gyro_bias_std', 'accel_bias', 'accel_bias_std', 'lever_arm',
-            'lever_arm_std', 'gnss_delay', 'gnss_delay_std', 'time_to_align_s')
-            and value is not None], status.initial, status.current)
-        self._check('declared', [], self.aligner.declared)
-        self._check('now', [], self.aligner.attitude_now())
-        self.aligner.take_events()
-        self._updates += 1
-        if self._updates % WEIGH_EVERY == 0:
-            self.weigh()
-
-    def weigh(self) -> None:
-        """Measure all that the aligner holds."""
-        self.held = max(self.held, len(pickle.dumps(vars(self.aligner))))
-
-    def _check(self, what: str, values: list[Any], *attitudes: Attitude | None) -> None:
-        for attitude in attitudes:
-            if attitude is None:
-                continue
-            values += [attitude.C_nb, attitude.covariance, attitude.sigma_deg]
+def broken(aligner: Aligner, epochs: list[Epoch]) -> list[str]:
+    """Return what is no number or no rotation, of epochs and of what can be asked for."""
+    status = aligner.status()
+    # An innovation that was not tested is nan by its definition, never infinite.
+    numbers = [('epoch', value) for epoch in epochs for value in (
+        0.0 if epoch.dry else epoch.t_s, epoch.gyro_bias, epoch.accel_bias,
+        np.nan_to_num(epoch.innovation, posinf=np.inf, neginf=np.inf))]
+    numbers += [('status', value) for name, value in vars(status).items()
+                if isinstance(value, (float, np.ndarray))]
+    wrong = []
+    for what, attitude in (
+            *(('epoch', each) for epoch in epochs for each in (epoch.initial, epoch.current)),
+            ('status', status.initial), ('status', status.current),
+            ('declared', aligner.declared), ('now', aligner.attitude_now())):
+        if attitude is not None:
+            numbers += [(what, attitude.C_nb), (what, attitude.covariance)]
             if not (abs(np.linalg.norm(attitude.quaternion_xyzw) - 1.0) < 1e-9
                     and np.abs(attitude.C_nb @ attitude.C_nb.T - np.eye(3)).max() < 1e-9):
-                self.non_finite.append(f'{what}: no rotation')
+                wrong.append(f'{what}: no rotation')
             if attitude.covariance.diagonal().min() <= 0:
-                self.non_finite.append(f'{what}: no covariance')
-        if not all(np.isfinite(value).all() for value in values):
-            self.non_finite.append(f'{what}: not finite')
+                wrong.append(f'{what}: no covariance')
+    return wrong + [f'{what}: not finite' for what, value in numbers
+                    if not np.isfinite(value).all()]
 
 
 def miscounted(counts: dict[str, int], stream: Stream) -> list[str]:

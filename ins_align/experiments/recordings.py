@@ -23,13 +23,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 import itertools
-import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ins_align.experiments import ExperimentError
-from ins_align.experiments.common import (
-    BINS, Column, draw, error_of, JsonDict, median, most, parallel, Report)
+from ins_align.experiments.cases import ALIGNED_COLUMNS, beyond, while_aligned, worst
+from ins_align.experiments.common import BINS, Column, JsonDict, median, parallel, Report
 from ins_align.experiments.spoilt import SECOND
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.messages import Fix, Velocity
@@ -38,7 +37,7 @@ from ins_align.offline import align
 from ins_align.recordings import BagError
 from ins_align.recordings.decode import ImuSamples, Orientations
 from ins_align.recordings.reader import read, REFERENCE_TOPIC, Request
-from ins_align.results import Reference, State
+from ins_align.results import Reference
 import numpy as np
 
 # What is known beside the recording, by the beginning of its name: the lever arm, and how well
@@ -54,16 +53,6 @@ TIMES = (30.0, 60.0, 120.0)
 METHODS: dict[str, JsonDict] = {
     'note': {'method': 'vif', 'free_start': False}, 'centred': {'method': 'vif'},
     'bank': {'method': 'bank'}}
-
-
-class Part(NamedTuple):
-    """The arguments of `align`."""
-
-    stamps: np.ndarray
-    gyro: Array
-    accel: Array
-    fixes: list[Fix]
-    velocities: list[Velocity]
 
 
 class Recording(NamedTuple):
@@ -90,15 +79,16 @@ class Recording(NamedTuple):
         """Return the reference's ``C_nb`` at stamps, None where there is none."""
         return [self.reference.attitude_at(stamp) for stamp in stamps_ns]
 
-    def part(self, start_s: float, duration: float) -> Part:
-        """Return what `align` takes, for so long from a time on, s."""
+    def part(self, start_s: float, duration: float) -> JsonDict:
+        """Return the data that `align` takes, for so long from a time on, s."""
         stamps_ns = self.imu.stamps_ns
         first, last = np.searchsorted(stamps_ns, stamps_ns[0] + np.rint(np.array(
             [start_s, start_s + duration]) * SECOND).astype(np.int64)).tolist()
         messages = [message for before, message in self.gnss if first < before <= last]
-        return Part(*(array[first:last] for array in (stamps_ns, self.imu.gyro, self.imu.accel)),
-                    [message for message in messages if isinstance(message, Fix)],
-                    [message for message in messages if isinstance(message, Velocity)])
+        return {'stamps': stamps_ns[first:last], 'gyro': self.imu.gyro[first:last],
+                'accel': self.imu.accel[first:last],
+                'fixes': [each for each in messages if isinstance(each, Fix)],
+                'velocities': [each for each in messages if isinstance(each, Velocity)]}
 
 
 def recordings_in(folder: Path) -> list[Path]:
@@ -132,67 +122,46 @@ def load(path: Path) -> Recording:
         Reference(orientations.known()), np.maximum(stated, [tilt, tilt, heading]))
 
 
-class Window(NamedTuple):
-    """What came of one window of a recording; K epochs with an attitude."""
+def run_window(task: tuple[Path, float, float, JsonDict, float]) -> JsonDict:
+    """
+    Align a window of a recording.
 
-    start_s: float
-    time: Array             # (K,), s since t0
-    aligned: Array          # (K,) bool
-    error_deg: Array        # (K, 3), of the current attitude about east, north, up
-    sigmas: Array           # (K, 2), tilt and heading in sigmas, that of the reference included
-    course_deg: Array       # (K,), error of the course over ground as heading, nan when slow
-    moves: bool             # real motion in its first minute
-    covers_minute: bool
-
-    @property
-    def declared_s(self) -> float | None:
-        """When it was declared first, s since t0; None if it was not."""
-        return next(iter(self.time[self.aligned].tolist()), None)
-
-
-Chosen = list[tuple[Window, int]]           # epochs of windows, by their places
-Windows = dict[str, dict[str, list[Window]]]        # by recording and method
-
-
-def run_window(task: tuple[Path, float, float, JsonDict]) -> Window:
-    """Align a window of a recording: from when on and how long, s; parameters of `Config`."""
-    path, start_s, duration, config = task
+    The task: its path, from when on and how long, s, parameters of `Config`, the sign of gyro z.
+    """
+    path, start_s, duration, config, z_sign = task
     recording = load(path)
     part = recording.part(start_s, duration)
-    stamps, velocities = _velocities(part)
-    rows = []
-    for epoch in align(*part, **{**recording.lever_arm, **config}).epochs:
-        if epoch.dry or epoch.current is None:
-            continue
-        [C_true] = recording.attitudes_at([epoch.current.stamp_ns])
-        if C_true is not None:
-            error = error_of(epoch.current, C_true, recording.reference_std_deg)
-            rows.append([epoch.t_s, epoch.state is State.ALIGNED, *error.angles_deg,
-                         error.tilt_sigmas, error.heading_sigmas,
-                         _course_error(epoch.stamp_ns, C_true, stamps, velocities)])
-    table = np.array(rows).reshape(-1, 8)
+    part['gyro'] = part['gyro'] * [1.0, 1.0, z_sign]
+    result = align(**part, **{**recording.lever_arm, **config})
+    run = while_aligned([epoch for epoch in result.epochs if not epoch.dry], int(part['stamps'][0]),
+                        recording.attitudes_at, recording.reference_std_deg, TIMES)
+    stamps, velocities = _velocities(**part)
     minute = velocities[stamps <= stamps[:1] + round(MOTION_TIME * SECOND)]
-    return Window(start_s, table[:, 0], table[:, 1] > 0, table[:, 2:5], table[:, 5:7],
-                  table[:, 7], _change(minute) >= MOTION_SPEED,
-                  min(recording.duration - start_s, duration) >= MOTION_TIME)
+    for found in itertools.chain(*run['at'].values()):
+        stamp_ns = result.first_t0_ns + round(found['t_s'] * SECOND)
+        found['course_deg'] = _course_error(recording.reference, stamp_ns, stamps, velocities)
+    return {'start_s': start_s, 'state': result.status.state.value,
+            'moves': _change(minute) >= MOTION_SPEED,
+            'covers_minute': min(recording.duration - start_s, duration) >= MOTION_TIME, **run}
 
 
-def _velocities(part: Part) -> tuple[np.ndarray, Array]:
+def _velocities(stamps: np.ndarray, fixes: list[Fix], velocities: list[Velocity], **imu: Array,
+                ) -> tuple[np.ndarray, Array]:
     """Horizontal velocities of a window, stamps and ENU; from positions where there are none."""
-    measured = [m for m in part.velocities if np.isfinite(m.velocity).all()]
+    measured = [m for m in velocities if np.isfinite(m.velocity).all()]
     if measured:
         return (np.array([m.stamp_ns for m in measured]),
                 np.array([m.velocity[:2] for m in measured]))
-    fixes = np.array([[m.stamp_ns - part.stamps[0], m.latitude_deg, m.longitude_deg, m.altitude_m]
-                      for m in part.fixes]).reshape(-1, 4)
-    fixes = fixes[np.isfinite(fixes).all(axis=1)]
-    if len(fixes) < 3:
+    rows = np.array([[m.stamp_ns - stamps[0], m.latitude_deg, m.longitude_deg, m.altitude_m]
+                     for m in fixes]).reshape(-1, 4)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if len(rows) < 3:
         return np.zeros(0, np.int64), np.zeros((0, 2))
-    time, places = track(series_of(fixes[:, 0] / SECOND, fixes[:, 1:]))
+    time, places = track(series_of(rows[:, 0] / SECOND, rows[:, 1:]))
     # Over half a second, against the noise of a fix.
     step = max(1, int(round(0.25 / np.median(np.diff(time)))))
     moved = (places[2 * step:] - places[:-2 * step])[:, :2]
-    return (part.stamps[0] + np.rint(time[step:-step] * SECOND).astype(np.int64),
+    return (stamps[0] + np.rint(time[step:-step] * SECOND).astype(np.int64),
             moved / (time[2 * step:] - time[:-2 * step])[:, None])
 
 
@@ -203,14 +172,15 @@ def _change(velocities: Any) -> float:
     return float(np.max(np.ptp(extents, axis=0))) if len(extents) else 0.0
 
 
-def _course_error(stamp_ns: int, C_true: Array, stamps: np.ndarray, velocities: Array) -> float:
-    """Error of taking the course over ground for the heading, degrees; nan below 1 m/s."""
-    v = velocities[min(int(np.searchsorted(stamps, stamp_ns)), len(stamps) - 1)] \
-        if len(stamps) else np.zeros(2)
-    if np.hypot(*v) < 1.0:
-        return math.nan
-    error = np.arctan2(C_true[1, 0], C_true[0, 0]) - np.arctan2(v[1], v[0])
-    return float(np.degrees((error + np.pi) % (2 * np.pi) - np.pi))
+def _course_error(reference: Reference, stamp_ns: int, stamps: np.ndarray,
+                  velocities: Array) -> float | None:
+    """Error of taking the course over ground for the heading, degrees; None below 1 m/s."""
+    C_true = reference.attitude_at(stamp_ns)
+    v = velocities[np.searchsorted(stamps, stamp_ns):][:1]
+    if C_true is None or not len(v) or np.hypot(*v[0]) < 1.0:
+        return None
+    error = np.arctan2(C_true[1, 0], C_true[0, 0]) - np.arctan2(v[0, 1], v[0, 0])
+    return float(abs(np.degrees((error + np.pi) % (2 * np.pi) - np.pi)))
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
@@ -219,42 +189,40 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     paths = recordings_in(data)
     if not paths:
         raise ExperimentError(f'no recording with {REFERENCE_TOPIC} in {data}')
-    groups = [(path, method) for path in paths for method in METHODS]
-    *results, whole = parallel(run_window, [
-        *([(path, start, LENGTH, _config_of(path, method)) for start in np.arange(
+    names = [f'{load(path).name}, {method}' for path in paths for method in METHODS]
+    *windows, whole = parallel(run_window, [
+        *([(path, start, LENGTH, _config_of(path, method), 1.0) for start in np.arange(
             0.0, max(load(path).duration - SHORTEST, 0.0) + 1e-6, STEP).tolist()]
-          for path, method in groups),
-        [(path, 0.0, load(path).duration, {}) for path in paths]], jobs, 'windows')
-    windows: Windows = {load(path).name: {} for path in paths}
-    for (path, method), each in zip(groups, results):
-        windows[load(path).name][method] = each
+          for path in paths for method in METHODS),
+        [(path, 0.0, load(path).duration, {}, 1.0) for path in paths]], jobs, 'windows')
+    groups = dict(zip(names, windows))
     report.text(
         f'An alignment starts every {STEP:g} s and runs for up to {LENGTH:g} s with the defaults '
         '(preset mems), the car with its lever arm. note: vif with free_start false; centred: '
         'vif; both are pif where there are no velocities. Errors of the current attitude against '
-        'the reference, in sigmas with that of the reference in quadrature.')
-    report.text(targets_text([window for methods in windows.values()
-                              for window in methods['bank']]))
-    rows = [(f'{name}, {method}', each) for name, methods in windows.items()
-            for method, each in methods.items()]
+        'the reference, in sigmas with that of the reference in quadrature. Targets of the bank: '
+        'of the declared 99 % within 3 sigma, none beyond 5, with a median heading error of 1 deg '
+        f'(UAV, car) and 3 deg (quadrotor); 90 % of the windows with real motion within '
+        f'{MOTION_TIME:g} s.')
+    every = [each for name, group in groups.items() for each in group if name.endswith('bank')]
     report.table(
         f'At the declaration: median / worst. in {MOTION_TIME:g} s: windows with real motion '
         f'(by {MOTION_SPEED:g} m/s in that time) that declare. Then all epochs while ALIGNED',
-        rows, DECLARED_COLUMNS)
+        [*groups.items(), ('all, bank', every)], DECLARED_COLUMNS)
     report.table(
         'Errors in deg: median / worst, declared or not; sigmas: of the heading; course: that '
         'over ground, above 1 m/s, taken for it. Windows with real motion; all if none has', [
-            (name, [window for window in each if window.moves] or each) for name, each in rows],
-        [*NAMES, *itertools.chain(*map(columns_at, TIMES))])
+            (name, [each for each in group if each['moves']] or group)
+            for name, group in groups.items()],
+        [*ALIGNED_COLUMNS[:2], *(
+            (f'{title} at {time:g} s', '', _both(lambda run, time=time: run['at'].get(
+                f'{time:g}', ()), name)) for time in TIMES for title, name in (
+                    ('heading', 'heading_deg'), ('tilt', 'tilt_deg'), ('sigmas', 'heading_sigmas'),
+                    ('course', 'course_deg')))])
     report.table('Whole recordings, bank: every epoch while ALIGNED', [
-        (load(path).name, [window]) for path, window in zip(paths, whole)], [
-            *NAMES, ('after, s', '.0f', lambda row: row[1][0].declared_s),
-            ('of all, %', '.0f', lambda row: 100 * np.mean(row[1][0].aligned)),
-            ('at the end', '', lambda row: bool(row[1][0].aligned[-1])), *HELD_COLUMNS])
-    report.figure(figure(windows), '', 'Heading error of the bank in all windows against time; '
-                                       'declared parts drawn dark')
-    return {name: {method: [window_json(window) for window in each]
-                   for method, each in methods.items()} for name, methods in windows.items()}
+        (load(path).name, [each]) for path, each in zip(paths, whole)], [
+            ALIGNED_COLUMNS[0], *ALIGNED_COLUMNS[3:4], *ALIGNED_COLUMNS[-2:], *HELD_COLUMNS])
+    return {**groups, 'whole': whole}
 
 
 def _config_of(path: Path, method: str) -> JsonDict:
@@ -264,113 +232,44 @@ def _config_of(path: Path, method: str) -> JsonDict:
     return config | {'method': 'pif'} if config['method'] == 'vif' and not known else config
 
 
-def targets_text(windows: list[Window]) -> str:
-    """Say how much of the declared was right and how much was declared soon."""
-    sigmas = np.array(_values(declarations(windows), 'worst'))
-    soon, moving = _soon(windows)
-    return (
-        f'bank: of {len(sigmas)} declared, {np.sum(sigmas <= 3)} are within 3 sigma '
-        f'({100 * np.sum(sigmas <= 3) / max(len(sigmas), 1):.0f} %, target 99 %), '
-        f'{np.sum(sigmas > 5)} beyond 5 (target none); of {moving} windows with real motion, '
-        f'{soon} declare within {MOTION_TIME:g} s ({100 * soon / max(moving, 1):.0f} %, target '
-        '90 %). Target of the median heading error then: 1 deg (UAV, car), 3 deg (quadrotor).')
+# Columns of tables, whose rows are a name and the runs of its windows
+
+def _both(moments_of: Callable[[JsonDict], list[JsonDict]], name: str) -> Callable[[Any], Any]:
+    """Return the median and the largest value of moments."""
+    def cell(group: tuple[str, list[JsonDict]]) -> str | None:
+        values = [moment[name] for run in group[1] for moment in moments_of(run)
+                  if moment[name] is not None]
+        return f'{np.median(values):.2g} / {np.max(values):.2g}' if values else None
+
+    return cell
 
 
-# Tables, whose rows are a name and its windows
-
-def declarations(windows: list[Window]) -> Chosen:
-    """Return the epochs of first declarations."""
-    return [(window, int(np.argmax(window.aligned))) for window in windows
-            if window.aligned.any()]
-
-
-def epochs_at(windows: list[Window], time: float) -> Chosen:
-    """Return the last epoch up to a time of the windows that do not end before it."""
-    return [(window, max(int(np.searchsorted(window.time, time + 1e-6)) - 1, 0))
-            for window in windows if len(window.time) and window.time[-1] >= time - 1.5]
-
-
-VALUES: dict[str, Callable[[Window, int], float]] = {
-    'heading, deg': lambda window, k: abs(window.error_deg[k, 2]),
-    'heading, sigma': lambda window, k: window.sigmas[k, 1],
-    'tilt, deg': lambda window, k: np.hypot(*window.error_deg[k, :2]),
-    'tilt, sigma': lambda window, k: window.sigmas[k, 0],
-    'worst': lambda window, k: window.sigmas[k].max(),
-    'course': lambda window, k: abs(window.course_deg[k])}
-
-
-def _values(chosen: Chosen, name: str) -> list[float]:
-    return [value for each in chosen if math.isfinite(value := VALUES[name](*each))]
-
-
-def _both(values: list[float]) -> str | None:
-    """Return the median and the largest of values."""
-    return f'{np.median(values):.2g} / {np.max(values):.2g}' if values else None
-
-
-def _soon(windows: list[Window]) -> tuple[int, int]:
+def _soon(group: tuple[str, list[JsonDict]]) -> str:
     """Count the windows with real motion that declare within a minute, and all of them."""
-    moving = [window for window in windows if window.moves and window.covers_minute]
-    return sum(window.declared_s is not None and window.declared_s <= MOTION_TIME
-               for window in moving), len(moving)
+    times = [[first['t_s'] for first in run['first']] for run in group[1]
+             if run['moves'] and run['covers_minute']]
+    return f'{sum(each[0] <= MOTION_TIME for each in times if each)}/{len(times)}'
 
 
-def _held(windows: list[Window]) -> Array:
-    """Return the errors of all epochs while ALIGNED, sigmas."""
-    return np.concatenate([window.sigmas[window.aligned].max(axis=1, initial=0.0)
-                           for window in windows])
+def _part(group: tuple[str, list[JsonDict]], place: int) -> float | None:
+    """Return the part of epochs while ALIGNED that are beyond one of `BINS`, %."""
+    epochs = sum(run['epochs'] for run in group[1])
+    return 100 * sum(run['beyond'][place] for run in group[1]) / epochs if epochs else None
 
 
-NAMES: list[Column] = [('recording, method', '', lambda row: row[0]),
-                       ('windows', '', lambda row: len(row[1]))]
 HELD_COLUMNS: list[Column] = [
-    ('epochs', '', lambda row: len(_held(row[1]))),
-    *((f'> {limit:g} sigma, %', '.1f', lambda row, limit=limit: (
-        100 * np.mean(held > limit) if len(held := _held(row[1])) else None)) for limit in BINS),
-    ('worst, sigma', '.1f', lambda row: most(_held(row[1])))]
+    ('epochs', '', lambda group: sum(run['epochs'] for run in group[1])),
+    *((f'> {limit:g} sigma, %', '.1f', lambda group, place=place: _part(group, place))
+      for place, limit in enumerate(BINS)),
+    next(column for column in ALIGNED_COLUMNS if column[0] == 'worst, sigma')]
 DECLARED_COLUMNS: list[Column] = [
-    *NAMES, ('declared', '', lambda row: len(declarations(row[1]))),
-    ('after, s', '.0f', lambda row: median([
-        window.declared_s for window in row[1] if window.declared_s is not None])),
-    ('in 60 s', '', lambda row: '/'.join(map(str, _soon(row[1])))),
-    *((name, '', lambda row, name=name: _both(_values(declarations(row[1]), name)))
-      for name in ('heading, deg', 'heading, sigma', 'tilt, deg', 'tilt, sigma')),
-    *((f'> {limit:g}', '', lambda row, limit=limit: sum(
-        sigmas > limit for sigmas in _values(declarations(row[1]), 'worst'))) for limit in BINS),
+    *ALIGNED_COLUMNS[:3],
+    ('after, s', '.0f', lambda group: median([
+        first['t_s'] for run in group[1] for first in run['first']])),
+    ('in 60 s', '', _soon),
+    *((title, '', _both(lambda run: run['first'], name)) for title, name in (
+        ('heading, deg', 'heading_deg'), ('heading, sigma', 'heading_sigmas'),
+        ('tilt, deg', 'tilt_deg'), ('tilt, sigma', 'tilt_sigmas'))),
+    *((f'> {limit:g}', '', lambda group, limit=limit: beyond(
+        (worst(run['first']) for run in group[1]), limit)) for limit in BINS),
     *HELD_COLUMNS]
-
-
-def columns_at(time: float) -> list[Column]:
-    """Return the columns of the errors at a time."""
-    return [(f'{title} at {time:g} s', '', lambda row, name=name: _both(
-        _values(epochs_at(row[1], time), name))) for title, name in (
-            ('heading', 'heading, deg'), ('tilt', 'tilt, deg'), ('sigmas', 'heading, sigma'),
-            ('course', 'course'))]
-
-
-def figure(windows: Windows) -> Any:
-    """Draw heading errors of the bank over time, window by window."""
-    def lines_of(window: Window) -> list[tuple[Any, ...]]:
-        # Two a second are enough to see, ten make a large file.
-        k = np.flatnonzero(np.diff(np.floor(2.0 * window.time), prepend=-1.0))
-        error = np.abs(window.error_deg[k, 2])
-        return [(window.time[k], error, {'color': '#bbbbbb', 'linewidth': 0.5}),
-                (window.time[k], np.where(window.aligned[k], error, np.nan),
-                 {'color': '#CC79A7', 'linewidth': 0.7})]
-
-    return draw(12.0, 3.4 * len(windows) + 0.4, [[{
-        'title': f'{name}: bank, every window (declared: dark)',
-        'lines': itertools.chain(*map(lines_of, methods['bank'])),
-        'ylabel': 'heading error (deg)', 'yscale': 'log', 'ylim': (0.02, 200.0)}]
-        for name, methods in windows.items()])
-
-
-def window_json(window: Window) -> JsonDict:
-    """Return the numbers of a window that the tables are made of."""
-    return {
-        'start_s': window.start_s, 'moves': window.moves, 'declared_s': window.declared_s,
-        'worst_declared_sigmas': window.sigmas[window.aligned].max(axis=0)
-        if window.aligned.any() else None,
-        **{name: next(([*at.error_deg[k], *at.sigmas[k]] for at, k in chosen), None)
-           for name, chosen in (('declared', declarations([window])), *(
-               (f'{time:g} s', epochs_at([window], time)) for time in TIMES))}}

@@ -22,6 +22,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+import itertools
+from operator import itemgetter
 from typing import Any
 
 from ins_align.config import Config
@@ -125,36 +127,35 @@ class Stream:
         Kinds are the names of the arrays, 'update', 'reset', and 'reject' with the reason for a
         message that cannot be used.
         """
-        kinds = *SENSORS, 'update', 'reset'
-        arrivals = [*(getattr(self, name)['arrival'] for name in SENSORS),
-                    self.updates, np.array(self.resets, np.int64)]
-        lengths = [len(times) for times in arrivals]
-        order = np.argsort(np.concatenate(arrivals), kind='stable')
-        kind = np.repeat(range(len(kinds)), lengths)[order]
-        places = order - (np.cumsum(lengths) - lengths)[kind]
-        for block in np.split(np.arange(len(order)), np.flatnonzero(np.diff(kind)) + 1):
-            what = kind[block[0]]
-            size = self.lot if what == 0 else 1
-            for start in range(0, len(block), size):
-                chosen = places[block[start:start + size]]
-                yield (int(arrivals[what][chosen[-1]]),
-                       *self._payload(config, kinds[what], chosen))
+        fix = self.fix
+        payloads = {'fix': fixes(*(fix[name] for name in fix.dtype.names[1:])),
+                    'velocity': self._velocities(config),
+                    'update': [None] * len(self.updates), 'reset': [None] * len(self.resets)}
+        arrivals = {**{name: getattr(self, name)['arrival'] for name in SENSORS},
+                    'update': self.updates, 'reset': self.resets}
+        events = sorted(((int(time), kind, place) for kind, times in arrivals.items()
+                         for place, time in enumerate(times)), key=itemgetter(0))
+        for kind, block in itertools.groupby(events, itemgetter(1)):
+            times, _, places = zip(*block)
+            if kind == 'imu':
+                for start in range(0, len(places), self.lot):
+                    lot = self.imu[list(places[start:start + self.lot])]
+                    yield (int(lot['arrival'][-1]), kind,
+                           (lot['stamp'], lot['gyro'], lot['accel']))
+                continue
+            for time, place in zip(times, places):
+                payload = payloads[kind][place]
+                yield time, 'reject' if isinstance(payload, str) else kind, payload
 
-    def _payload(self, config: Config, kind: str, chosen: np.ndarray) -> tuple[str, Any]:
-        if kind not in SENSORS:
-            return kind, None
-        rows = getattr(self, kind)[chosen]
-        if kind == 'imu':
-            return kind, (rows['stamp'], rows['gyro'], rows['accel'])
-        if kind == 'fix':
-            return kind, fixes(rows['stamp'], rows['lla'], rows['covariance'],
-                               rows['covariance_type'], rows['status'])[0]
+    def _velocities(self, config: Config) -> list[Any]:
+        """Return velocities, or why each cannot be used."""
+        rows = self.velocity
         stated = None if config.velocity_type == 'TwistStamped' else rows['covariance']
         try:
-            return kind, velocities(rows['stamp'], str(rows['frame_id'][0]), rows['velocity'],
-                                    stated, config)[0]
+            return velocities(rows['stamp'], ''.join(set(rows['frame_id'])), rows['velocity'],
+                              stated, config)
         except MessageError:
-            return 'reject', 'velocity_body_frame'
+            return ['velocity_body_frame'] * len(rows)
 
 
 def stream_of(simulation: Simulation, lot: int = LOT) -> Stream:

@@ -30,15 +30,14 @@ from typing import Any, NamedTuple
 
 from ins_align.config import PRESETS
 from ins_align.experiments.cases import (
-    ALIGNED_COLUMNS, Case, Groups, run_case, while_aligned)
+    ALIGNED_COLUMNS, Case, Groups, run_case)
 from ins_align.experiments.common import BINS, JsonDict, parallel, Report
 from ins_align.experiments.spoilt import directions, GNSS, Random, SECOND, Stream
 from ins_align.geometry.rotation import Array
-from ins_align.offline import align
 import numpy as np
 
 DURATION = 90.0         # s, unless a case says otherwise
-RECORDING, STARTS = 'car_drive0708', (0.0, 100.0, 200.0, 300.0, 400.0)      # s
+RECORDING = 'car_drive0708'
 WINDOW, EVERY = 120.0, 10.0     # s of the recorded car in `vehicle`, from start to start
 MOUNT_STD_DEG = 1.0
 
@@ -340,8 +339,10 @@ VEHICLE_SPOTS = (
     _vehicle('towed 70 deg across', 'car', {**STREETS, 'crab_deg': 70.0}),
     _vehicle('on a ferry, 70 deg across, in waves', 'swing', {**STREETS, 'crab_deg': 70.0}),
 )
-RECORDED: tuple[JsonDict, ...] = ({}, {'vehicle': 'car'},
-                                  {'vehicle': 'car', 'heading_std_threshold': 2.0})
+RECORDED: dict[str, tuple[JsonDict, float]] = {
+    'none': ({}, 1.0), 'vehicle: car': ({'vehicle': 'car'}, 1.0),
+    'vehicle: car, heading_std_threshold: 2': (
+        {'vehicle': 'car', 'heading_std_threshold': 2.0}, 1.0)}
 
 
 # Runs
@@ -356,33 +357,33 @@ def draw(name: str, index: int) -> Case:
             stream, np.random.default_rng([6, index]))), spot.between)
 
 
-def recorded_car(data: Path | None) -> Path | None:
-    """Return the recording of the car if it is in the folder."""
-    return next(iter(sorted(data.glob(f'{RECORDING}*'))), None) if data else None
+def run_spots(spots: Sequence[Spot], runs: int, jobs: int | None) -> Groups:
+    """Run every spot so many times, or a part of them."""
+    return list(zip((spot.name for spot in spots), parallel(run_case, [
+        [(draw, spot.name, index) for index in range(max(1, runs // spot.part))]
+        for spot in spots], jobs, 'spots')))
 
 
-def run_recorded(path: Path, start_s: float, z_sign: float, config: JsonDict) -> JsonDict:
-    """Align a recording from some time to its end."""
-    from ins_align.experiments.recordings import load
+def run_recorded(data: Path | None, every_s: float, length_s: float, jobs: int | None,
+                 variants: dict[str, tuple[JsonDict, float]]) -> Groups:
+    """Align windows of the car, if it is recorded there, with parameters and a sign of gyro z."""
+    from ins_align.experiments.recordings import load, run_window
 
-    recording = load(path)
-    part = recording.part(start_s, recording.duration)
-    result = align(*part._replace(gyro=part.gyro * [1.0, 1.0, z_sign]), **recording.lever_arm,
-                   **config)
-    return {'start_s': start_s, 'state': result.status.state.value, **while_aligned(
-        result.epochs, int(part.stamps[0]), recording.attitudes_at, recording.reference_std_deg)}
+    path = next(iter(sorted(data.glob(f'{RECORDING}*'))), None) if data else None
+    if path is None:
+        return []
+    starts = np.arange(0.0, max(load(path).duration - every_s, 1.0), every_s).tolist()
+    return list(zip(variants, parallel(run_window, [
+        [(path, start, length_s, *variant) for start in starts] for variant in variants.values()],
+        jobs, 'recorded car')))
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``weak-spots``, and its cases of the recorded car if it is there."""
-    path = recorded_car(data)
     found = run_spots(SPOTS, runs, jobs)
-    if path is not None:
-        found += [(f'recorded car, {name}', [run_recorded(path, start, sign, config)
-                                             for start in STARTS])
-                  for name, sign, config in (
-                      ('lever arm told to 3 cm', 1.0, {'lever_arm_std': 0.03}),
-                      ('gyro z reversed', -1.0, {}))]
+    found += run_recorded(data, 100.0, 3600.0, jobs, {
+        'recorded car, lever arm told to 3 cm': ({'lever_arm_std': 0.03}, 1.0),
+        'recorded car, gyro z reversed': ({}, -1.0)})
     report.text(
         f'{runs} runs of each case, fewer where they are long, of {DURATION:g} s unless the case '
         'needs more. Car and flight in turn, or a hover, a throw, all of these; MEMS grade unless '
@@ -391,16 +392,16 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         f'first declaration, and at any time at which it was called ALIGNED; runs beyond '
         f'{BINS[0]:g} and {BINS[1]:g}, the seconds beyond {BINS[1]:g} of the longest, the worst '
         'error in sigmas and, of heading, in degrees, the part of the time at which it was '
-        'ALIGNED, and after how many seconds of data it was declared, the median.')
-    if path is None:
-        report.text('The recorded car is left out: --data DIR names the folder of it.')
+        'ALIGNED, and after how many seconds of data it was declared, the median. With --data DIR '
+        'that has it, the recorded car too.')
     report.table('Weak spots', found, ALIGNED_COLUMNS)
     return {'runs': runs, 'cases': dict(found)}
 
 
 def run_vehicle(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``vehicle``, and the recorded car if it is there."""
-    path = recorded_car(data)
+    from ins_align.experiments.recordings import DECLARED_COLUMNS
+
     found = run_spots(VEHICLE_SPOTS, runs, jobs)
     report.text(
         f'{runs} runs of each case, MEMS, GNSS velocity 0.1 m/s at 5 Hz, the mounting off by '
@@ -410,21 +411,8 @@ def run_vehicle(report: Report, runs: int, jobs: int | None, data: Path | None) 
         'contradicts `vehicle`.')
     report.table('Simulated', found, [*ALIGNED_COLUMNS, ('not used', '', lambda group: sum(
         'contradicts vehicle' in each['reason'] for each in group[1]))])
-    if path is not None:
-        from ins_align.experiments.recordings import DECLARED_COLUMNS, load, run_window
-
-        starts = np.arange(0.0, max(load(path).duration - EVERY, 0.0), EVERY)
-        windows = parallel(run_window, [[(path, start, WINDOW, config)
-                                         for start in starts.tolist()]
-                                        for config in RECORDED], jobs, 'recorded car')
-        report.table(f'The recorded car, started anew every {EVERY:g} s', [
-            (', '.join(f'{name}: {value}' for name, value in config.items()) or 'none', each)
-            for config, each in zip(RECORDED, windows)], DECLARED_COLUMNS)
-    return {'runs': runs, 'cases': dict(found)}
-
-
-def run_spots(spots: Sequence[Spot], runs: int, jobs: int | None) -> Groups:
-    """Run every spot so many times, or a part of them."""
-    return list(zip((spot.name for spot in spots), parallel(run_case, [
-        [(draw, spot.name, index) for index in range(max(1, runs // spot.part))]
-        for spot in spots], jobs, 'spots')))
+    recorded = run_recorded(data, EVERY, WINDOW, jobs, RECORDED)
+    if recorded:
+        report.table(f'The recorded car, started anew every {EVERY:g} s', recorded,
+                     DECLARED_COLUMNS)
+    return {'runs': runs, 'cases': dict(found), 'recorded': dict(recorded)}
