@@ -20,7 +20,7 @@ import math
 from ins_align import experiments
 from ins_align.aligner import Aligner, Attitude, State
 from ins_align.config import Config, PRESETS
-from ins_align.experiments import bound, cases, common, declare, note, recordings, weak_spots
+from ins_align.experiments import bound, common, declare, recordings, weak_spots
 from ins_align.experiments.spoilt import stream_of
 from ins_align.geometry.rotation import exp_so3, matrix_from_rpy
 from ins_align.simulation.simulate import simulate, write_bag
@@ -104,7 +104,7 @@ def test_every_combination_of_faults_is_drawn_once():
 def test_imus_worse_than_configured(tmp_path, monkeypatch):
     monkeypatch.setattr(declare, 'DURATION', 16.0)
     monkeypatch.setattr(declare, 'STAND_STILL', 0.0)
-    clean, again, noisy = (cases.run_case((declare.draw_worse, 5, faults, 'car'))
+    clean, again, noisy = (common.run_case((declare.draw_worse, 5, faults, 'car'))
                            for faults in ((), (), ('noise x 3',)))
     assert clean == again
     assert clean['levelled'][0]['tilt_sigmas'] < 5
@@ -118,7 +118,7 @@ def test_shares_beyond_the_limits():
     def result(sigma):
         return {'levelled': [{'t_s': 4.0, 'tilt_sigmas': sigma, 'heading_sigmas': 0.5,
                               'tilt_deg': 0.2, 'heading_deg': 0.7}]}
-    columns = cases.moment_columns('levelled')
+    columns = common.moment_columns('levelled')
 
     def cells(*sigmas):
         group = 'name', [*map(result, sigmas), {'levelled': []}]
@@ -134,16 +134,16 @@ def test_a_declared_run_is_judged_against_the_truth(monkeypatch):
     monkeypatch.setattr(declare, 'DURATION', 20.0)
     index = next(index for index, case in enumerate(map(declare.draw, range(500)))
                  if case[:2] == ('none', 'flight') and case.simulate['imu_grade'] == 'navigation')
-    result = cases.run_case((declare.draw, index))
+    result = common.run_case((declare.draw, index))
     assert result['state'] == State.ALIGNED.value
     for moment in ('levelled', 'declared', 'final'):
-        assert cases.worst(result[moment]) < 5
-    assert cases.worst(result['final'], 'heading') == result['final'][0]['heading_sigmas']
+        assert common.worst(result[moment]) < 5
+    assert common.worst(result['final'], 'heading') == result['final'][0]['heading_sigmas']
 
 
 def test_note_with_and_without_lever_arm(monkeypatch):
-    monkeypatch.setattr(note, 'DURATION', 12.0)
-    errors = {name: np.array([note.run_one(('navigation', name, seed)) for seed in range(3)])
+    monkeypatch.setattr(bound, 'DURATION', 12.0)
+    errors = {name: np.array([bound.run_variant(('navigation', name, seed)) for seed in range(3)])
               for name in ('not compensated', 'compensated', 'zero lever arm')}
     end = {name: error[:, -1] for name, error in errors.items()}
     assert common.rms(end['compensated'][:, 2]) < 1.0
@@ -153,7 +153,7 @@ def test_note_with_and_without_lever_arm(monkeypatch):
 
 
 def test_short_form_stays_below_its_limit():
-    time, remainder, limit, term, integral = note.remarks_of(100.0)
+    time, remainder, limit, term, integral = bound.remarks_of(100.0)
     assert np.all(remainder[1:] <= limit[1:])
     assert limit[-1] == pytest.approx(2 * 7.292115e-5 ** 2 * time[-1] * math.sqrt(3))
     assert integral[-1] > 100 * term[-1]
@@ -226,9 +226,9 @@ def test_weak_spots_are_judged_by_the_clock_of_the_imu():
         stream.stamp_imu(stream.imu['stamp'])
 
         def judged(turned=np.eye(3)):
-            epochs = list(itertools.chain(*cases.follow(
+            epochs = list(itertools.chain(*common.follow(
                 Aligner(common.config_for(s)), stream.messages(Config()))))
-            return epochs[-1].state, cases.while_aligned(
+            return epochs[-1].state, common.while_aligned(
                 epochs, stream.start_ns,
                 lambda stamps: turned @ s.attitude_at(stream.true_stamps(stamps)))
 
@@ -236,7 +236,7 @@ def test_weak_spots_are_judged_by_the_clock_of_the_imu():
         assert state is State.ALIGNED and 0.0 < result['worst_sigmas'] < 5.0
         assert result['beyond_s'] == 0.0 and 0.3 < result['aligned_part'] < 0.9
         _, wrong = judged(exp_so3(np.radians([0.0, 0.0, 20.0])))
-        assert cases.worst(wrong['first']) > 10.0 and 15.0 < wrong['worst_heading_deg'] < 25.0
+        assert common.worst(wrong['first']) > 10.0 and 15.0 < wrong['worst_heading_deg'] < 25.0
         assert wrong['beyond_s'] == pytest.approx(40.0 - wrong['declared_s'], abs=0.5)
 
 

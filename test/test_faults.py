@@ -18,7 +18,7 @@ import json
 
 from ins_align import experiments
 from ins_align.aligner import Aligner
-from ins_align.experiments import cases, faults
+from ins_align.experiments import common, faults
 import numpy as np
 import pytest
 
@@ -82,7 +82,7 @@ def spoil(monkeypatch, name, value):
     class Spoilt(Aligner):
         pass
     setattr(Spoilt, name, value)
-    monkeypatch.setattr(cases, 'Aligner', Spoilt)
+    monkeypatch.setattr(common, 'Aligner', Spoilt)
 
 
 def test_an_exception_is_seen(short, monkeypatch):
@@ -117,13 +117,13 @@ def test_a_message_that_is_not_counted_is_seen(short, monkeypatch):
 
 def test_a_wrong_declaration_is_seen(short):
     case = faults.draw(index_of('none'))
-    simulation, stream, aligner = cases.prepare(case)
-    epochs = list(itertools.chain(*cases.follow(aligner, stream.messages(aligner.config))))
-    right = cases.outcome(case, simulation, stream, aligner, epochs)
+    simulation, stream, aligner = common.prepare(case)
+    epochs = list(itertools.chain(*common.follow(aligner, stream.messages(aligner.config))))
+    right = common.outcome(case, simulation, stream, aligner, epochs)
     assert faults.error(right) < 5.0
     # The truth of a second later is not that of the stamp.
     stream.clock = (), (-1_000_000_000,)
-    result = cases.outcome(case, simulation, stream, aligner, epochs)
+    result = common.outcome(case, simulation, stream, aligner, epochs)
     assert faults.error(result) > 5.0
     assert result['beyond_s'] > 1.0
 

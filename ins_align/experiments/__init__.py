@@ -24,7 +24,7 @@ from pathlib import Path
 
 # Title, function and by default how many runs of each, in the order in which `all` runs them.
 NAMES = {
-    'note': ("The note's experiment", 'note.run', 100),
+    'note': ("The note's experiment", 'bound.run_note', 100),
     'bound': ('The estimator at the Cramer-Rao bound', 'bound.run', 100),
     'declare': ('Declared means right', 'declare.run', 1000),
     'declare-worse': ('IMUs worse than configured', 'declare.run_worse', 500),

@@ -12,10 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Experiment ``bound``: errors of `method: bank` against the Cramer-Rao bound, and its sigma.
+Experiments ``bound`` and ``note``: what an aligner that knows the very model reaches.
 
-The bound comes from the dense reference on the true motion. Errors are those of the attitude at
-t0 after so many seconds of data.
+``bound`` has the errors of `method: bank` against the Cramer-Rao bound, and its sigma. The bound
+comes from the dense reference on the true motion. ``note`` has the note's simulation with and
+without its lever-arm term, and its remarks. The note says of its set-up: lever arm [1 1 1] m, 100
+runs, the simulation of its predecessor, which it does not describe. Here: scenario `flight`,
+navigation grade, velocity 0.1 m/s at 5 Hz. Errors are those of the attitude at t0 after so many
+seconds of data.
 """
 
 from __future__ import annotations
@@ -28,7 +32,8 @@ from ins_align.aligner import Aligner
 from ins_align.experiments import dense
 from ins_align.experiments.common import (
     Column, draw, error_of, exact_config_for, field, GRADES, JsonDict, parallel, Report, rms)
-from ins_align.geometry.rotation import Array
+from ins_align.geometry.earth import EARTH_RATE, earth_rate_n, LocalLevel
+from ins_align.geometry.rotation import apply, Array, cross, roll_pitch_yaw, skew
 from ins_align.simulation.simulate import epochs_of, simulate
 import numpy as np
 
@@ -71,7 +76,7 @@ CASES = (
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
-    """Run every case and print ratios and normalised errors."""
+    """Run ``bound``: every case; print ratios and normalised errors."""
     [bounds] = parallel(bounds_of, [CASES], jobs, 'bounds')
     results = parallel(run_case, [
         [(case, seed) for seed in range(max(1, round(case.share * runs)))] for case in CASES],
@@ -100,7 +105,7 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
             field('stated sigma', 'nuisance_std', '.2g'),
             field('rms of error/sigma', 'nuisance_sigmas', '.2f')])
     report.figure(draw(11.0, 7.5, [[panel(summaries, scenario, angle) for scenario in (
-        'flight', 'car')] for angle in ('tilt', 'heading')], sharex=True), '',
+        'flight', 'car')] for angle in ('tilt', 'heading')], sharex=True),
         'Errors of the attitude at t0 (dots: rms; lines: Cramer-Rao bound), GNSS velocity')
     return {'runs': runs, 'times_s': TIMES, 'cases': summaries}
 
@@ -212,3 +217,173 @@ def panel(results: list[JsonDict], scenario: str, angle: str) -> JsonDict:
                       'color': colour, 'label': f'{grade}, rms error', 'marker': 'o',
                       'markersize': 5, 'linestyle': ''})]
     return {'title': f'{scenario}: {angle}', 'ylabel': 'deg', 'yscale': 'log', 'lines': lines}
+
+
+# The note
+
+DURATION = 100.0
+PEAK_FROM, PEAK_TO = 2.0, 20.0      # s, where the note's Fig. 1 has its lumps
+SHOWN_FROM = 3.0                    # s, larger errors before may lie outside of the figure
+REMARK_DURATION = 1000.0
+ANGLES = ('roll', 'pitch', 'heading')
+LEVER, NO_LEVER = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+# Name, lever arm of the vehicle, what the aligner is told beside the grade.
+VARIANTS: dict[str, tuple[tuple[float, ...], JsonDict]] = {
+    'not compensated': (LEVER, {'method': 'vif', 'free_start': False, 'lever_arm': NO_LEVER}),
+    'compensated': (LEVER, {'method': 'vif', 'free_start': False}),
+    'zero lever arm': (NO_LEVER, {'method': 'vif', 'free_start': False}),
+    'not compensated, free start': (LEVER, {'method': 'vif', 'lever_arm': NO_LEVER}),
+    'compensated, free start': (LEVER, {'method': 'vif'}),
+    'bank': (LEVER, {'method': 'bank'}),
+}
+NOTE_RUNS = (*(('navigation', name) for name in VARIANTS), ('mems', 'compensated'),
+             ('mems', 'compensated, free start'), ('mems', 'bank'))
+# Those of the figure, as in the note.
+SHOWN = {'not compensated': '#D55E00', 'compensated': '#0072B2', 'zero lever arm': '#009E73'}
+
+
+def run_note(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
+    """Run ``note``: all variants, navigation grade; some of them with MEMS too."""
+    report.text(
+        'Scenario `flight` (100 m/s, S-turns with 40 s period, oscillation of 2 to 3 deg about '
+        f'all axes), IMU 100 Hz, GNSS velocity 5 Hz, 0.1 m/s; lever arm {list(LEVER)} m; {runs} '
+        'runs. The note does not give its own set-up. Errors of the attitude at t0.')
+    errors = dict(zip(NOTE_RUNS, map(np.array, parallel(run_variant, [
+        [(*each, seed) for seed in range(runs)] for each in NOTE_RUNS], jobs, 'runs'))))
+    time = np.arange(errors['navigation', 'bank'].shape[1]) / 5.0
+    heading = [(f'{grade}: {name}', rms(each[..., 2], axis=0))
+               for (grade, name), each in errors.items()]
+    heading += [(f'{grade}: Cramer-Rao bound', heading_bound(grade))
+                for grade in ('navigation', 'mems')]
+    table = {name: {f'{t:g} s': each[np.argmin(np.abs(time - t))] for t in TABLE_TIMES}
+             for name, each in heading}
+    peaks = peaks_of(errors, time)
+    for title, numbers in (
+            ('Heading error, rms in deg. Without "free start" and bank: free_start false, the '
+             'note to the letter', table),
+            (f'Mean error, deg: largest from {PEAK_FROM:g} to {PEAK_TO:g} s, at {DURATION:g} s, '
+             'and largest difference early from that of zero lever arm with the same noise',
+             peaks)):
+        report.table(title, [{'variant': name, **row} for name, row in numbers.items()], [
+            field('variant', 'variant'),
+            *(field(name, name, '.2g') for name in next(iter(numbers.values())))])
+    none = errors['navigation', 'zero lever arm']
+    chance = np.max(np.std(none, axis=0, ddof=1)[early(time)], axis=0) / np.sqrt(len(none))
+    report.text(
+        "The note's Fig. 1 shows early peaks without compensation, gone with it, and compensated "
+        'like zero lever arm. What the noise alone leaves in these means (1 sigma): '
+        + ', '.join(f'{angle} {value:.2g}' for angle, value in zip(ANGLES, chance)) + ' deg.')
+    report.figure(mean_figure(errors, time), f'Mean errors of {runs} runs, method `vif` without '
+                  'free start, as in Fig. 1 of the note')
+    return {'runs': runs, 'rms_heading_deg': table, 'peak_deg': peaks,
+            'remark_2_1': remarks_text(report)}
+
+
+def run_variant(task: tuple[str, str, int]) -> Array:
+    """Return errors of roll, pitch, yaw, degrees, at every epoch, shape (K, 3)."""
+    grade, name, seed = task
+    lever, told = VARIANTS[name]
+    simulation = simulate('flight', imu_grade=grade, seed=seed, duration=DURATION,
+                          lever_arm=lever)
+    aligner = Aligner(exact_config_for(simulation, **told))
+    errors = np.full((len(simulation.gnss_stamps_ns), 3), np.nan)
+    for epoch in epochs_of(aligner, simulation):
+        if epoch.initial is not None:
+            rpy, true_rpy = (roll_pitch_yaw(C) for C in (
+                epoch.initial.C_nb, simulation.attitude_at(epoch.initial.stamp_ns)))
+            errors[np.searchsorted(simulation.gnss_stamps_ns, epoch.stamp_ns)] = np.degrees(
+                np.remainder(rpy - true_rpy + np.pi, 2 * np.pi) - np.pi)
+    return errors
+
+
+def heading_bound(grade: str) -> Array:
+    """Bound of the heading at every epoch, degrees."""
+    P = dense.bound(simulate('flight', imu_grade=grade, duration=DURATION)).covariance
+    return np.degrees(np.sqrt(P[:, 2, 2]))
+
+
+def early(time: Array) -> Array:
+    """Whether it is the time in which the note has its lumps."""
+    return (time >= PEAK_FROM) & (time <= PEAK_TO)
+
+
+def peaks_of(errors: dict[tuple[str, str], Array], time: Array) -> dict[str, dict[str, float]]:
+    """Return the largest mean errors early on, and how far they are from those of no lever arm."""
+    means = {name: np.mean(errors['navigation', name], axis=0) for name in SHOWN}
+    apart = {name: mean - means['zero lever arm'] for name, mean in means.items()}
+    return {name: {
+        f'{angle}{when}': np.max(np.abs(values[rows, axis]))
+        for when, values, rows in (('', mean, early(time)), (', end', mean, time == time[-1]),
+                                   (', apart', apart[name], early(time)))
+        for axis, angle in enumerate(ANGLES)} for name, mean in means.items()}
+
+
+def mean_figure(errors: dict[tuple[str, str], Array], time: Array) -> Any:
+    """Draw mean errors over time."""
+    means = {name: np.mean(errors['navigation', name], axis=0) for name in SHOWN}
+    shown = np.max([np.nanmax(np.abs(mean[time >= SHOWN_FROM]), axis=0)
+                    for mean in means.values()], axis=0)
+    return draw(8.0, 8.0, [[{
+        'title': '' if column else
+        f'mean alignment error (scaled to what is seen after {SHOWN_FROM:g} s)',
+        'ylabel': f'{angle} (deg)', 'ylim': 1.1 * shown[column] * np.array([-1.0, 1.0]),
+        'xlim': (0.0, DURATION), 'lines': [(time, mean[:, column], {
+            'color': SHOWN[name], 'label': name,
+            'linestyle': '--' if name == 'zero lever arm' else '-'})
+            for name, mean in means.items()]}]
+        for column, angle in enumerate(ANGLES)], sharex=True)
+
+
+def remarks_text(report: Report) -> JsonDict:
+    """Print how large the terms of Remarks 2.1 and 2.2 are."""
+    seconds, remainder, limit, term, integral = remarks_of(REMARK_DURATION)
+    share = np.max(remainder[1:] / limit[1:])
+    moments = [(t, np.searchsorted(seconds, t)) for t in (1.0, 10.0, 100.0)]
+    report.text(
+        f'Remark 2.1: over {REMARK_DURATION:g} s the short form of (9) misses at most '
+        f'{remainder.max():.2g} m/s; the limit 2 W^2 t |l| is {limit[-1]:.2g} m/s at the end; the '
+        f'remainder is at most {share:.2f} of it. Remark 2.2: after '
+        + ', '.join(f'{t:g} s the lever-arm term is {term[k]:.2g} m/s, the integral '
+                    f'{integral[k]:.3g} m/s' for t, k in moments) + '.')
+    return {'largest_m_s': remainder.max(), 'limit_at_end_m_s': limit[-1],
+            'largest_share_of_limit': share}
+
+
+def remarks_of(duration: float) -> tuple[Array, Array, Array, Array, Array]:
+    """
+    Terms of (9) on the true motion, five arrays (N,).
+
+    Time, s; then, m/s: what the short form leaves out, its limit, the lever-arm term, the integral
+    of the specific force.
+    """
+    truth = simulate('flight', ideal=True, duration=duration, gnss_rate=1.0)
+    time = (truth.truth_stamps_ns - truth.truth_stamps_ns[0]) * 1e-9
+    lever_b, C_nb = np.array(LEVER), truth.truth_C_nb
+    latitude, longitude = np.radians(truth.truth_lla[:, :2]).T
+    C_b0b = C_nb[0].T @ LocalLevel(latitude[0], longitude[0]).matrix(
+        time, latitude, longitude) @ C_nb
+    omega_ie_n = earth_rate_n(latitude)
+    omega_eb_b = truth.truth_gyro - np.einsum('nji,nj->ni', C_nb, omega_ie_n)
+    remainder = exact_lever_remainder(time, C_b0b, omega_eb_b, C_nb[0].T @ omega_ie_n[0],
+                                      lever_b)
+    turned = apply(C_b0b, cross(truth.truth_gyro, lever_b))
+    integral = dense.cumulative(time, apply(C_b0b, truth.truth_accel))
+    return (time, np.linalg.norm(remainder, axis=1),
+            2 * EARTH_RATE ** 2 * time * np.linalg.norm(lever_b),
+            np.linalg.norm(turned - turned[0], axis=1), np.linalg.norm(integral, axis=1))
+
+
+def exact_lever_remainder(time: Array, C_b0b: Array, omega_eb_b: Array, omega_ie_b0: Array,
+                          lever_b: Array) -> Array:
+    """
+    Difference of the exact form of (9) from the short one: the oracle of Remark 2.1.
+
+    For times (N,) from t0 on, attitudes to t0 (N, 3, 3), rates to the Earth (N, 3), the Earth rate
+    in b0 and the lever arm (3,) in SI units; (N, 3), m/s, at most ``W^2 t |lever|``.
+    """
+    rate = skew(omega_eb_b)
+    omega_ie_b = C_b0b.transpose(0, 2, 1) @ omega_ie_b0
+    exact = C_b0b @ rate - rate[0] + skew(omega_ie_b0) @ dense.cumulative(time, C_b0b @ rate)
+    omega_ib_b = omega_eb_b + omega_ie_b
+    short = C_b0b @ skew(omega_ib_b) - skew(omega_ib_b[0])
+    return (exact - short) @ lever_b

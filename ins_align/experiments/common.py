@@ -11,11 +11,18 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What the experiments share: processes, errors against truth, tables and pages."""
+"""
+What the experiments share: cases and their runs, errors against truth, tables and pages.
+
+A case is a simulated vehicle whose messages are spoilt, aligned and judged against the truth.
+Every campaign draws cases from numbers, `run_case` runs them in the same way, and its tables have
+a row for all runs of a name.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 import io
 import itertools
 import json
@@ -23,13 +30,14 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
+from ins_align.experiments.spoilt import LOT, Message, SECOND, SENSORS, Stream, stream_of
 from ins_align.geometry.rotation import Array, log_so3
 from ins_align.outputs import write_whole
 from ins_align.processes import pool, processors
 from ins_align.report import format_table, new_figure
-from ins_align.results import Attitude
-from ins_align.simulation.simulate import Simulation
+from ins_align.simulation.simulate import give, simulate, Simulation
 import numpy as np
 
 # Of simulated data nothing comes late, but an unknown delay wants IMU samples beyond the stamp.
@@ -37,9 +45,15 @@ LATENESS = 0.5
 GRADES = ('navigation', 'tactical', 'mems')
 BINS = (3.0, 5.0)       # sigmas that are counted
 COLOURS = 64            # of a figure
+UPDATE_EVERY = 5.0      # s
+LONGEST = 5.0           # s that an epoch stands for
+BETWEEN_LOT = 7         # IMU samples given at once where attitudes between epochs are judged
+ANGLES = ('tilt', 'heading')
 
 JsonDict = dict[str, Any]
 Column = tuple[str, str, Callable[[Any], Any]]  # title, format, and the value of a row's object
+Truth = Callable[[list[int]], Sequence[Any]]    # ``C_nb`` at stamps, None where it is not known
+Groups = list[tuple[str, list[JsonDict]]]       # names and their runs
 
 
 def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jobs: int | None,
@@ -66,6 +80,84 @@ def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jo
                                     chunksize=max(1, min(10, len(every) // (4 * jobs)))))
 
 
+# Runs
+
+class Case(NamedTuple):
+    """One run: what is simulated, how its messages are spoilt, what is configured."""
+
+    name: str                       # the row of a table
+    scenario: str
+    simulate: JsonDict              # arguments of `simulate`
+    config: JsonDict = {}           # parameters of `Config` in place of the truth
+    spoil: Callable[[Stream], Any] | None = None
+    between: bool = False           # attitudes between epochs are judged, instead of those there
+
+
+def combination(index: int, seed: Sequence[int], *axes: Iterable[Any]) -> Any:
+    """Return one of the combinations of `axes`; each comes once before any comes twice."""
+    combinations = list(itertools.product(*axes))
+    turn, place = divmod(index, len(combinations))
+    order = np.random.default_rng([*seed, turn]).permutation(len(combinations))
+    return combinations[order[place]]
+
+
+def setup(random: np.random.Generator) -> JsonDict:
+    """Draw heading, latitude, lever arm and mount as arguments of `simulate`."""
+    return {'heading_deg': random.uniform(-180, 180), 'latitude_deg': random.uniform(-75, 75),
+            'lever_arm': random.uniform(-1.5, 1.5, 3).tolist(),
+            'mount_rpy_deg': random.uniform(-20, 20, 3).tolist()}
+
+
+def run_case(task: Sequence[Any]) -> JsonDict:
+    """Run what a function draws, the task being the function and its arguments; judge it."""
+    case = task[0](*task[1:])
+    simulation, stream, aligner = prepare(case)
+    looks = follow(aligner, stream.messages(aligner.config), between=case.between)
+    return outcome(case, simulation, stream, aligner, list(itertools.chain(*looks)))
+
+
+def prepare(case: Case) -> tuple[Simulation, Stream, Aligner]:
+    """Simulate, spoil the messages, and configure an aligner for what is left of the truth."""
+    simulation = simulate(case.scenario, **case.simulate)
+    stream = stream_of(simulation, BETWEEN_LOT if case.between else LOT)
+    if case.spoil is not None:
+        case.spoil(stream)
+    return simulation, stream, Aligner(config_for(simulation, **{**stream.config, **case.config}))
+
+
+def follow(aligner: Aligner, sent: Iterable[Message], every_s: float = UPDATE_EVERY,
+           between: bool = False) -> Iterator[list[Epoch]]:
+    """
+    Give an aligner messages in the order of arrival, and yield the epochs of each update.
+
+    An update without epochs yields what the status says, as an epoch without GNSS, so that silence
+    counts. Updates come every so often, with messages 'update' and 'reset', and at the end;
+    `between`: after every message, with the attitude now instead of epochs.
+    """
+    due = 0.0 if math.isfinite(every_s) else math.inf
+    for now, kind, payload in sent:
+        if kind in SENSORS:
+            give(aligner, kind, payload)
+        elif kind == 'reject':
+            aligner.reject(payload)
+        if between or now >= due or kind in ('update', 'reset'):
+            yield _epochs(aligner, aligner.update(), between)
+            due = now + every_s * SECOND
+        if kind == 'reset':
+            aligner.reset()
+    yield _epochs(aligner, aligner.flush(), between)
+
+
+def _epochs(aligner: Aligner, epochs: list[Epoch], between: bool) -> list[Epoch]:
+    stamp_ns = aligner.newest_imu_ns
+    if stamp_ns is None or (epochs and not between):
+        return epochs
+    status = aligner.status()
+    return [Epoch(stamp_ns, math.nan, status.state, status.initial,
+                  aligner.attitude_now() if between else status.current, np.full(3, np.nan),
+                  status.gyro_bias, status.accel_bias, dry=True)]
+
+
 def config_for(simulation: Simulation, **changes: Any) -> Config:
     """Return the defaults with a simulation's IMU grade and lever arm."""
     return Config(**{'lever_arm': tuple(simulation.lever_arm.tolist()), 'gnss_lateness': LATENESS,
@@ -83,6 +175,8 @@ def exact_config_for(simulation: Simulation, **changes: Any) -> Config:
         'rate_random_walk': 60 * math.degrees(noise.rate_random_walk),
         'lever_arm_std': 0.0, 'gnss_delay_std': 0.0, **changes})
 
+
+# How they are judged
 
 class Error(NamedTuple):
     """Error of an attitude against the truth."""
@@ -117,10 +211,85 @@ def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Any = 0.0) -> Err
                  float(np.max(sigmas[:2])), float(sigmas[2]))
 
 
-def field(title: str, name: str, digits: str = '') -> Column:
-    """Return the column of what rows, which are dictionaries, have under a name."""
-    return title, digits, lambda row: row[name]
+def outcome(case: Case, simulation: Simulation, stream: Stream, aligner: Aligner,
+            epochs: list[Epoch]) -> JsonDict:
+    """Return which run it was, how it ended, and how right it was."""
+    status = aligner.status()
 
+    def true(stamps: list[int]) -> Array:
+        return simulation.attitude_at(stream.true_stamps(stamps))
+
+    return {'name': case.name, 'scenario': case.scenario, 'imu': aligner.config.imu_grade,
+            'seed': case.simulate['seed'], 'state': status.state.value, 'reason': status.reason,
+            'counts': {name: count for name, count in status.counts.items() if count},
+            'least_heading_sigma_deg': min((epoch.initial.sigma_deg[2] for epoch in epochs
+                                            if epoch.initial is not None), default=None),
+            **moments(epochs, true), **while_aligned(epochs, stream.start_ns, true)}
+
+
+def moments(epochs: Iterable[Epoch], true: Truth) -> JsonDict:
+    """
+    Judge the first epoch that is levelled, every declaration, the last epoch if it is aligned.
+
+    The errors are the larger ones of the attitude at t0 and the current one. Lists, empty where
+    there was none.
+    """
+    epochs = [epoch for epoch in epochs if not epoch.dry]
+    aligned = [epoch.state is State.ALIGNED for epoch in epochs]
+    chosen = {
+        'levelled': [epoch for epoch in epochs
+                     if epoch.state in (State.LEVELLED, State.ALIGNED)][:1],
+        'declared': [epoch for epoch, before, now in zip(epochs, [False, *aligned], aligned)
+                     if now and not before],
+        'final': epochs[-1:] if any(aligned[-1:]) else []}
+    return {name: [moment(epoch.t_s, errors_of([epoch.initial, epoch.current], true))
+                   for epoch in each if epoch.initial is not None and epoch.current is not None]
+            for name, each in chosen.items()}
+
+
+def moment(t_s: float, errors: list[Error | None]) -> JsonDict:
+    """Return a time, s since t0, and the largest errors of tilt and heading."""
+    return {'t_s': t_s, **{name: max(getattr(error, name) for error in errors) for name in (
+        'tilt_sigmas', 'heading_sigmas', 'tilt_deg', 'heading_deg')}}
+
+
+def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth, std_deg: Any = 0.0,
+                  times: Iterable[float] = ()) -> JsonDict:
+    """
+    Judge the current attitude whenever it is called aligned, and after some times since t0.
+
+    `std_deg` (3,) says how well the truth is known; `start_ns` is the stamp of the first sample.
+    """
+    stamps = np.array([epoch.stamp_ns for epoch in epochs], np.int64)
+    held = np.clip(np.diff(stamps, append=stamps[-1:]) / SECOND, 0.0, LONGEST)
+    known = [k for k, epoch in enumerate(epochs) if epoch.current is not None]
+    errors = {k: error for k, error in zip(known, errors_of(
+        [epochs[k].current for k in known], true, std_deg)) if error is not None}
+    aligned = [k for k in errors if epochs[k].state is State.ALIGNED]
+    sigmas = {k: errors[k].worst_sigmas for k in aligned}
+    last_s = max((epochs[k].t_s for k in errors), default=-math.inf)
+    at = {f'{time:g}': [moment(epochs[k].t_s, [errors[k]]) for k in [
+        k for k in errors if epochs[k].t_s <= time + 1e-6][-1:]]
+        for time in times if last_s >= time - 1.5}
+    return {'first': [moment(epochs[k].t_s, [errors[k]]) for k in aligned[:1]],
+            'declared_s': next(((stamps[k] - start_ns) / SECOND for k in aligned), None),
+            'epochs': len(aligned), 'worst_sigmas': most(sigmas.values()),
+            'worst_heading_deg': most(errors[k].heading_deg for k in aligned),
+            'beyond': [beyond(sigmas.values(), limit) for limit in BINS],
+            'beyond_s': np.sum(held[[k for k in aligned if sigmas[k] > BINS[1]]]),
+            'aligned_part': np.sum(held[[
+                k for k in known if epochs[k].state is State.ALIGNED]]) / max(np.sum(held), 1e-9),
+            'at': at}
+
+
+def errors_of(attitudes: list[Any], true: Truth, std_deg: Any = 0.0) -> list[Error | None]:
+    """Compare attitudes with the truth; None where that is not known."""
+    truths = true([attitude.stamp_ns for attitude in attitudes]) if attitudes else ()
+    return [None if C_true is None else error_of(attitude, C_true, std_deg)
+            for attitude, C_true in zip(attitudes, truths)]
+
+
+# Tables, figures and pages; rows of a table are a name and its runs, or dictionaries
 
 def most(values: Iterable[float]) -> float | None:
     """Return the largest value, None if there is none."""
@@ -135,6 +304,76 @@ def median(values: Any) -> float | None:
 def rms(values: Any, axis: Any = None) -> Any:
     """Root mean square."""
     return np.sqrt(np.mean(np.square(values), axis=axis))
+
+
+def field(title: str, name: str, digits: str = '') -> Column:
+    """Return the column of what rows, which are dictionaries, have under a name."""
+    return title, digits, lambda row: row[name]
+
+
+def groups_of(runs: list[JsonDict], names: Iterable[str]) -> Groups:
+    """Group runs by name; the last group is all."""
+    return [*((name, [run for run in runs if run['name'] == name]) for name in names),
+            ('all', runs)]
+
+
+def worst(moments: Iterable[JsonDict], *angles: str) -> float | None:
+    """Return the largest error of judged moments in sigmas, of some of `ANGLES` or all."""
+    return most(moment[f'{angle}_sigmas'] for moment in moments for angle in angles or ANGLES)
+
+
+def beyond(values: Iterable[float | None], limit: float) -> int:
+    """Count values above a limit."""
+    return sum(value is not None and value > limit for value in values)
+
+
+def count(values: Iterable[Any]) -> int:
+    """Count what there is."""
+    return sum(map(bool, values))
+
+
+def over(title: str, name: str, value: Callable[[list[Any]], Any], digits: str = '') -> Column:
+    """Return the column of a value of what the runs of a row have under a name, if not None."""
+    return title, digits, lambda group: value(
+        [run[name] for run in group[1] if run[name] is not None])
+
+
+WHICH: list[Column] = [('case', '', lambda group: group[0]),
+                       ('runs', '', lambda group: len(group[1]))]
+
+
+def moment_columns(name: str) -> list[Column]:
+    """Return how many runs came to a moment, when, and how wrong each angle was."""
+    def first(title: str, value: Callable[[list[JsonDict]], Any], digits: str = '') -> Column:
+        return over(title, name, lambda found: value([each[0] for each in found if each]), digits)
+
+    def share(found: list[JsonDict], angle: str, limit: float) -> str | None:
+        wrong = beyond((moment[f'{angle}_sigmas'] for moment in found), limit)
+        return f'{wrong} ({100 * wrong / len(found):.1f} %)' if found else None
+
+    columns = [*WHICH, first('declared', len),
+               first('median, s', lambda found: median([each['t_s'] for each in found]), '.1f')]
+    for angle in ANGLES:
+        columns += [first(f'{angle} beyond {limit:g}', partial(share, angle=angle, limit=limit))
+                    for limit in BINS]
+        columns += [first(f'worst {angle}, sigma', lambda found, angle=angle: worst(found, angle),
+                          '.1f'),
+                    first(f'{angle}, deg', lambda found, angle=angle: most(
+                        each[f'{angle}_deg'] for each in found), '.2g')]
+    return columns
+
+
+ALIGNED_COLUMNS: list[Column] = [
+    *WHICH, over('declared', 'first', count),
+    over('at the end', 'state', lambda states: states.count(State.ALIGNED.value)),
+    over('declared beyond 3', 'first', lambda found: beyond(map(worst, found), BINS[0])),
+    *(over(f'beyond {limit:g}', 'worst_sigmas', partial(beyond, limit=limit)) for limit in BINS),
+    ('beyond 5, s', '.1f', lambda group: most(run['beyond_s'] for run in group[1]
+                                              if run['first'])),
+    over('worst, sigma', 'worst_sigmas', most, '.1f'),
+    over('heading, deg', 'worst_heading_deg', most, '.2g'),
+    over('aligned, %', 'aligned_part', lambda parts: 100 * np.mean(parts), '.0f'),
+    over('after, s', 'declared_s', median, '.1f')]
 
 
 class Report:
@@ -160,11 +399,11 @@ class Report:
         self._parts.append(f'{title}\n\n```text\n{table}\n```' if rows else f'{title}: none.')
         print(f'{title}\n\n{table}\n', flush=True)
 
-    def figure(self, figure: Any, suffix: str, caption: str) -> None:
+    def figure(self, figure: Any, caption: str) -> None:
         """Write a figure as PNG and refer to it."""
         from PIL import Image
 
-        file = f'{self._name}{suffix}.png'
+        file = f'{self._name}.png'
         drawn = io.BytesIO()
         figure.savefig(drawn, dpi=110)
         # A palette makes the files of the documentation a third as large.

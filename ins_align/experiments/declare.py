@@ -30,10 +30,9 @@ from typing import Any
 
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config, PRESETS
-from ins_align.experiments.cases import (
-    beyond, Case, combination, groups_of, moment_columns, run_case, setup, worst)
 from ins_align.experiments.common import (
-    BINS, config_for, exact_config_for, field, GRADES, JsonDict, most, parallel, Report)
+    beyond, BINS, Case, combination, config_for, count, exact_config_for, field, GRADES, groups_of,
+    JsonDict, moment_columns, most, over, parallel, Report, run_case, setup, WHICH, worst)
 from ins_align.experiments.dense import bound
 from ins_align.simulation.simulate import epochs_of, SCENARIOS, simulate
 import numpy as np
@@ -77,18 +76,14 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         'it is levelled wrongly until the vehicle turns or changes speed. Of the '
         f'{len(upset)} with a tilt beyond {BINS[1]:g} sigma, '
         f"{sum(each['state'] == State.LEVELLED.value for each in upset)} are still LEVELLED at "
-        f"the end, and {sum(bool(each['declared']) for each in upset)} were ever ALIGNED.")
+        f"the end, and {count(each['declared'] for each in upset)} were ever ALIGNED.")
     report.table(f'MEMS for {SILENT_DURATION:g} s without a change of velocity', [
         (name, [each for each in silent if each['scenario'] == name]) for name in SILENT], [
-            ('scenario', '', lambda group: group[0]), ('runs', '', lambda group: len(group[1])),
-            ('heading declared', '', lambda group: sum(bool(each['declared'])
-                                                       for each in group[1])),
-            ('level declared', '', lambda group: sum(bool(each['levelled'])
-                                                     for each in group[1])),
-            ('worst tilt, sigma', '.1f', lambda group: most(
-                worst(each['levelled'], 'tilt') or 0.0 for each in group[1])),
-            ('least heading sigma, deg', '.1f', lambda group: min(
-                each['least_heading_sigma_deg'] for each in group[1]))])
+            *WHICH, over('heading declared', 'declared', count),
+            over('level declared', 'levelled', count),
+            over('worst tilt, sigma', 'levelled', lambda found: most(
+                worst(each, 'tilt') for each in found if each), '.1f'),
+            over('least heading sigma, deg', 'least_heading_sigma_deg', min, '.1f')])
     time_table(report, waits)
     return {'runs': found, 'silent': silent, 'time_to_heading': waits}
 

@@ -23,16 +23,15 @@ from __future__ import annotations
 import math
 from pathlib import Path
 import pickle
-import resource
 import traceback
 from typing import Any
 import warnings
 
 from ins_align.aligner import Aligner, Epoch
 from ins_align.config import Config
-from ins_align.experiments.cases import (
-    beyond, Case, combination, follow, groups_of, outcome, prepare, setup, worst)
-from ins_align.experiments.common import BINS, Column, GRADES, JsonDict, most, parallel, Report
+from ins_align.experiments.common import (
+    beyond, BINS, Case, Column, combination, count, follow, GRADES, groups_of, JsonDict, most,
+    outcome, over, parallel, prepare, Report, setup, WHICH, worst)
 from ins_align.experiments.spoilt import FAULTS, Random, SECOND, SENSORS, Stream, turn_to_ned
 from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
@@ -56,14 +55,14 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         'lever arm, velocity message and frame. The fault is in the messages; nothing is told to '
         'the aligner but what the name of the fault says. Samples come one by one or many at a '
         'time.')
+    broke = {what: count(each[what] for each in found)
+             for what in ('exception', 'non_finite', 'miscounted', 'warnings')}
     report.text(
-        f"{count(found, 'exception')} runs ended with an exception, "
-        f"{count(found, 'non_finite')} gave a number that is not finite or an attitude that is "
-        f"no rotation, in {count(found, 'miscounted')} the counters do not fit what was sent, "
-        f"{count(found, 'warnings')} made numpy warn (target: none). An aligner "
-        f"never held more than {max(each['held'] for each in found) * 1e-6:.2f} MB (pickled, "
-        f'every {WEIGH_EVERY} updates; limit {MAX_HELD * 1e-6:g}); the processes that ran them '
-        f"grew to {max(each['resident_kb'] for each in found) / 1024:.0f} MB.")
+        '{exception} runs ended with an exception, {non_finite} gave a number that is not finite '
+        'or an attitude that is no rotation, in {miscounted} the counters do not fit what was '
+        'sent, {warnings} made numpy warn (target: none). '.format(**broke)
+        + f"An aligner never held more than {max(each['held'] for each in found) * 1e-6:.2f} MB "
+        f'(pickled, every {WEIGH_EVERY} updates; limit {MAX_HELD * 1e-6:g}).')
     declared, share, gross = (beyond(map(error, found), limit) for limit in (-math.inf, *BINS))
     report.text(
         f'{declared} runs were declared ALIGNED at some time, {share} of them '
@@ -132,8 +131,7 @@ def run_watched(index: int) -> JsonDict:
             exception = traceback.format_exc(limit=-3)
     result = {'name': case.name, 'seed': index, 'declared': [], 'final': [], 'beyond_s': 0.0,
               'exception': exception, 'non_finite': sorted(non_finite), 'held': held,
-              'miscounted': [], 'warnings': sorted({str(each.message) for each in warned}),
-              'resident_kb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
+              'miscounted': [], 'warnings': sorted({str(each.message) for each in warned})}
     if not exception:
         result |= outcome(case, simulation, stream, aligner, epochs)
         result['miscounted'] = miscounted(result['counts'], stream)
@@ -198,19 +196,13 @@ def error(run: JsonDict) -> float | None:
     return worst([*run['declared'], *run['final']])
 
 
-def count(runs: list[JsonDict], what: str) -> int:
-    """Count the runs in which there was an exception, say."""
-    return sum(bool(each[what]) for each in runs)
-
-
 COLUMNS: list[Column] = [
-    ('fault', '', lambda group: group[0]), ('runs', '', lambda group: len(group[1])),
-    *((title, '', lambda group, what=what: count(group[1], what)) for title, what in (
-        ('exceptions', 'exception'), ('non-finite', 'non_finite'), ('miscounted', 'miscounted'))),
+    *WHICH, over('exceptions', 'exception', count), over('non-finite', 'non_finite', count),
+    over('miscounted', 'miscounted', count),
     *((title, '', lambda group, limit=limit: beyond(map(error, group[1]), limit))
       for title, limit in (('declared', -math.inf),
                            *((f'beyond {limit:g}', limit) for limit in BINS))),
     ('worst, sigma', '.1f', lambda group: most(
         sigmas for sigmas in map(error, group[1]) if sigmas is not None)),
-    ('aligned beyond 5, s', '.1f', lambda group: most(each['beyond_s'] for each in group[1])),
-    ('held, MB', '.2f', lambda group: np.median([each['held'] for each in group[1]]) * 1e-6)]
+    over('aligned beyond 5, s', 'beyond_s', most, '.1f'),
+    over('held, MB', 'held', lambda values: np.median(values) * 1e-6, '.2f')]

@@ -27,8 +27,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ins_align.experiments import ExperimentError
-from ins_align.experiments.cases import ALIGNED_COLUMNS, beyond, while_aligned, worst
-from ins_align.experiments.common import BINS, Column, JsonDict, median, parallel, Report
+from ins_align.experiments.common import (
+    ALIGNED_COLUMNS, beyond, BINS, Column, count, JsonDict, median, most, over, parallel, Report,
+    WHICH, while_aligned, worst)
 from ins_align.experiments.spoilt import SECOND
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.messages import Fix, Velocity
@@ -133,8 +134,9 @@ def run_window(task: tuple[Path, float, float, JsonDict, float]) -> JsonDict:
     part = recording.part(start_s, duration)
     part['gyro'] = part['gyro'] * [1.0, 1.0, z_sign]
     result = align(**part, **{**recording.lever_arm, **config})
-    run = while_aligned([epoch for epoch in result.epochs if not epoch.dry], int(part['stamps'][0]),
-                        recording.attitudes_at, recording.reference_std_deg, TIMES)
+    epochs = [epoch for epoch in result.epochs if not epoch.dry]
+    run = while_aligned(epochs, int(part['stamps'][0]), recording.attitudes_at,
+                        recording.reference_std_deg, TIMES)
     stamps, velocities = _velocities(**part)
     minute = velocities[stamps <= stamps[:1] + round(MOTION_TIME * SECOND)]
     for found in itertools.chain(*run['at'].values()):
@@ -214,14 +216,15 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         'over ground, above 1 m/s, taken for it. Windows with real motion; all if none has', [
             (name, [each for each in group if each['moves']] or group)
             for name, group in groups.items()],
-        [*ALIGNED_COLUMNS[:2], *(
+        [*WHICH, *(
             (f'{title} at {time:g} s', '', _both(lambda run, time=time: run['at'].get(
                 f'{time:g}', ()), name)) for time in TIMES for title, name in (
                     ('heading', 'heading_deg'), ('tilt', 'tilt_deg'), ('sigmas', 'heading_sigmas'),
                     ('course', 'course_deg')))])
     report.table('Whole recordings, bank: every epoch while ALIGNED', [
         (load(path).name, [each]) for path, each in zip(paths, whole)], [
-            ALIGNED_COLUMNS[0], *ALIGNED_COLUMNS[3:4], *ALIGNED_COLUMNS[-2:], *HELD_COLUMNS])
+            WHICH[0], *(column for column in ALIGNED_COLUMNS if column[0] in (
+                'at the end', 'aligned, %', 'after, s')), *HELD_COLUMNS])
     return {**groups, 'whole': whole}
 
 
@@ -251,25 +254,24 @@ def _soon(group: tuple[str, list[JsonDict]]) -> str:
     return f'{sum(each[0] <= MOTION_TIME for each in times if each)}/{len(times)}'
 
 
-def _part(group: tuple[str, list[JsonDict]], place: int) -> float | None:
+def _share(group: tuple[str, list[JsonDict]], place: int) -> float | None:
     """Return the part of epochs while ALIGNED that are beyond one of `BINS`, %."""
     epochs = sum(run['epochs'] for run in group[1])
     return 100 * sum(run['beyond'][place] for run in group[1]) / epochs if epochs else None
 
 
 HELD_COLUMNS: list[Column] = [
-    ('epochs', '', lambda group: sum(run['epochs'] for run in group[1])),
-    *((f'> {limit:g} sigma, %', '.1f', lambda group, place=place: _part(group, place))
+    over('epochs', 'epochs', sum),
+    *((f'> {limit:g} sigma, %', '.1f', lambda group, place=place: _share(group, place))
       for place, limit in enumerate(BINS)),
-    next(column for column in ALIGNED_COLUMNS if column[0] == 'worst, sigma')]
+    over('worst, sigma', 'worst_sigmas', most, '.1f')]
 DECLARED_COLUMNS: list[Column] = [
-    *ALIGNED_COLUMNS[:3],
-    ('after, s', '.0f', lambda group: median([
-        first['t_s'] for run in group[1] for first in run['first']])),
+    *WHICH, over('declared', 'first', count),
+    over('after, s', 'first', lambda found: median([
+        each[0]['t_s'] for each in found if each]), '.0f'),
     ('in 60 s', '', _soon),
     *((title, '', _both(lambda run: run['first'], name)) for title, name in (
         ('heading, deg', 'heading_deg'), ('heading, sigma', 'heading_sigmas'),
         ('tilt, deg', 'tilt_deg'), ('tilt, sigma', 'tilt_sigmas'))),
-    *((f'> {limit:g}', '', lambda group, limit=limit: beyond(
-        (worst(run['first']) for run in group[1]), limit)) for limit in BINS),
-    *HELD_COLUMNS]
+    *(over(f'> {limit:g}', 'first', lambda found, limit=limit: beyond(map(worst, found), limit))
+      for limit in BINS), *HELD_COLUMNS]

@@ -115,10 +115,13 @@ class Stream:
             for name in names:
                 self.keep(name, ~within(getattr(self, name), window))
 
-    def displace(self, chosen: np.ndarray, away: Array) -> None:
-        """Move positions by ENU offsets in metres, or by one for all."""
-        here = self.fix['lla'][chosen]
-        self.fix['lla'][chosen] = displaced(here, np.broadcast_to(away, here.shape))
+    def put_off(self, name: str, chosen: np.ndarray, away: Array) -> None:
+        """Add ENU errors to positions (m) or velocities (m/s), or one to all that are chosen."""
+        if name == 'velocity':
+            self.velocity['velocity'][chosen] += away
+        else:
+            here = self.fix['lla'][chosen]
+            self.fix['lla'][chosen] = displaced(here, np.broadcast_to(away, here.shape))
 
     def messages(self, config: Config) -> Iterator[Message]:
         """
@@ -203,17 +206,15 @@ def directions(random: Random, number: int) -> Array:
 # Faults of GNSS
 
 def _outliers(stream: Stream, random: Random) -> None:
-    chosen = some(random, stream.fix, 0.01, 0.1)
-    stream.displace(chosen, random.uniform(10.0, 100.0, (len(chosen), 1))
-                    * directions(random, len(chosen)))
-    chosen = some(random, stream.velocity, 0.01, 0.1)
-    stream.velocity['velocity'][chosen] += (random.uniform(0.5, 10.0, (len(chosen), 1))
-                                            * directions(random, len(chosen)))
+    for name, least, most in ('fix', 10.0, 100.0), ('velocity', 0.5, 10.0):
+        chosen = some(random, getattr(stream, name), 0.01, 0.1)
+        stream.put_off(name, chosen, random.uniform(least, most, (len(chosen), 1))
+                       * directions(random, len(chosen)))
 
 
 def _position_jump(stream: Stream, random: Random) -> None:
     later = stream.fix['stamp'] >= stream.moment(random)
-    stream.displace(later, 10 ** random.uniform(1.3, 3.3) * directions(random, 1))
+    stream.put_off('fix', later, 10 ** random.uniform(1.3, 3.3) * directions(random, 1))
 
 
 def _null_island(stream: Stream, random: Random) -> None:

@@ -29,9 +29,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ins_align.config import PRESETS
-from ins_align.experiments.cases import (
-    ALIGNED_COLUMNS, Case, Groups, run_case)
-from ins_align.experiments.common import BINS, JsonDict, parallel, Report
+from ins_align.experiments.common import (
+    ALIGNED_COLUMNS, BINS, Case, Groups, JsonDict, parallel, Report, run_case)
 from ins_align.experiments.spoilt import directions, GNSS, Random, SECOND, Stream
 from ins_align.geometry.rotation import Array
 import numpy as np
@@ -78,17 +77,13 @@ def _stepping(stream: Stream, random: Random) -> None:
     """Add to velocities without noise one of steps of 10 to 60 s, and state the middle one."""
     _states(stream, random, 0.1)
     for chosen in _spells(random, stream.seconds('velocity'), (10.0, 60.0), (0.0, 0.0)):
-        stream.velocity['velocity'][chosen] += (
-            random.choice([0.03, 0.1, 0.5]) * random.standard_normal((len(chosen), 3)))
+        stream.put_off('velocity', chosen, random.choice([0.03, 0.1, 0.5])
+                       * random.standard_normal((len(chosen), 3)))
 
 
 def _multipath(stream: Stream, random: Random, size: float, name: str = 'velocity') -> None:
     for chosen in _spells(random, stream.seconds(name), (5.0, 15.0), (20.0, 100.0)):
-        away = size * directions(random, 1)
-        if name == 'fix':
-            stream.displace(chosen, away)
-        else:
-            stream.velocity['velocity'][chosen] += away
+        stream.put_off(name, chosen, size * directions(random, 1))
 
 
 def _positions(stream: Stream, random: Random, offsets: float = 0.0, stated: float = 0.0) -> None:
