@@ -65,7 +65,7 @@ def test_exact_model_is_that_of_the_simulation():
 def test_bound_is_reached_on_a_navigation_grade_flight(monkeypatch):
     monkeypatch.setattr(bound, 'TIMES', bound.TIMES[:6])
     case = next(case for case in bound.CASES if case.grade == 'navigation')
-    limits = bound.bounds_of(case)
+    limits = bound.bound_of(case)
     runs = [bound.run_case((case, seed)) for seed in range(4)]
     result = bound.summary(case, limits, runs)
     assert result['heading_bound_deg'][bound.TIMES.index(10.0)] == pytest.approx(0.245, abs=0.01)
@@ -141,11 +141,12 @@ def test_a_declared_run_is_judged_against_the_truth(monkeypatch):
     assert common.worst(result['final'], 'heading') == result['final'][0]['heading_sigmas']
 
 
-def test_note_with_and_without_lever_arm(monkeypatch):
-    monkeypatch.setattr(bound, 'DURATION', 12.0)
-    errors = {name: np.array([bound.run_variant(('navigation', name, seed)) for seed in range(3)])
-              for name in ('not compensated', 'compensated', 'zero lever arm')}
-    end = {name: error[:, -1] for name, error in errors.items()}
+def test_note_with_and_without_lever_arm():
+    end = {}
+    for case in bound.NOTE_CASES[:3]:
+        short = case._replace(simulate={**case.simulate, 'duration': 12.0})
+        end[case.title.partition(': ')[2]] = np.array([
+            bound.run_case((short, seed))['rpy_deg'][-1] for seed in range(3)])
     assert common.rms(end['compensated'][:, 2]) < 1.0
     # With its term the lever arm is as if it were not there, without it is not.
     same = common.rms(end['compensated'] - end['zero lever arm'])

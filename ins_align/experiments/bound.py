@@ -24,64 +24,61 @@ seconds of data.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import itertools
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ins_align.aligner import Aligner
+from ins_align.config import Config
 from ins_align.experiments import dense
 from ins_align.experiments.common import (
     Column, draw, error_of, exact_config_for, field, GRADES, JsonDict, parallel, Report, rms)
 from ins_align.geometry.earth import EARTH_RATE, earth_rate_n, LocalLevel
 from ins_align.geometry.rotation import apply, Array, cross, roll_pitch_yaw, skew
-from ins_align.simulation.simulate import epochs_of, simulate
+from ins_align.simulation.simulate import epochs_of, simulate, Simulation
 import numpy as np
 
 TIMES = (3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 30.0, 50.0, 70.0, 100.0)
 TABLE_TIMES = (10.0, 20.0, 50.0, 100.0)
 LEVER_STD, DELAY, DELAY_STD = 1.0, 0.12, 0.1
-# Of `dense.bound`.
-UNKNOWN_STD: dict[str, dict[str, float]] = {
-    '': {}, 'lever arm': {'lever_arm_std': LEVER_STD}, 'delay': {'delay_std': DELAY_STD}}
 # Targets.
 RATIO_LIMIT, NEES_RANGE = 1.10, (0.85, 1.15)
 
 
 class Case(NamedTuple):
-    """One row of Monte Carlo: what is simulated, and what of it is known."""
+    """One row of Monte Carlo: what is simulated, and what is configured beside its very model."""
 
     title: str
     scenario: str
     grade: str
     simulate: JsonDict = {}
-    position_only: bool = False
-    unknown: str = ''           # 'lever arm' or 'delay'
+    config: JsonDict = {}
     share: float = 0.5          # of the runs asked for
 
 
 MOVING = tuple(itertools.product(('flight', 'car'), GRADES))
-# In the order of the tables.
+POSITIONS = {'use_velocity': False}
+# In the order of the tables. What has a sigma in the configuration is unknown to the bound too.
 CASES = (
     *(Case('velocity', *moving, share=1.0) for moving in MOVING),
     *(Case('velocity, gyro bias 0.5 deg/s', scenario, 'mems', {'gyro_bias_std': np.radians(0.5)})
       for scenario in ('flight', 'car')),
-    *(Case('RTK 2 cm, 5 Hz', *moving, {'position_std': 0.02}, position_only=True)
-      for moving in MOVING),
-    *(Case('position 1 m white, 1 Hz', *moving, {'position_std': 1.0, 'gnss_rate': 1.0},
-           position_only=True, share=0.25) for moving in MOVING),
-    *(Case('unknown lever arm', 'flight', grade, unknown='lever arm') for grade in GRADES),
-    *(Case('unknown delay', 'flight', grade, {'gnss_delay': DELAY}, unknown='delay')
+    *(Case('RTK 2 cm, 5 Hz', *moving, {'position_std': 0.02}, POSITIONS) for moving in MOVING),
+    *(Case('position 1 m white, 1 Hz', *moving, {'position_std': 1.0, 'gnss_rate': 1.0}, POSITIONS,
+           share=0.25) for moving in MOVING),
+    *(Case('unknown lever arm', 'flight', grade, {}, {
+        'lever_arm': (0.0, 0.0, 0.0), 'lever_arm_std': LEVER_STD}) for grade in GRADES),
+    *(Case('unknown delay', 'flight', grade, {'gnss_delay': DELAY}, {'gnss_delay_std': DELAY_STD})
       for grade in GRADES),
     Case('standing: north from the Earth rate', 'static', 'navigation', share=0.25))
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``bound``: every case; print ratios and normalised errors."""
-    [bounds] = parallel(bounds_of, [CASES], jobs, 'bounds')
-    results = parallel(run_case, [
-        [(case, seed) for seed in range(max(1, round(case.share * runs)))] for case in CASES],
-        jobs, 'runs')
-    summaries = [summary(*each) for each in zip(CASES, bounds, results)]
+    [bounds] = parallel(bound_of, [CASES], jobs, 'bounds')
+    summaries = [summary(*each) for each in zip(CASES, bounds, run_cases(CASES, runs, jobs))]
     rows = [row for result in summaries for row in rows_of(result)]
     report.text(
         'GNSS 5 Hz, 0.1 m/s, lever arm [1 1 1] m unless said otherwise. Errors of the attitude at '
@@ -99,7 +96,7 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     report.table(
         f'Lever arm (prior {LEVER_STD:g} m per axis) and delay (true {DELAY:g} s, prior '
         f'{DELAY_STD:g} s) as unknowns on `flight`, after {TIMES[-1]:g} s; above, the bound knows '
-        'no more than the aligner', [result for result in summaries if result['unknown']], [
+        'no more than the aligner', [result for result in summaries if 'nuisance_rms' in result], [
             field('case', 'title'), field('IMU', 'grade'),
             field('rms error (m or s)', 'nuisance_rms', '.2g'),
             field('stated sigma', 'nuisance_std', '.2g'),
@@ -110,58 +107,76 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     return {'runs': runs, 'times_s': TIMES, 'cases': summaries}
 
 
-def bounds_of(case: Case) -> tuple[Array, Array]:
-    """Bound of tilt (both axes) and heading at all times, degrees, with the case's unknowns."""
-    simulation = simulate(case.scenario, imu_grade=case.grade, duration=TIMES[-1] + 0.5,
-                          **case.simulate)
-    bound = dense.bound(simulation, use_velocity=not case.position_only,
-                        use_position=case.position_only, **UNKNOWN_STD[case.unknown])
-    P = np.array([np.diag(bound.at(time)) for time in TIMES])
-    return np.degrees(np.sqrt(P[:, 0] + P[:, 1])), np.degrees(np.sqrt(P[:, 2]))
+def run_cases(cases: Sequence[Case], runs: int, jobs: int | None) -> list[list[JsonDict]]:
+    """Run every case with its share of the runs."""
+    return parallel(run_case, [
+        [(case, seed) for seed in range(max(1, round(case.share * runs)))] for case in cases],
+        jobs, 'runs')
+
+
+def simulation_of(case: Case, **changes: Any) -> Simulation:
+    """Simulate a case."""
+    return simulate(case.scenario, **{'imu_grade': case.grade, 'duration': TIMES[-1] + 0.5,
+                                      **case.simulate, **changes})
+
+
+def bound_of(case: Case) -> dense.Bound:
+    """Return the bound of a case, with what is unknown in it."""
+    velocity = case.config.get('use_velocity', True)
+    return dense.bound(simulation_of(case), use_velocity=velocity, use_position=not velocity,
+                       lever_arm_std=case.config.get('lever_arm_std', 0.0),
+                       delay_std=case.config.get('gnss_delay_std', 0.0))
 
 
 def run_case(task: tuple[Case, int]) -> JsonDict:
-    """Run the aligner; errors at all times."""
+    """
+    Run the aligner.
+
+    At its K epochs: time (K,), s since t0, and of the attitude at t0 errors about east, north, up
+    (K, 3) and of roll, pitch, yaw (K, 3), degrees, and the normalised squared error (K,). At the
+    end errors and sigmas of what is unknown.
+    """
     case, seed = task
+    changes: JsonDict = {'seed': seed}
+    if 'lever_arm_std' in case.config:      # another one in each run
+        changes['lever_arm'] = LEVER_STD * np.random.default_rng([3, seed]).standard_normal(3)
+    simulation = simulation_of(case, **changes)
     # Nothing is declared, for that may move t0, and the bound is about the first one.
-    config: JsonDict = {'hold_time': 1e3}
-    arguments = dict(case.simulate)
-    if case.position_only:
-        config['use_velocity'] = False
-    if case.unknown == 'lever arm':     # another one in each run
-        arguments['lever_arm'] = LEVER_STD * np.random.default_rng([3, seed]).standard_normal(3)
-        config |= {'lever_arm': (0.0, 0.0, 0.0), 'lever_arm_std': LEVER_STD}
-    if case.unknown == 'delay':
-        config['gnss_delay_std'] = DELAY_STD
-    simulation = simulate(case.scenario, imu_grade=case.grade, seed=seed, duration=TIMES[-1] + 0.5,
-                          **arguments)
-    aligner = Aligner(exact_config_for(simulation, **config))
-    epochs = list(epochs_of(aligner, simulation, velocity=not case.position_only))
-    error, nees = np.full((len(TIMES), 3), np.nan), np.full(len(TIMES), np.nan)
-    for k, time in enumerate(TIMES):
-        last = [epoch.initial for epoch in epochs if epoch.t_s <= time + 1e-6][-1:]
-        for attitude in filter(None, last):
-            error[k], _, nees[k], *_ = error_of(attitude,
-                                                simulation.attitude_at(attitude.stamp_ns))
-    status = aligner.status()
+    aligner = Aligner(exact_config_for(simulation, **{'hold_time': 1e3, **case.config}))
+    rows = []
+    for epoch in epochs_of(aligner, simulation, velocity=case.config.get('use_velocity', True)):
+        error = rpy = np.full(3, np.nan)
+        nees = math.nan
+        if epoch.initial is not None:
+            C_true = simulation.attitude_at(epoch.initial.stamp_ns)
+            error, nees, *_ = error_of(epoch.initial, C_true)
+            rpy = roll_pitch_yaw(epoch.initial.C_nb) - roll_pitch_yaw(C_true)
+        rows.append([epoch.t_s, nees, *error, *np.degrees(
+            np.remainder(rpy + np.pi, 2 * np.pi) - np.pi)])
+    table, status = np.array(rows), aligner.status()
     nuisance = ([status.gnss_delay - DELAY], [status.gnss_delay_std])
-    if case.unknown == 'lever arm':
+    if 'lever_arm_std' in case.config:
         nuisance = (status.lever_arm - simulation.lever_arm, status.lever_arm_std)
-    return {'error': error, 'nees': nees, 'nuisance': nuisance}
+    return {'time': table[:, 0], 'nees': table[:, 1], 'error_deg': table[:, 2:5],
+            'rpy_deg': table[:, 5:], 'nuisance': nuisance}
 
 
-def summary(case: Case, bound: tuple[Array, Array], runs: list[JsonDict]) -> JsonDict:
+def summary(case: Case, bound: dense.Bound, runs: list[JsonDict]) -> JsonDict:
     """Return the statistics of a case's runs over time."""
-    error = np.array([each['error'] for each in runs])
+    def at_times(name: str) -> Array:
+        return np.array([run[name][np.searchsorted(run['time'], np.add(TIMES, 1e-6)) - 1]
+                         for run in runs])
+
+    error, P = at_times('error_deg'), np.array([np.diag(bound.at(time)) for time in TIMES])
     result = {'title': case.title, 'scenario': case.scenario, 'grade': case.grade,
-              'unknown': case.unknown, 'runs': len(runs)}
-    for angle, limit, errors in zip(('tilt', 'heading'), bound, (
-            np.hypot(error[..., 0], error[..., 1]), error[..., 2])):
+              'runs': len(runs), 'nees': np.mean(at_times('nees'), axis=0) / 3}
+    for angle, errors, variance in (('tilt', np.hypot(*error.T[:2]).T, P[:, 0] + P[:, 1]),
+                                    ('heading', error[..., 2], P[:, 2])):
+        limit = np.degrees(np.sqrt(variance))
         result |= {f'{angle}_deg': rms(errors, axis=0), f'{angle}_bound_deg': limit,
                    f'{angle}_ratio': rms(errors, axis=0) / limit}
-    result['nees'] = np.mean([each['nees'] for each in runs], axis=0) / 3
-    if case.unknown:
-        errors, stds = (np.array([each['nuisance'][place] for each in runs]) for place in (0, 1))
+    if {'lever_arm_std', 'gnss_delay_std'} & {*case.config}:
+        errors, stds = (np.array([run['nuisance'][place] for run in runs]) for place in (0, 1))
         result |= {'nuisance_rms': rms(errors), 'nuisance_std': rms(stds),
                    'nuisance_sigmas': rms(errors / stds)}
     return result
@@ -221,23 +236,24 @@ def panel(results: list[JsonDict], scenario: str, angle: str) -> JsonDict:
 
 # The note
 
-DURATION = 100.0
 PEAK_FROM, PEAK_TO = 2.0, 20.0      # s, where the note's Fig. 1 has its lumps
 SHOWN_FROM = 3.0                    # s, larger errors before may lie outside of the figure
 REMARK_DURATION = 1000.0
 ANGLES = ('roll', 'pitch', 'heading')
 LEVER, NO_LEVER = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
-# Name, lever arm of the vehicle, what the aligner is told beside the grade.
-VARIANTS: dict[str, tuple[tuple[float, ...], JsonDict]] = {
-    'not compensated': (LEVER, {'method': 'vif', 'free_start': False, 'lever_arm': NO_LEVER}),
-    'compensated': (LEVER, {'method': 'vif', 'free_start': False}),
-    'zero lever arm': (NO_LEVER, {'method': 'vif', 'free_start': False}),
-    'not compensated, free start': (LEVER, {'method': 'vif', 'lever_arm': NO_LEVER}),
-    'compensated, free start': (LEVER, {'method': 'vif'}),
-    'bank': (LEVER, {'method': 'bank'}),
-}
-NOTE_RUNS = (*(('navigation', name) for name in VARIANTS), ('mems', 'compensated'),
-             ('mems', 'compensated, free start'), ('mems', 'bank'))
+LETTER = {'method': 'vif', 'free_start': False}
+# Name, lever arm of the vehicle, what the aligner is told beside its very model; with MEMS too?
+VARIANTS: tuple[tuple[str, tuple[float, ...], JsonDict, bool], ...] = (
+    ('not compensated', LEVER, {**LETTER, 'lever_arm': NO_LEVER}, False),
+    ('compensated', LEVER, LETTER, True), ('zero lever arm', NO_LEVER, LETTER, False),
+    ('not compensated, free start', LEVER, {'method': 'vif', 'lever_arm': NO_LEVER}, False),
+    ('compensated, free start', LEVER, {'method': 'vif'}, True),
+    ('bank', LEVER, {'method': 'bank'}, True))
+NOTE_CASES = tuple(
+    Case(f'{grade}: {name}', 'flight', grade, {'duration': 100.0, 'lever_arm': lever},
+         {'hold_time': Config().hold_time, **told}, share=1.0)
+    for grade in ('navigation', 'mems') for name, lever, told, too in VARIANTS
+    if too or grade == 'navigation')
 # Those of the figure, as in the note.
 SHOWN = {'not compensated': '#D55E00', 'compensated': '#0072B2', 'zero lever arm': '#009E73'}
 
@@ -248,26 +264,30 @@ def run_note(report: Report, runs: int, jobs: int | None, data: Path | None) -> 
         'Scenario `flight` (100 m/s, S-turns with 40 s period, oscillation of 2 to 3 deg about '
         f'all axes), IMU 100 Hz, GNSS velocity 5 Hz, 0.1 m/s; lever arm {list(LEVER)} m; {runs} '
         'runs. The note does not give its own set-up. Errors of the attitude at t0.')
-    errors = dict(zip(NOTE_RUNS, map(np.array, parallel(run_variant, [
-        [(*each, seed) for seed in range(runs)] for each in NOTE_RUNS], jobs, 'runs'))))
-    time = np.arange(errors['navigation', 'bank'].shape[1]) / 5.0
-    heading = [(f'{grade}: {name}', rms(each[..., 2], axis=0))
-               for (grade, name), each in errors.items()]
-    heading += [(f'{grade}: Cramer-Rao bound', heading_bound(grade))
-                for grade in ('navigation', 'mems')]
-    table = {name: {f'{t:g} s': each[np.argmin(np.abs(time - t))] for t in TABLE_TIMES}
-             for name, each in heading}
+    results = run_cases(NOTE_CASES, runs, jobs)
+    time = results[0][0]['time']
+    errors = {case.title: np.array([each['rpy_deg'] for each in found])
+              for case, found in zip(NOTE_CASES, results)}
+    places = np.searchsorted(time, np.add(TABLE_TIMES, 1e-6)) - 1
+    heading = {name: rms(each[:, places, 2], axis=0) for name, each in errors.items()}
+    for case in NOTE_CASES:
+        if case.title.endswith('bank'):
+            limit = bound_of(case)
+            heading[f'{case.grade}: Cramer-Rao bound'] = np.degrees(np.sqrt(
+                [limit.at(t)[2, 2] for t in TABLE_TIMES]))
+    table = {name: {f'{t:g} s': value for t, value in zip(TABLE_TIMES, values)}
+             for name, values in heading.items()}
     peaks = peaks_of(errors, time)
     for title, numbers in (
             ('Heading error, rms in deg. Without "free start" and bank: free_start false, the '
              'note to the letter', table),
-            (f'Mean error, deg: largest from {PEAK_FROM:g} to {PEAK_TO:g} s, at {DURATION:g} s, '
+            (f'Mean error, deg: largest from {PEAK_FROM:g} to {PEAK_TO:g} s, at the end, '
              'and largest difference early from that of zero lever arm with the same noise',
              peaks)):
         report.table(title, [{'variant': name, **row} for name, row in numbers.items()], [
             field('variant', 'variant'),
             *(field(name, name, '.2g') for name in next(iter(numbers.values())))])
-    none = errors['navigation', 'zero lever arm']
+    none = errors['navigation: zero lever arm']
     chance = np.max(np.std(none, axis=0, ddof=1)[early(time)], axis=0) / np.sqrt(len(none))
     report.text(
         "The note's Fig. 1 shows early peaks without compensation, gone with it, and compensated "
@@ -279,37 +299,14 @@ def run_note(report: Report, runs: int, jobs: int | None, data: Path | None) -> 
             'remark_2_1': remarks_text(report)}
 
 
-def run_variant(task: tuple[str, str, int]) -> Array:
-    """Return errors of roll, pitch, yaw, degrees, at every epoch, shape (K, 3)."""
-    grade, name, seed = task
-    lever, told = VARIANTS[name]
-    simulation = simulate('flight', imu_grade=grade, seed=seed, duration=DURATION,
-                          lever_arm=lever)
-    aligner = Aligner(exact_config_for(simulation, **told))
-    errors = np.full((len(simulation.gnss_stamps_ns), 3), np.nan)
-    for epoch in epochs_of(aligner, simulation):
-        if epoch.initial is not None:
-            rpy, true_rpy = (roll_pitch_yaw(C) for C in (
-                epoch.initial.C_nb, simulation.attitude_at(epoch.initial.stamp_ns)))
-            errors[np.searchsorted(simulation.gnss_stamps_ns, epoch.stamp_ns)] = np.degrees(
-                np.remainder(rpy - true_rpy + np.pi, 2 * np.pi) - np.pi)
-    return errors
-
-
-def heading_bound(grade: str) -> Array:
-    """Bound of the heading at every epoch, degrees."""
-    P = dense.bound(simulate('flight', imu_grade=grade, duration=DURATION)).covariance
-    return np.degrees(np.sqrt(P[:, 2, 2]))
-
-
 def early(time: Array) -> Array:
     """Whether it is the time in which the note has its lumps."""
     return (time >= PEAK_FROM) & (time <= PEAK_TO)
 
 
-def peaks_of(errors: dict[tuple[str, str], Array], time: Array) -> dict[str, dict[str, float]]:
+def peaks_of(errors: dict[str, Array], time: Array) -> dict[str, dict[str, float]]:
     """Return the largest mean errors early on, and how far they are from those of no lever arm."""
-    means = {name: np.mean(errors['navigation', name], axis=0) for name in SHOWN}
+    means = {name: np.mean(errors[f'navigation: {name}'], axis=0) for name in SHOWN}
     apart = {name: mean - means['zero lever arm'] for name, mean in means.items()}
     return {name: {
         f'{angle}{when}': np.max(np.abs(values[rows, axis]))
@@ -318,16 +315,16 @@ def peaks_of(errors: dict[tuple[str, str], Array], time: Array) -> dict[str, dic
         for axis, angle in enumerate(ANGLES)} for name, mean in means.items()}
 
 
-def mean_figure(errors: dict[tuple[str, str], Array], time: Array) -> Any:
+def mean_figure(errors: dict[str, Array], time: Array) -> Any:
     """Draw mean errors over time."""
-    means = {name: np.mean(errors['navigation', name], axis=0) for name in SHOWN}
+    means = {name: np.mean(errors[f'navigation: {name}'], axis=0) for name in SHOWN}
     shown = np.max([np.nanmax(np.abs(mean[time >= SHOWN_FROM]), axis=0)
                     for mean in means.values()], axis=0)
     return draw(8.0, 8.0, [[{
         'title': '' if column else
         f'mean alignment error (scaled to what is seen after {SHOWN_FROM:g} s)',
         'ylabel': f'{angle} (deg)', 'ylim': 1.1 * shown[column] * np.array([-1.0, 1.0]),
-        'xlim': (0.0, DURATION), 'lines': [(time, mean[:, column], {
+        'xlim': (0.0, time[-1]), 'lines': [(time, mean[:, column], {
             'color': SHOWN[name], 'label': name,
             'linestyle': '--' if name == 'zero lever arm' else '-'})
             for name, mean in means.items()]}]

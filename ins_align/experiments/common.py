@@ -268,8 +268,9 @@ def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth, std_deg: 
     aligned = [k for k in errors if epochs[k].state is State.ALIGNED]
     sigmas = {k: errors[k].worst_sigmas for k in aligned}
     last_s = max((epochs[k].t_s for k in errors), default=-math.inf)
-    at = {f'{time:g}': [moment(epochs[k].t_s, [errors[k]]) for k in [
-        k for k in errors if epochs[k].t_s <= time + 1e-6][-1:]]
+    # The first attitude where there was none before; nothing of what ended before.
+    at = {f'{time:g}': [moment(epochs[k].t_s, [errors[k]]) for k in (
+        [k for k in errors if epochs[k].t_s <= time + 1e-6] or [*errors][:1])[-1:]]
         for time in times if last_s >= time - 1.5}
     return {'first': [moment(epochs[k].t_s, [errors[k]]) for k in aligned[:1]],
             'declared_s': next(((stamps[k] - start_ns) / SECOND for k in aligned), None),
