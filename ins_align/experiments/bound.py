@@ -28,16 +28,17 @@ from collections.abc import Sequence
 import itertools
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ins_align.aligner import Aligner
 from ins_align.config import Config
 from ins_align.experiments import dense
 from ins_align.experiments.common import (
-    Column, draw, error_of, exact_config_for, field, GRADES, JsonDict, parallel, Report, rms)
+    Case, Column, error_of, exact_config_for, field, GRADES, JsonDict, line_figure, parallel,
+    Report, rms)
 from ins_align.geometry.earth import EARTH_RATE, earth_rate_n, LocalLevel
 from ins_align.geometry.rotation import apply, Array, cross, roll_pitch_yaw, skew
-from ins_align.simulation.simulate import epochs_of, simulate, Simulation
+from ins_align.simulation.simulate import epochs_of, simulate
 import numpy as np
 
 TIMES = (3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 30.0, 50.0, 70.0, 100.0)
@@ -47,38 +48,36 @@ LEVER_STD, DELAY, DELAY_STD = 1.0, 0.12, 0.1
 RATIO_LIMIT, NEES_RANGE = 1.10, (0.85, 1.15)
 
 
-class Case(NamedTuple):
-    """One row of Monte Carlo: what is simulated, and what is configured beside its very model."""
-
-    title: str
-    scenario: str
-    grade: str
-    simulate: JsonDict = {}
-    config: JsonDict = {}
-    share: float = 0.5          # of the runs asked for
+def case_of(name: str, scenario: str, grade: str, config: JsonDict = {}, **arguments: Any) -> Case:
+    """Return a case; `config` is beside the very model of its simulation."""
+    return Case(name, scenario, {'imu_grade': grade, 'duration': TIMES[-1] + 0.5, **arguments},
+                config)
 
 
 MOVING = tuple(itertools.product(('flight', 'car'), GRADES))
 POSITIONS = {'use_velocity': False}
 # In the order of the tables. What has a sigma in the configuration is unknown to the bound too.
 CASES = (
-    *(Case('velocity', *moving, share=1.0) for moving in MOVING),
-    *(Case('velocity, gyro bias 0.5 deg/s', scenario, 'mems', {'gyro_bias_std': np.radians(0.5)})
+    *(case_of('velocity', *moving) for moving in MOVING),
+    *(case_of('velocity, gyro bias 0.5 deg/s', scenario, 'mems', gyro_bias_std=np.radians(0.5))
       for scenario in ('flight', 'car')),
-    *(Case('RTK 2 cm, 5 Hz', *moving, {'position_std': 0.02}, POSITIONS) for moving in MOVING),
-    *(Case('position 1 m white, 1 Hz', *moving, {'position_std': 1.0, 'gnss_rate': 1.0}, POSITIONS,
-           share=0.25) for moving in MOVING),
-    *(Case('unknown lever arm', 'flight', grade, {}, {
+    *(case_of('RTK 2 cm, 5 Hz', *moving, POSITIONS, position_std=0.02) for moving in MOVING),
+    *(case_of('position 1 m white, 1 Hz', *moving, POSITIONS, position_std=1.0, gnss_rate=1.0)
+      for moving in MOVING),
+    *(case_of('unknown lever arm', 'flight', grade, {
         'lever_arm': (0.0, 0.0, 0.0), 'lever_arm_std': LEVER_STD}) for grade in GRADES),
-    *(Case('unknown delay', 'flight', grade, {'gnss_delay': DELAY}, {'gnss_delay_std': DELAY_STD})
+    *(case_of('unknown delay', 'flight', grade, {'gnss_delay_std': DELAY_STD}, gnss_delay=DELAY)
       for grade in GRADES),
-    Case('standing: north from the Earth rate', 'static', 'navigation', share=0.25))
+    case_of('standing: north from the Earth rate', 'static', 'navigation'))
+# Of the runs asked for.
+SHARES = {case.name: 0.5 for case in CASES} | {
+    'velocity': 1.0, 'position 1 m white, 1 Hz': 0.25, 'standing: north from the Earth rate': 0.25}
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``bound``: every case; print ratios and normalised errors."""
     [bounds] = parallel(bound_of, [CASES], jobs, 'bounds')
-    summaries = [summary(*each) for each in zip(CASES, bounds, run_cases(CASES, runs, jobs))]
+    summaries = [summary(*each) for each in zip(CASES, bounds, run_all(CASES, runs, jobs))]
     rows = [row for result in summaries for row in rows_of(result)]
     report.text(
         'GNSS 5 Hz, 0.1 m/s, lever arm [1 1 1] m unless said otherwise. Errors of the attitude at '
@@ -91,7 +90,7 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         f'Targets: ratio of error and bound at most {RATIO_LIMIT:g}, NEES/3 within '
         f'{NEES_RANGE[0]:g} to {NEES_RANGE[1]:g}; beyond chance: by more than two of its sigmas', [
             (title, [row for row in rows if row['title'] == title])
-            for title in dict.fromkeys(case.title for case in CASES)], TARGET_COLUMNS)
+            for title in SHARES], TARGET_COLUMNS)
     report.table('Root mean square errors, bounds and their ratios', rows, ROW_COLUMNS)
     report.table(
         f'Lever arm (prior {LEVER_STD:g} m per axis) and delay (true {DELAY:g} s, prior '
@@ -101,36 +100,31 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
             field('rms error (m or s)', 'nuisance_rms', '.2g'),
             field('stated sigma', 'nuisance_std', '.2g'),
             field('rms of error/sigma', 'nuisance_sigmas', '.2f')])
-    report.figure(draw(11.0, 7.5, [[panel(summaries, scenario, angle) for scenario in (
+    report.figure(line_figure(11.0, 7.5, [[panel(summaries, scenario, angle) for scenario in (
         'flight', 'car')] for angle in ('tilt', 'heading')], sharex=True),
         'Errors of the attitude at t0 (dots: rms; lines: Cramer-Rao bound), GNSS velocity')
     return {'runs': runs, 'times_s': TIMES, 'cases': summaries}
 
 
-def run_cases(cases: Sequence[Case], runs: int, jobs: int | None) -> list[list[JsonDict]]:
+def run_all(cases: Sequence[Case], runs: int, jobs: int | None) -> list[list[JsonDict]]:
     """Run every case with its share of the runs."""
-    return parallel(run_case, [
-        [(case, seed) for seed in range(max(1, round(case.share * runs)))] for case in cases],
-        jobs, 'runs')
-
-
-def simulation_of(case: Case, **changes: Any) -> Simulation:
-    """Simulate a case."""
-    return simulate(case.scenario, **{'imu_grade': case.grade, 'duration': TIMES[-1] + 0.5,
-                                      **case.simulate, **changes})
+    return parallel(run_exact, [
+        [(case, seed) for seed in range(max(1, round(SHARES.get(case.name, 1.0) * runs)))]
+        for case in cases], jobs, 'runs')
 
 
 def bound_of(case: Case) -> dense.Bound:
     """Return the bound of a case, with what is unknown in it."""
     velocity = case.config.get('use_velocity', True)
-    return dense.bound(simulation_of(case), use_velocity=velocity, use_position=not velocity,
-                       lever_arm_std=case.config.get('lever_arm_std', 0.0),
-                       delay_std=case.config.get('gnss_delay_std', 0.0))
+    return dense.bound(
+        simulate(case.scenario, **case.simulate), use_velocity=velocity, use_position=not velocity,
+        lever_arm_std=case.config.get('lever_arm_std', 0.0),
+        delay_std=case.config.get('gnss_delay_std', 0.0))
 
 
-def run_case(task: tuple[Case, int]) -> JsonDict:
+def run_exact(task: tuple[Case, int]) -> JsonDict:
     """
-    Run the aligner.
+    Run an aligner that knows the very model.
 
     At its K epochs: time (K,), s since t0, and of the attitude at t0 errors about east, north, up
     (K, 3) and of roll, pitch, yaw (K, 3), degrees, and the normalised squared error (K,). At the
@@ -140,7 +134,7 @@ def run_case(task: tuple[Case, int]) -> JsonDict:
     changes: JsonDict = {'seed': seed}
     if 'lever_arm_std' in case.config:      # another one in each run
         changes['lever_arm'] = LEVER_STD * np.random.default_rng([3, seed]).standard_normal(3)
-    simulation = simulation_of(case, **changes)
+    simulation = simulate(case.scenario, **case.simulate, **changes)
     # Nothing is declared, for that may move t0, and the bound is about the first one.
     aligner = Aligner(exact_config_for(simulation, **{'hold_time': 1e3, **case.config}))
     rows = []
@@ -168,7 +162,7 @@ def summary(case: Case, bound: dense.Bound, runs: list[JsonDict]) -> JsonDict:
                          for run in runs])
 
     error, P = at_times('error_deg'), np.array([np.diag(bound.at(time)) for time in TIMES])
-    result = {'title': case.title, 'scenario': case.scenario, 'grade': case.grade,
+    result = {'title': case.name, 'scenario': case.scenario, 'grade': case.simulate['imu_grade'],
               'runs': len(runs), 'nees': np.mean(at_times('nees'), axis=0) / 3}
     for angle, errors, variance in (('tilt', np.hypot(*error.T[:2]).T, P[:, 0] + P[:, 1]),
                                     ('heading', error[..., 2], P[:, 2])):
@@ -221,7 +215,7 @@ ROW_COLUMNS: list[Column] = [
 
 
 def panel(results: list[JsonDict], scenario: str, angle: str) -> JsonDict:
-    """Return errors and bounds over time for `draw`."""
+    """Return errors and bounds over time for `line_figure`."""
     lines: list[Any] = []
     for grade, colour in zip(GRADES, ('#0072B2', '#E69F00', '#D55E00')):
         result = next(result for result in results if (
@@ -250,8 +244,8 @@ VARIANTS: tuple[tuple[str, tuple[float, ...], JsonDict, bool], ...] = (
     ('compensated, free start', LEVER, {'method': 'vif'}, True),
     ('bank', LEVER, {'method': 'bank'}, True))
 NOTE_CASES = tuple(
-    Case(f'{grade}: {name}', 'flight', grade, {'duration': 100.0, 'lever_arm': lever},
-         {'hold_time': Config().hold_time, **told}, share=1.0)
+    case_of(f'{grade}: {name}', 'flight', grade, {'hold_time': Config().hold_time, **told},
+            duration=100.0, lever_arm=lever)
     for grade in ('navigation', 'mems') for name, lever, told, too in VARIANTS
     if too or grade == 'navigation')
 # Those of the figure, as in the note.
@@ -264,16 +258,16 @@ def run_note(report: Report, runs: int, jobs: int | None, data: Path | None) -> 
         'Scenario `flight` (100 m/s, S-turns with 40 s period, oscillation of 2 to 3 deg about '
         f'all axes), IMU 100 Hz, GNSS velocity 5 Hz, 0.1 m/s; lever arm {list(LEVER)} m; {runs} '
         'runs. The note does not give its own set-up. Errors of the attitude at t0.')
-    results = run_cases(NOTE_CASES, runs, jobs)
+    results = run_all(NOTE_CASES, runs, jobs)
     time = results[0][0]['time']
-    errors = {case.title: np.array([each['rpy_deg'] for each in found])
+    errors = {case.name: np.array([each['rpy_deg'] for each in found])
               for case, found in zip(NOTE_CASES, results)}
     places = np.searchsorted(time, np.add(TABLE_TIMES, 1e-6)) - 1
     heading = {name: rms(each[:, places, 2], axis=0) for name, each in errors.items()}
     for case in NOTE_CASES:
-        if case.title.endswith('bank'):
+        if case.name.endswith('bank'):
             limit = bound_of(case)
-            heading[f'{case.grade}: Cramer-Rao bound'] = np.degrees(np.sqrt(
+            heading[case.name.replace('bank', 'Cramer-Rao bound')] = np.degrees(np.sqrt(
                 [limit.at(t)[2, 2] for t in TABLE_TIMES]))
     table = {name: {f'{t:g} s': value for t, value in zip(TABLE_TIMES, values)}
              for name, values in heading.items()}
@@ -320,7 +314,7 @@ def mean_figure(errors: dict[str, Array], time: Array) -> Any:
     means = {name: np.mean(errors[f'navigation: {name}'], axis=0) for name in SHOWN}
     shown = np.max([np.nanmax(np.abs(mean[time >= SHOWN_FROM]), axis=0)
                     for mean in means.values()], axis=0)
-    return draw(8.0, 8.0, [[{
+    return line_figure(8.0, 8.0, [[{
         'title': '' if column else
         f'mean alignment error (scaled to what is seen after {SHOWN_FROM:g} s)',
         'ylabel': f'{angle} (deg)', 'ylim': 1.1 * shown[column] * np.array([-1.0, 1.0]),

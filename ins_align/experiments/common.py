@@ -421,7 +421,8 @@ class Report:
             write_whole(self._out / f'{self._name}.{suffix}', lambda file: file.write(content))
 
 
-def draw(width: float, height: float, panels: Sequence[Sequence[JsonDict]], **shared: Any) -> Any:
+def line_figure(width: float, height: float, panels: Sequence[Sequence[JsonDict]],
+                **shared: Any) -> Any:
     """
     Draw lines over time in a grid of panels, inches; what they share is for ``subplots``.
 

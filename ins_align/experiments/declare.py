@@ -32,7 +32,7 @@ from ins_align.aligner import Aligner, State
 from ins_align.config import Config, PRESETS
 from ins_align.experiments.common import (
     beyond, BINS, Case, combination, config_for, count, exact_config_for, field, GRADES, groups_of,
-    JsonDict, moment_columns, most, over, parallel, Report, run_case, setup, WHICH, worst)
+    JsonDict, moment_columns, over, parallel, Report, run_case, setup, worst)
 from ins_align.experiments.dense import bound
 from ins_align.simulation.simulate import epochs_of, SCENARIOS, simulate
 import numpy as np
@@ -77,12 +77,10 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         f'{len(upset)} with a tilt beyond {BINS[1]:g} sigma, '
         f"{sum(each['state'] == State.LEVELLED.value for each in upset)} are still LEVELLED at "
         f"the end, and {count(each['declared'] for each in upset)} were ever ALIGNED.")
-    report.table(f'MEMS for {SILENT_DURATION:g} s without a change of velocity', [
-        (name, [each for each in silent if each['scenario'] == name]) for name in SILENT], [
-            *WHICH, over('heading declared', 'declared', count),
-            over('level declared', 'levelled', count),
-            over('worst tilt, sigma', 'levelled', lambda found: most(
-                worst(each, 'tilt') for each in found if each), '.1f'),
+    report.table(
+        f'MEMS for {SILENT_DURATION:g} s without a change of velocity: LEVELLED, and ALIGNED',
+        groups_of(silent, SILENT)[:-1], [
+            *moment_columns('levelled')[:7], over('ALIGNED', 'declared', count),
             over('least heading sigma, deg', 'least_heading_sigma_deg', min, '.1f')])
     time_table(report, waits)
     return {'runs': found, 'silent': silent, 'time_to_heading': waits}
@@ -139,7 +137,7 @@ def draw(index: int) -> Case:
 def draw_silent(scenario: str, seed: int) -> Case:
     """Draw ten minutes of motion that does not show the heading."""
     mount = np.random.default_rng([2, seed]).uniform(-20, 20, 3)
-    return Case('silent', scenario, {'imu_grade': 'mems', 'seed': seed,
+    return Case(scenario, scenario, {'imu_grade': 'mems', 'seed': seed,
                                      'duration': SILENT_DURATION, 'mount_rpy_deg': mount})
 
 

@@ -99,8 +99,7 @@ def draw(index: int) -> Case:
 
 def update_times(stream: Stream, random: Random) -> np.ndarray:
     """When somebody looks for results."""
-    end = max((int(rows['arrival'].max()) for name in SENSORS
-               if len(rows := getattr(stream, name))), default=stream.first)
+    end = max(int(getattr(stream, name)['arrival'].max(initial=stream.first)) for name in SENSORS)
     duration = (end - stream.first) / SECOND
     if stream.update_every == 0:
         steps = np.full(int(duration / UPDATE_EVERY) + 1, UPDATE_EVERY)
