@@ -32,7 +32,7 @@ from ins_align.config import Config
 from ins_align.experiments.common import (
     beyond, BINS, Case, Column, combination, count, follow, GRADES, groups_of, JsonDict, most,
     outcome, over, parallel, prepare, Report, setup, WHICH, worst)
-from ins_align.experiments.spoilt import FAULTS, Random, SECOND, SENSORS, Stream, turn_to_ned
+from ins_align.experiments.spoilt import FAULTS, Random, SECOND, SENSORS, Stream
 from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
 
@@ -84,12 +84,11 @@ def draw(index: int) -> Case:
     arguments = {'imu_grade': grade, 'seed': index, 'duration': DURATION, **setup(random)}
     config = {'gnss_lateness': Config().gnss_lateness, 'velocity_type': str(random.choice(
         ['TwistWithCovarianceStamped', 'TwistStamped', 'Odometry']))}
-    ned = random.choice(['enu', 'ned']) == 'ned'
+    arguments['velocity_frame'] = str(random.choice(['enu', 'ned']))
 
     def spoil(stream: Stream) -> None:
         random = np.random.default_rng([5, index])
-        if ned:
-            turn_to_ned(stream)
+        stream.config['velocity_frame'] = arguments['velocity_frame']
         FAULTS[fault](stream, random)
         stream.lot = 1 if random.random() < 0.5 else len(stream.imu) + 1
         stream.updates = update_times(stream, random)

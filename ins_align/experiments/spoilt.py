@@ -28,7 +28,7 @@ from typing import Any
 
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array
-from ins_align.gnss.messages import ENU_FROM_NED, fixes, MessageError, velocities
+from ins_align.gnss.messages import fixes, MessageError, velocities
 from ins_align.simulation.scenarios import displaced
 from ins_align.simulation.simulate import Simulation
 import numpy as np
@@ -162,7 +162,7 @@ class Stream:
 
 
 def stream_of(simulation: Simulation, lot: int = LOT) -> Stream:
-    """Return the messages of a simulation, velocities in ENU."""
+    """Return the messages of a simulation, its velocities taken for ENU."""
     imu = np.zeros(len(simulation.imu_stamps_ns), _IMU)
     imu['arrival'] = imu['stamp'] = simulation.imu_stamps_ns
     imu['gyro'], imu['accel'] = simulation.gyro, simulation.accel
@@ -176,14 +176,6 @@ def stream_of(simulation: Simulation, lot: int = LOT) -> Stream:
     velocity['covariance'] = simulation.velocity_covariance
     return Stream(imu, fix, velocity, int(simulation.imu_stamps_ns[0]),
                   int(simulation.imu_stamps_ns[-1]), lot, {'velocity_frame': 'enu'})
-
-
-def turn_to_ned(stream: Stream) -> None:
-    """Send velocities in NED, and configure it."""
-    rows = stream.velocity
-    rows['velocity'] = rows['velocity'] @ ENU_FROM_NED
-    rows['covariance'] = ENU_FROM_NED @ rows['covariance'] @ ENU_FROM_NED
-    stream.config['velocity_frame'] = 'ned'
 
 
 def within(rows: np.ndarray, window: Window) -> np.ndarray:
