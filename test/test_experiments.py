@@ -48,12 +48,14 @@ def test_error_is_counted_in_stated_sigmas():
     sigma = np.radians([0.1, 0.2, 1.0])
     attitude = Attitude(1, exp_so3(-phi) @ C, np.diag(sigma ** 2))
     error = common.error_of(attitude, C)
-    assert error.angles_deg == pytest.approx(np.degrees(phi))
-    assert error.tilt_sigmas == pytest.approx(3.0)
-    assert error.heading_sigmas == pytest.approx(3.0)
-    assert error.nees == pytest.approx(4 + 9 + 9)
+    assert error['angles_deg'] == pytest.approx(np.degrees(phi))
+    assert error['tilt_deg'] == pytest.approx(math.hypot(0.2, 0.6))
+    assert error['heading_deg'] == pytest.approx(3.0)
+    assert error['tilt_sigmas'] == pytest.approx(3.0)
+    assert error['heading_sigmas'] == pytest.approx(3.0)
+    assert error['nees'] == pytest.approx(4 + 9 + 9)
     wider = common.error_of(attitude, C, np.array([0.0, 0.0, math.sqrt(8.0)]))
-    assert wider.heading_sigmas == pytest.approx(1.0)
+    assert wider['heading_sigmas'] == pytest.approx(1.0)
 
 
 def test_exact_model_is_that_of_the_simulation():

@@ -26,7 +26,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import itertools
-import math
 from pathlib import Path
 from typing import Any
 
@@ -139,14 +138,14 @@ def run_exact(task: tuple[Case, int]) -> JsonDict:
     aligner = Aligner(exact_config_for(simulation, **{'hold_time': 1e3, **case.config}))
     rows = []
     for epoch in epochs_of(aligner, simulation, velocity=case.config.get('use_velocity', True)):
-        error = rpy = np.full(3, np.nan)
-        nees = math.nan
+        row = np.full(7, np.nan)
         if epoch.initial is not None:
             C_true = simulation.attitude_at(epoch.initial.stamp_ns)
-            error, nees, *_ = error_of(epoch.initial, C_true)
+            error = error_of(epoch.initial, C_true)
             rpy = roll_pitch_yaw(epoch.initial.C_nb) - roll_pitch_yaw(C_true)
-        rows.append([epoch.t_s, nees, *error, *np.degrees(
-            np.remainder(rpy + np.pi, 2 * np.pi) - np.pi)])
+            row[:] = [error['nees'], *error['angles_deg'], *np.degrees(
+                np.remainder(rpy + np.pi, 2 * np.pi) - np.pi)]
+        rows.append([epoch.t_s, *row])
     table, status = np.array(rows), aligner.status()
     nuisance = ([status.gnss_delay - DELAY], [status.gnss_delay_std])
     if 'lever_arm_std' in case.config:

@@ -178,37 +178,19 @@ def exact_config_for(simulation: Simulation, **changes: Any) -> Config:
 
 # How they are judged
 
-class Error(NamedTuple):
-    """Error of an attitude against the truth."""
+def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Any = 0.0) -> JsonDict:
+    """
+    Compare an attitude with ``C_nb``, whose own sigma (3,), if any, is added in quadrature.
 
-    angles_deg: Array       # (3,), about east, north, up
-    nees: float             # normalised squared error of the three angles
-    tilt_sigmas: float      # the larger one of two, each in its stated sigma
-    heading_sigmas: float
-
-    @property
-    def worst_sigmas(self) -> float:
-        """Larger one of tilt and heading."""
-        return max(self.tilt_sigmas, self.heading_sigmas)
-
-    @property
-    def tilt_deg(self) -> float:
-        """Angle between the verticals."""
-        return float(np.hypot(*self.angles_deg[:2]))
-
-    @property
-    def heading_deg(self) -> float:
-        """Size of the angle about the vertical."""
-        return float(abs(self.angles_deg[2]))
-
-
-def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Any = 0.0) -> Error:
-    """Compare an attitude with ``C_nb``, whose own sigma (3,), if any, is added in quadrature."""
+    ``angles_deg`` (3,) about east, north, up; ``nees``, their normalised squared error; tilt and
+    heading in degrees and in stated sigmas, of the tilt the larger one of two axes.
+    """
     phi = log_so3(C_true @ attitude.C_nb.T)
     covariance = attitude.covariance + np.diag(np.radians(np.broadcast_to(extra_std_deg, 3)) ** 2)
-    sigmas = np.abs(phi) / np.sqrt(np.diag(covariance))
-    return Error(np.degrees(phi), float(phi @ np.linalg.solve(covariance, phi)),
-                 float(np.max(sigmas[:2])), float(sigmas[2]))
+    angles, sigmas = np.degrees(phi), np.abs(phi) / np.sqrt(np.diag(covariance))
+    return {'angles_deg': angles, 'nees': float(phi @ np.linalg.solve(covariance, phi)),
+            'tilt_sigmas': float(np.max(sigmas[:2])), 'heading_sigmas': float(sigmas[2]),
+            'tilt_deg': float(np.hypot(*angles[:2])), 'heading_deg': float(abs(angles[2]))}
 
 
 def outcome(case: Case, simulation: Simulation, stream: Stream, aligner: Aligner,
@@ -247,9 +229,9 @@ def moments(epochs: Iterable[Epoch], true: Truth) -> JsonDict:
             for name, each in chosen.items()}
 
 
-def moment(t_s: float, errors: list[Error | None]) -> JsonDict:
+def moment(t_s: float, errors: list[JsonDict]) -> JsonDict:
     """Return a time, s since t0, and the largest errors of tilt and heading."""
-    return {'t_s': t_s, **{name: max(getattr(error, name) for error in errors) for name in (
+    return {'t_s': t_s, **{name: max(error[name] for error in errors) for name in (
         'tilt_sigmas', 'heading_sigmas', 'tilt_deg', 'heading_deg')}}
 
 
@@ -266,7 +248,7 @@ def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth, std_deg: 
     errors = {k: error for k, error in zip(known, errors_of(
         [epochs[k].current for k in known], true, std_deg)) if error is not None}
     aligned = [k for k in errors if epochs[k].state is State.ALIGNED]
-    sigmas = {k: errors[k].worst_sigmas for k in aligned}
+    sigmas = {k: worst([errors[k]]) for k in aligned}
     last_s = max((epochs[k].t_s for k in errors), default=-math.inf)
     # The first attitude where there was none before; nothing of what ended before.
     at = {f'{time:g}': [moment(epochs[k].t_s, [errors[k]]) for k in (
@@ -275,7 +257,7 @@ def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth, std_deg: 
     return {'first': [moment(epochs[k].t_s, [errors[k]]) for k in aligned[:1]],
             'declared_s': next(((stamps[k] - start_ns) / SECOND for k in aligned), None),
             'epochs': len(aligned), 'worst_sigmas': most(sigmas.values()),
-            'worst_heading_deg': most(errors[k].heading_deg for k in aligned),
+            'worst_heading_deg': most(errors[k]['heading_deg'] for k in aligned),
             'beyond': [beyond(sigmas.values(), limit) for limit in BINS],
             'beyond_s': np.sum(held[[k for k in aligned if sigmas[k] > BINS[1]]]),
             'aligned_part': np.sum(held[[
@@ -283,7 +265,7 @@ def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth, std_deg: 
             'at': at}
 
 
-def errors_of(attitudes: list[Any], true: Truth, std_deg: Any = 0.0) -> list[Error | None]:
+def errors_of(attitudes: list[Any], true: Truth, std_deg: Any = 0.0) -> list[Any]:
     """Compare attitudes with the truth; None where that is not known."""
     truths = true([attitude.stamp_ns for attitude in attitudes]) if attitudes else ()
     return [None if C_true is None else error_of(attitude, C_true, std_deg)

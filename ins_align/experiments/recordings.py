@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 from ins_align.experiments import ExperimentError
 from ins_align.experiments.common import (
-    ALIGNED_COLUMNS, beyond, BINS, Column, count, JsonDict, median, most, over, parallel, Report,
+    beyond, BINS, Column, count, JsonDict, median, most, over, parallel, Report,
     WHICH, while_aligned, worst)
 from ins_align.experiments.spoilt import SECOND
 from ins_align.geometry.rotation import Array
@@ -51,9 +51,6 @@ MOTION_SPEED, MOTION_TIME = 5.0, 60.0       # m/s of change within so many s is 
 STEP, LENGTH = 10.0, 120.0      # s
 SHORTEST = 10.0                 # s of data that a window has to have
 TIMES = (30.0, 60.0, 120.0)
-METHODS: dict[str, JsonDict] = {
-    'note': {'method': 'vif', 'free_start': False}, 'centred': {'method': 'vif'},
-    'bank': {'method': 'bank'}}
 
 
 class Recording(NamedTuple):
@@ -191,13 +188,15 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     paths = recordings_in(data)
     if not paths:
         raise ExperimentError(f'no recording with {REFERENCE_TOPIC} in {data}')
-    names = [f'{load(path).name}, {method}' for path in paths for method in METHODS]
-    *windows, whole = parallel(run_window, [
-        *([(path, start, LENGTH, _config_of(path, method), 1.0) for start in np.arange(
-            0.0, max(load(path).duration - SHORTEST, 0.0) + 1e-6, STEP).tolist()]
-          for path in paths for method in METHODS),
-        [(path, 0.0, load(path).duration, {}, 1.0) for path in paths]], jobs, 'windows')
-    groups = dict(zip(names, windows))
+    tasks: dict[str, list[Any]] = {}
+    for path in paths:
+        name, duration = load(path).name, load(path).duration
+        starts = np.arange(0.0, max(duration - SHORTEST, 0.0) + 1e-6, STEP).tolist()
+        tasks |= {f'{name}, {method}': [(path, start, LENGTH, config, 1.0) for start in starts]
+                  for method, config in methods_of(path).items()}
+        tasks[f'{name}, bank, all of it'] = [(path, 0.0, duration, {}, 1.0)]
+    groups = dict(zip(tasks, parallel(run_window, list(tasks.values()), jobs, 'windows')))
+    every = [each for name, group in groups.items() for each in group if name.endswith('bank')]
     report.text(
         f'An alignment starts every {STEP:g} s and runs for up to {LENGTH:g} s with the defaults '
         '(preset mems), the car with its lever arm. note: vif with free_start false; centred: '
@@ -206,11 +205,10 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         'of the declared 99 % within 3 sigma, none beyond 5, with a median heading error of 1 deg '
         f'(UAV, car) and 3 deg (quadrotor); 90 % of the windows with real motion within '
         f'{MOTION_TIME:g} s.')
-    every = [each for name, group in groups.items() for each in group if name.endswith('bank')]
     report.table(
         f'At the declaration: median / worst. in {MOTION_TIME:g} s: windows with real motion '
         f'(by {MOTION_SPEED:g} m/s in that time) that declare. Then all epochs while ALIGNED',
-        [*groups.items(), ('all, bank', every)], DECLARED_COLUMNS)
+        [*groups.items(), ('all windows, bank', every)], DECLARED_COLUMNS)
     report.table(
         'Errors in deg: median / worst, declared or not; sigmas: of the heading; course: that '
         'over ground, above 1 m/s, taken for it. Windows with real motion; all if none has', [
@@ -221,18 +219,14 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
                 f'{time:g}', ()), name)) for time in TIMES for title, name in (
                     ('heading', 'heading_deg'), ('tilt', 'tilt_deg'), ('sigmas', 'heading_sigmas'),
                     ('course', 'course_deg')))])
-    report.table('Whole recordings, bank: every epoch while ALIGNED', [
-        (load(path).name, [each]) for path, each in zip(paths, whole)], [
-            WHICH[0], *(column for column in ALIGNED_COLUMNS if column[0] in (
-                'at the end', 'aligned, %', 'after, s')), *HELD_COLUMNS])
-    return {**groups, 'whole': whole}
+    return groups
 
 
-def _config_of(path: Path, method: str) -> JsonDict:
-    """Return a method's parameters: pif instead of vif where there is no velocity."""
-    config = METHODS[method]
-    known = any(isinstance(message, Velocity) for _, message in load(path).gnss)
-    return config | {'method': 'pif'} if config['method'] == 'vif' and not known else config
+def methods_of(path: Path) -> dict[str, JsonDict]:
+    """Return the parameters of each method: pif instead of vif where there is no velocity."""
+    measured = any(isinstance(message, Velocity) for _, message in load(path).gnss)
+    note = {'method': 'vif' if measured else 'pif'}
+    return {'note': {**note, 'free_start': False}, 'centred': note, 'bank': {'method': 'bank'}}
 
 
 # Columns of tables, whose rows are a name and the runs of its windows
@@ -260,11 +254,6 @@ def _share(group: tuple[str, list[JsonDict]], place: int) -> float | None:
     return 100 * sum(run['beyond'][place] for run in group[1]) / epochs if epochs else None
 
 
-HELD_COLUMNS: list[Column] = [
-    over('epochs', 'epochs', sum),
-    *((f'> {limit:g} sigma, %', '.1f', lambda group, place=place: _share(group, place))
-      for place, limit in enumerate(BINS)),
-    over('worst, sigma', 'worst_sigmas', most, '.1f')]
 DECLARED_COLUMNS: list[Column] = [
     *WHICH, over('declared', 'first', count),
     over('after, s', 'first', lambda found: median([
@@ -274,4 +263,9 @@ DECLARED_COLUMNS: list[Column] = [
         ('heading, deg', 'heading_deg'), ('heading, sigma', 'heading_sigmas'),
         ('tilt, deg', 'tilt_deg'), ('tilt, sigma', 'tilt_sigmas'))),
     *(over(f'> {limit:g}', 'first', lambda found, limit=limit: beyond(map(worst, found), limit))
-      for limit in BINS), *HELD_COLUMNS]
+      for limit in BINS),
+    over('at the end', 'state', lambda states: states.count('ALIGNED')),
+    over('epochs', 'epochs', sum),
+    *((f'> {limit:g} sigma, %', '.1f', lambda group, place=place: _share(group, place))
+      for place, limit in enumerate(BINS)),
+    over('worst, sigma', 'worst_sigmas', most, '.1f')]
