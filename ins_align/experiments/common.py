@@ -235,34 +235,27 @@ def moment(t_s: float, errors: list[JsonDict]) -> JsonDict:
         'tilt_sigmas', 'heading_sigmas', 'tilt_deg', 'heading_deg')}}
 
 
-def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth, std_deg: Any = 0.0,
-                  times: Iterable[float] = ()) -> JsonDict:
+def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth,
+                  std_deg: Any = 0.0) -> JsonDict:
     """
-    Judge the current attitude whenever it is called aligned, and after some times since t0.
+    Judge the current attitude whenever it is called aligned.
 
     `std_deg` (3,) says how well the truth is known; `start_ns` is the stamp of the first sample.
     """
     stamps = np.array([epoch.stamp_ns for epoch in epochs], np.int64)
     held = np.clip(np.diff(stamps, append=stamps[-1:]) / SECOND, 0.0, LONGEST)
-    known = [k for k, epoch in enumerate(epochs) if epoch.current is not None]
-    errors = {k: error for k, error in zip(known, errors_of(
-        [epochs[k].current for k in known], true, std_deg)) if error is not None}
-    aligned = [k for k in errors if epochs[k].state is State.ALIGNED]
-    sigmas = {k: worst([errors[k]]) for k in aligned}
-    last_s = max((epochs[k].t_s for k in errors), default=-math.inf)
-    # The first attitude where there was none before; nothing of what ended before.
-    at = {f'{time:g}': [moment(epochs[k].t_s, [errors[k]]) for k in (
-        [k for k in errors if epochs[k].t_s <= time + 1e-6] or [*errors][:1])[-1:]]
-        for time in times if last_s >= time - 1.5}
-    return {'first': [moment(epochs[k].t_s, [errors[k]]) for k in aligned[:1]],
-            'declared_s': next(((stamps[k] - start_ns) / SECOND for k in aligned), None),
-            'epochs': len(aligned), 'worst_sigmas': most(sigmas.values()),
-            'worst_heading_deg': most(errors[k]['heading_deg'] for k in aligned),
+    aligned = [k for k, epoch in enumerate(epochs)
+               if epoch.state is State.ALIGNED and epoch.current is not None]
+    errors = {k: error for k, error in zip(aligned, errors_of(
+        [epochs[k].current for k in aligned], true, std_deg)) if error is not None}
+    sigmas = {k: worst([error]) for k, error in errors.items()}
+    return {'first': [moment(epochs[k].t_s, [errors[k]]) for k in [*errors][:1]],
+            'declared_s': next(((stamps[k] - start_ns) / SECOND for k in errors), None),
+            'epochs': len(errors), 'worst_sigmas': most(sigmas.values()),
+            'worst_heading_deg': most(error['heading_deg'] for error in errors.values()),
             'beyond': [beyond(sigmas.values(), limit) for limit in BINS],
-            'beyond_s': np.sum(held[[k for k in aligned if sigmas[k] > BINS[1]]]),
-            'aligned_part': np.sum(held[[
-                k for k in known if epochs[k].state is State.ALIGNED]]) / max(np.sum(held), 1e-9),
-            'at': at}
+            'beyond_s': np.sum(held[[k for k in errors if sigmas[k] > BINS[1]]]),
+            'aligned_part': np.sum(held[aligned]) / max(np.sum(held), 1e-9)}
 
 
 def errors_of(attitudes: list[Any], true: Truth, std_deg: Any = 0.0) -> list[Any]:

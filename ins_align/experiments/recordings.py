@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 from ins_align.experiments import ExperimentError
 from ins_align.experiments.common import (
-    beyond, BINS, Column, count, JsonDict, median, most, over, parallel, Report,
+    beyond, BINS, Column, count, error_of, JsonDict, median, moment, most, over, parallel, Report,
     WHICH, while_aligned, worst)
 from ins_align.experiments.spoilt import SECOND
 from ins_align.geometry.rotation import Array
@@ -38,7 +38,7 @@ from ins_align.offline import align
 from ins_align.recordings import BagError
 from ins_align.recordings.decode import ImuSamples, Orientations
 from ins_align.recordings.reader import read, REFERENCE_TOPIC, Request
-from ins_align.results import Reference
+from ins_align.results import Epoch, Reference
 import numpy as np
 
 # What is known beside the recording, by the beginning of its name: the lever arm, and how well
@@ -132,16 +132,30 @@ def run_window(task: tuple[Path, float, float, JsonDict, float]) -> JsonDict:
     part['gyro'] = part['gyro'] * [1.0, 1.0, z_sign]
     result = align(**part, **{**recording.lever_arm, **config})
     epochs = [epoch for epoch in result.epochs if not epoch.dry]
-    run = while_aligned(epochs, int(part['stamps'][0]), recording.attitudes_at,
-                        recording.reference_std_deg, TIMES)
     stamps, velocities = _velocities(**part)
     minute = velocities[stamps <= stamps[:1] + round(MOTION_TIME * SECOND)]
-    for found in itertools.chain(*run['at'].values()):
-        stamp_ns = result.first_t0_ns + round(found['t_s'] * SECOND)
-        found['course_deg'] = _course_error(recording.reference, stamp_ns, stamps, velocities)
     return {'start_s': start_s, 'state': result.status.state.value,
             'moves': _change(minute) >= MOTION_SPEED,
-            'covers_minute': min(recording.duration - start_s, duration) >= MOTION_TIME, **run}
+            'covers_minute': min(recording.duration - start_s, duration) >= MOTION_TIME,
+            'at': at_times(recording, epochs, stamps, velocities),
+            **while_aligned(epochs, int(part['stamps'][0]), recording.attitudes_at,
+                            recording.reference_std_deg)}
+
+
+def at_times(recording: Recording, epochs: list[Epoch], stamps: np.ndarray,
+             velocities: Array) -> dict[str, list[JsonDict]]:
+    """Judge the last epochs up to `TIMES`, declared or not, and the course over ground there."""
+    known = [(epoch, C_true) for epoch in epochs if epoch.current is not None
+             for C_true in recording.attitudes_at([epoch.current.stamp_ns]) if C_true is not None]
+    found = {}
+    for time in TIMES:
+        before = [each for each in known if each[0].t_s <= time + 1e-6] or known[:1]
+        # A window that ends before has nothing to show.
+        for epoch, C_true in before[-1:] if known and known[-1][0].t_s >= time - 1.5 else ():
+            error = error_of(epoch.current, C_true, recording.reference_std_deg)
+            found[f'{time:g}'] = [{**moment(epoch.t_s, [error]), 'course_deg': _course_error(
+                C_true, velocities[np.searchsorted(stamps, epoch.stamp_ns):][:1])}]
+    return found
 
 
 def _velocities(stamps: np.ndarray, fixes: list[Fix], velocities: list[Velocity], **imu: Array,
@@ -171,12 +185,9 @@ def _change(velocities: Any) -> float:
     return float(np.max(np.ptp(extents, axis=0))) if len(extents) else 0.0
 
 
-def _course_error(reference: Reference, stamp_ns: int, stamps: np.ndarray,
-                  velocities: Array) -> float | None:
-    """Error of taking the course over ground for the heading, degrees; None below 1 m/s."""
-    C_true = reference.attitude_at(stamp_ns)
-    v = velocities[np.searchsorted(stamps, stamp_ns):][:1]
-    if C_true is None or not len(v) or np.hypot(*v[0]) < 1.0:
+def _course_error(C_true: Array, v: Array) -> float | None:
+    """Error of a velocity (1, 2) as heading, degrees; None if there is none above 1 m/s."""
+    if not len(v) or np.hypot(*v[0]) < 1.0:
         return None
     error = np.arctan2(C_true[1, 0], C_true[0, 0]) - np.arctan2(v[0, 1], v[0, 0])
     return float(abs(np.degrees((error + np.pi) % (2 * np.pi) - np.pi)))
