@@ -22,6 +22,7 @@ a row for all runs of a name.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from functools import partial
 import io
 import itertools
@@ -68,16 +69,11 @@ def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jo
 
     every = list(itertools.chain(*groups))
     jobs = min(jobs or processors(), max(len(every), 1))
-
-    def grouped(results: Iterable[Any]) -> list[list[Any]]:
+    with ExitStack() as stack:
+        results = map(function, every) if jobs == 1 else stack.enter_context(pool(jobs)).map(
+            function, every, chunksize=max(1, min(10, len(every) // (4 * jobs))))
         shown = iter(tqdm(results, name, len(every), disable=None))     # None: not on a terminal
         return [list(itertools.islice(shown, len(group))) for group in groups]
-
-    if jobs == 1:
-        return grouped(map(function, every))
-    with pool(jobs) as executor:
-        return grouped(executor.map(function, every,
-                                    chunksize=max(1, min(10, len(every) // (4 * jobs)))))
 
 
 # Runs
