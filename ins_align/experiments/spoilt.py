@@ -40,7 +40,7 @@ Message = tuple[int, str, Any]      # when it arrives (ns), what it is, and itse
 SECOND = 1_000_000_000
 HOUR = 3600 * SECOND
 GRAVITY = 9.80665  # m/s^2
-LATENESS = round(Config().gnss_lateness * SECOND)
+LATENESS_NS = round(Config().gnss_lateness * SECOND)
 LOT = 100       # IMU samples given at once, in which the lateness of their stamps is taken for one
 GNSS = 'fix', 'velocity'
 SENSORS = 'imu', *GNSS
@@ -288,7 +288,7 @@ def _late_gnss(stream: Stream, random: Random) -> None:
     """Send GNSS late, and out of order, but within what is allowed."""
     for name in GNSS:
         rows = getattr(stream, name)
-        rows['arrival'] += random.integers(0, LATENESS, len(rows))
+        rows['arrival'] += random.integers(0, LATENESS_NS, len(rows))
         stream.expected[f'{name}_late'] = 0
 
 
@@ -297,10 +297,10 @@ def _too_late_gnss(stream: Stream, random: Random) -> None:
     for name in GNSS:
         rows = getattr(stream, name)
         chosen = some(random, rows, 0.1 * part, part)
-        rows['arrival'][chosen] += random.integers(LATENESS + SECOND // 20, 5 * SECOND,
+        rows['arrival'][chosen] += random.integers(LATENESS_NS + SECOND // 20, 5 * SECOND,
                                                    len(chosen))
         newest = np.minimum(rows['arrival'], stream.imu['stamp'][-1])
-        stream.expected[f'{name}_late'] = int(np.sum(rows['stamp'] < newest - LATENESS))
+        stream.expected[f'{name}_late'] = int(np.sum(rows['stamp'] < newest - LATENESS_NS))
 
 
 def _gnss_clock(stream: Stream, shift: int) -> None:
