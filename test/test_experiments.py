@@ -13,13 +13,14 @@
 # limitations under the License.
 """The experiments: small runs whose numbers are known, and the errors a user can make."""
 
+import itertools
 import json
 import math
 
 from ins_align import experiments
 from ins_align.aligner import Aligner, Attitude, State
 from ins_align.config import Config, PRESETS
-from ins_align.experiments import bound, common, declare, note, recordings, weak_spots
+from ins_align.experiments import bound, common, declare, recordings, weak_spots
 from ins_align.experiments.spoilt import stream_of
 from ins_align.geometry.rotation import exp_so3, matrix_from_rpy
 from ins_align.simulation.simulate import simulate, write_bag
@@ -47,12 +48,14 @@ def test_error_is_counted_in_stated_sigmas():
     sigma = np.radians([0.1, 0.2, 1.0])
     attitude = Attitude(1, exp_so3(-phi) @ C, np.diag(sigma ** 2))
     error = common.error_of(attitude, C)
-    assert error.angles_deg == pytest.approx(np.degrees(phi))
-    assert error.tilt_sigmas == pytest.approx(3.0)
-    assert error.heading_sigmas == pytest.approx(3.0)
-    assert error.nees == pytest.approx(4 + 9 + 9)
+    assert error['angles_deg'] == pytest.approx(np.degrees(phi))
+    assert error['tilt_deg'] == pytest.approx(math.hypot(0.2, 0.6))
+    assert error['heading_deg'] == pytest.approx(3.0)
+    assert error['tilt_sigmas'] == pytest.approx(3.0)
+    assert error['heading_sigmas'] == pytest.approx(3.0)
+    assert error['nees'] == pytest.approx(4 + 9 + 9)
     wider = common.error_of(attitude, C, np.array([0.0, 0.0, math.sqrt(8.0)]))
-    assert wider.heading_sigmas == pytest.approx(1.0)
+    assert wider['heading_sigmas'] == pytest.approx(1.0)
 
 
 def test_exact_model_is_that_of_the_simulation():
@@ -63,9 +66,10 @@ def test_exact_model_is_that_of_the_simulation():
 
 def test_bound_is_reached_on_a_navigation_grade_flight(monkeypatch):
     monkeypatch.setattr(bound, 'TIMES', bound.TIMES[:6])
-    case = next(case for case in bound.CASES if case.grade == 'navigation')
-    limits = bound.bounds_of(case)
-    runs = [bound.run_case((case, seed)) for seed in range(4)]
+    case = bound.CASES[0]
+    case = case._replace(simulate={**case.simulate, 'duration': 20.5})
+    limits = bound.bound_of(case)
+    runs = [bound.run_exact((case, seed)) for seed in range(4)]
     result = bound.summary(case, limits, runs)
     assert result['heading_bound_deg'][bound.TIMES.index(10.0)] == pytest.approx(0.245, abs=0.01)
     # Four runs, three angles: the mean of twelve squares is within 0.2 and 2.5.
@@ -75,77 +79,77 @@ def test_bound_is_reached_on_a_navigation_grade_flight(monkeypatch):
     assert np.all(result['heading_ratio'][late:] < 2.0)
 
 
-def test_time_at_which_the_bound_crosses():
-    flight = declare.crossing_time(('flight', 'navigation', 10.0, 1.0, {}))
+def test_time_at_which_the_bound_crosses(monkeypatch):
+    monkeypatch.setattr(declare, 'HORIZON', 10.0)
+    flight = declare.crossing_time(('flight', 'navigation', True))
     assert flight == pytest.approx(5.4, abs=0.3)
-    assert declare.crossing_time(('straight', 'mems', 10.0, 1.0, {})) is None
-    unknown = {'lever_arm_std': 5.0, 'delay_std': 0.5}
-    assert declare.crossing_time(('flight', 'navigation', 10.0, 1.0, unknown)) > flight
+    assert declare.crossing_time(('straight', 'mems', True)) is None
+    assert declare.crossing_time(('flight', 'navigation', False)) > flight
 
 
-def test_trials_are_repeatable_and_cover_everything():
+def test_draws_are_repeatable_and_cover_everything():
     combinations = len(declare.FAULTS) * len(declare.SCENARIOS) * len(declare.GRADES)
-    trials = [declare.trial(index) for index in range(combinations)]
-    assert trials[5] == declare.trial(5)
-    seen = {(t['fault'], t['scenario'], t['simulate']['imu_grade']) for t in trials}
-    assert len(seen) == combinations
+    drawn = [declare.draw(index) for index in range(combinations)]
+    assert drawn[5] == declare.draw(5)
+    assert len({(case.name, case.scenario, case.simulate['imu_grade'])
+                for case in drawn}) == combinations
 
 
 def test_every_combination_of_faults_is_drawn_once():
     names = {fault for combination in declare.COMBINATIONS for fault in combination}
     assert names == set(declare.WORSE)
     seeds = range(len(declare.COMBINATIONS) * len(declare.SCENARIOS))
-    drawn = [declare.worse_trial(seed) for seed in seeds]
-    assert drawn[7] == declare.worse_trial(7)
-    assert len({(d['faults'], d['scenario']) for d in drawn}) == len(drawn)
+    drawn = [declare.draw_worse(seed) for seed in seeds]
+    assert drawn[7] == declare.draw_worse(7)
+    assert len({(case.name, case.scenario) for case in drawn}) == len(drawn)
 
 
-def test_imus_worse_than_configured(tmp_path, monkeypatch, capsys):
+def test_imus_worse_than_configured(tmp_path, monkeypatch):
     monkeypatch.setattr(declare, 'DURATION', 16.0)
     monkeypatch.setattr(declare, 'STAND_STILL', 0.0)
-    task = declare.worse_trial(5, faults=(), scenario='car')
-    clean = declare.run_trial(task)
-    assert clean == declare.run_trial(task)
-    assert clean['levelled']['current']['tilt_sigmas'] < 5
-    worse = declare.worse_trial(5, faults=('noise x 3',), scenario='car')
-    noisy = declare.run_trial(worse)
-    assert worse['simulate'] == task['simulate'] | declare.WORSE['noise x 3']
+    clean, again, noisy = (common.run_case((declare.draw_worse, 5, faults, 'car'))
+                           for faults in ((), (), ('noise x 3',)))
+    assert clean == again
+    assert clean['levelled'][0]['tilt_sigmas'] < 5
     assert noisy['levelled'] != clean['levelled']
-    declare.write_worse(tmp_path, [clean])
-    assert 'Beyond 3 sigma' in capsys.readouterr().out
-    assert len(json.loads((tmp_path / 'declare-worse.json').read_text())['runs']) == 1
+    experiments.run('declare-worse', tmp_path, runs=2, jobs=1)
+    assert 'First declared ALIGNED' in (tmp_path / 'declare-worse.md').read_text('utf-8')
+    assert len(json.loads((tmp_path / 'declare-worse.json').read_text())['runs']) == 2
 
 
-def test_shares_beyond_the_limits(tmp_path, capsys):
-    def result(faults, sigma):
-        angles = {'tilt_sigmas': sigma, 'heading_sigmas': 0.5, 'error_deg': [0.1, -0.2, 0.7]}
-        return {**declare.worse_trial(1, faults, 'car'), 'aligned': None,
-                'levelled': {'t_s': 4.0, 'initial': angles, 'current': angles}}
-    fault = next(iter(declare.WORSE))
-    declare.write_worse(tmp_path, [result((), 1.0), result((), 4.0), result((fault,), 6.0)])
-    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    none = next(line for line in lines if line[:1] == ['none'])
-    assert none[1:] == '2 2 4.0 1 (50.0 %) 0 (0.0 %) 4.0 0.2 0 (0.0 %) 0 (0.0 %) 0.5 0.7'.split()
-    alone = next(line for line in lines if line[:len(fault.split())] == fault.split())
-    assert alone[len(fault.split()):][3:9] == '1 (100.0 %) 1 (100.0 %)'.split()
+def test_shares_beyond_the_limits():
+    def result(sigma):
+        return {'levelled': [{'t_s': 4.0, 'tilt_sigmas': sigma, 'heading_sigmas': 0.5,
+                              'tilt_deg': 0.2, 'heading_deg': 0.7}]}
+    columns = common.moment_columns('levelled')
+
+    def cells(*sigmas):
+        group = 'name', [*map(result, sigmas), {'levelled': []}]
+        return [value(group) for _, _, value in columns]
+
+    assert cells(1.0, 4.0) == ['name', 3, 2, 4.0, '1 (50.0 %)', '0 (0.0 %)', 4.0, 0.2,
+                               '0 (0.0 %)', '0 (0.0 %)', 0.5, 0.7]
+    assert cells(6.0)[4:6] == ['1 (100.0 %)', '1 (100.0 %)']
+    assert cells()[2:] == [0] + [None] * 9
 
 
-def test_a_declared_trial_is_judged_against_the_truth(monkeypatch):
+def test_a_declared_run_is_judged_against_the_truth(monkeypatch):
     monkeypatch.setattr(declare, 'DURATION', 20.0)
-    task = next(t for t in map(declare.trial, range(500)) if t['fault'] == 'none'
-                and t['scenario'] == 'flight' and t['simulate']['imu_grade'] == 'navigation')
-    result = declare.run_trial(task)
+    index = next(index for index, case in enumerate(map(declare.draw, range(500)))
+                 if case[:2] == ('none', 'flight') and case.simulate['imu_grade'] == 'navigation')
+    result = common.run_case((declare.draw, index))
     assert result['state'] == State.ALIGNED.value
-    for moment in ('levelled', 'aligned', 'final'):
-        for name in ('initial', 'current'):
-            assert result[moment][name]['heading_sigmas'] < 5
+    for moment in ('levelled', 'declared', 'final'):
+        assert common.worst(result[moment]) < 5
+    assert common.worst(result['final'], 'heading') == result['final'][0]['heading_sigmas']
 
 
-def test_note_with_and_without_lever_arm(monkeypatch):
-    monkeypatch.setattr(note, 'DURATION', 12.0)
-    errors = {name: np.array([note.run_one(('navigation', name, seed)) for seed in range(3)])
-              for name in ('not compensated', 'compensated', 'zero lever arm')}
-    end = {name: error[:, -1] for name, error in errors.items()}
+def test_note_with_and_without_lever_arm():
+    end = {}
+    for case in bound.NOTE_CASES[:3]:
+        short = case._replace(simulate={**case.simulate, 'duration': 12.0})
+        end[case.name.partition(': ')[2]] = np.array([
+            bound.run_exact((short, seed))['rpy_deg'][-1] for seed in range(3)])
     assert common.rms(end['compensated'][:, 2]) < 1.0
     # With its term the lever arm is as if it were not there, without it is not.
     same = common.rms(end['compensated'] - end['zero lever arm'])
@@ -153,7 +157,7 @@ def test_note_with_and_without_lever_arm(monkeypatch):
 
 
 def test_short_form_stays_below_its_limit():
-    time, remainder, limit, term, integral = note.remarks_of(100.0)
+    time, remainder, limit, term, integral = bound.remarks_of(100.0)
     assert np.all(remainder[1:] <= limit[1:])
     assert limit[-1] == pytest.approx(2 * 7.292115e-5 ** 2 * time[-1] * math.sqrt(3))
     assert integral[-1] > 100 * term[-1]
@@ -174,13 +178,22 @@ def test_window_of_a_recording_against_its_reference(folder):
     assert recordings.recordings_in(folder) == [path, folder / 'hovering']
     recording = recordings.load(path)
     assert recording.duration == pytest.approx(32.0, abs=0.1)
-    window = recordings.run_window((path, 2.0, 25.0, {}))
-    assert window.moves and not window.covers_minute
-    assert window.declared_s is not None and window.declared.heading_sigmas < 5
-    assert window.time[-1] == pytest.approx(25.0, abs=0.5)
-    assert np.abs(window.error_deg[-1, 2]) < 3.0
-    assert np.nanmedian(np.abs(window.course_deg)) < 3.0
-    assert not recordings.run_window((folder / 'hovering', 0.0, 25.0, {})).moves
+    window = recordings.run_window((path, 2.0, 25.0, {}, 1.0))
+    assert window['moves'] and not window['covers_minute']
+    [first] = window['first']
+    assert first['heading_sigmas'] < 5 and 0.0 < first['t_s'] <= window['declared_s']
+    assert window['worst_sigmas'] < 5 and window['beyond'][1] == window['beyond_s'] == 0
+    assert window['epochs'] == pytest.approx(5 * 25.0 * window['aligned_part'], abs=5)
+    assert window['at'] == {}
+    hovering = recordings.run_window((folder / 'hovering', 0.0, 31.0, {}, 1.0))
+    assert not hovering['moves']
+    [late] = hovering['at']['30']
+    assert late['t_s'] == pytest.approx(30.0, abs=0.5) and late['tilt_deg'] < 1.0
+
+
+def test_course_over_ground_is_compared_with_the_reference(folder):
+    [at] = recordings.run_window((folder / 'driven', 0.0, 32.0, {}, 1.0))['at']['30']
+    assert at['course_deg'] < 3.0 and at['heading_deg'] < 3.0
 
 
 def test_recordings_and_their_files(folder, tmp_path, capsys):
@@ -189,24 +202,23 @@ def test_recordings_and_their_files(folder, tmp_path, capsys):
     assert 'ins_align experiment recordings --out DIR --data DIR' in text
     assert 'driven, bank' in text
     numbers = json.loads((tmp_path / 'recordings.json').read_text('utf-8'))
-    assert [window['start_s'] for window in numbers['driven']['bank']] == [0.0, 10.0, 20.0]
-    assert (tmp_path / 'recordings.png').stat().st_size > 10_000
-    assert 'driven, course' in capsys.readouterr().out
+    assert [window['start_s'] for window in numbers['driven, bank']] == [0.0, 10.0, 20.0]
+    assert 'course at 30 s' in capsys.readouterr().out
 
 
 def test_every_weak_spot_is_one_of_its_own():
     s = simulate('car', imu_rate=50.0, duration=100.0, seed=1, velocity_std_vertical=1.0)
     whole = stream_of(s)
-    for case in weak_spots.CASES:
+    for spot in weak_spots.SPOTS:
         stream = stream_of(s)
-        if case.spoil is not None:
-            case.spoil(stream, np.random.default_rng(1))
+        if spot.spoil is not None:
+            spot.spoil(stream, np.random.default_rng(1))
             assert stream.config != whole.config or any(
                 getattr(stream, name).tobytes() != getattr(whole, name).tobytes()
-                for name in ('imu', 'fix', 'velocity')), case.name
+                for name in ('imu', 'fix', 'velocity')), spot.name
         else:
-            assert case.simulate or case.config or 'nothing wrong' in case.name
-    assert len({case.name for case in weak_spots.CASES}) == len(weak_spots.CASES)
+            assert spot.simulate or spot.config or 'nothing wrong' in spot.name
+    assert len({spot.name for spot in weak_spots.SPOTS}) == len(weak_spots.SPOTS)
 
 
 def test_weak_spots_are_judged_by_the_clock_of_the_imu():
@@ -215,39 +227,40 @@ def test_weak_spots_are_judged_by_the_clock_of_the_imu():
         stream = stream_of(s)
         for rows in stream.imu, stream.fix, stream.velocity:
             rows['stamp'] += by_ns
+        stream.stamp_imu(stream.imu['stamp'])
 
         def judged(turned=np.eye(3)):
-            looks = common.follow(Aligner(common.config_for(s)), stream.messages(Config()))
-            return looks[-1].state, common.while_aligned(
-                looks, int(stream.imu['stamp'][0]),
-                lambda stamps: turned @ s.attitude_at(stream.measured_at(stamps)))
+            epochs = list(itertools.chain(*common.follow(
+                Aligner(common.config_for(s)), stream.messages(Config()))))
+            return epochs[-1].state, common.while_aligned(
+                epochs, stream.start_ns,
+                lambda stamps: turned @ s.attitude_at(stream.true_stamps(stamps)))
 
         state, result = judged()
         assert state is State.ALIGNED and 0.0 < result['worst_sigmas'] < 5.0
         assert result['beyond_s'] == 0.0 and 0.3 < result['aligned_part'] < 0.9
         _, wrong = judged(exp_so3(np.radians([0.0, 0.0, 20.0])))
-        assert wrong['declared_sigmas'] > 10.0 and 15.0 < wrong['worst_heading_deg'] < 25.0
+        assert common.worst(wrong['first']) > 10.0 and 15.0 < wrong['worst_heading_deg'] < 25.0
         assert wrong['beyond_s'] == pytest.approx(40.0 - wrong['declared_s'], abs=0.5)
 
 
 def test_weak_spots_and_their_files(folder, tmp_path, monkeypatch):
     chosen = ('nothing wrong', 'GNSS stays away after 60 s', 'gyro x alone reversed, launch',
               'IMU losses of 50 to 600 ms, attitude between epochs')
-    monkeypatch.setattr(weak_spots, 'CASES', [
-        case._replace(simulate={'duration': 40.0, **case.simulate})
-        for case in weak_spots.CASES if case.name in chosen])
+    monkeypatch.setattr(weak_spots, 'SPOTS', [
+        spot._replace(simulate={'duration': 40.0, **spot.simulate})
+        for spot in weak_spots.SPOTS if spot.name in chosen])
     monkeypatch.setattr(weak_spots, 'RECORDING', 'driven')
-    monkeypatch.setattr(weak_spots, 'STARTS', (0.0,))
     monkeypatch.setitem(recordings.KNOWN_LEVER_ARMS, 'driven', (0.0, 0.0, 0.0))
     experiments.run('weak-spots', tmp_path, folder, runs=1, jobs=1)
     assert 'weak-spots --out DIR --runs 1' in (tmp_path / 'weak-spots.md').read_text('utf-8')
-    cases = json.loads((tmp_path / 'weak-spots.json').read_text('utf-8'))['cases']
-    assert len(cases) == len(chosen) + 2 and all(len(runs) == 1 for runs in cases.values())
-    right, away, between, reversed_, *of_recording = (runs[0] for runs in cases.values())
-    assert right['end'] and right['worst_sigmas'] < 5.0
-    assert not away['end'] and 0.1 < away['aligned_part'] < 0.9
+    found = json.loads((tmp_path / 'weak-spots.json').read_text('utf-8'))['cases']
+    assert len(found) == len(chosen) + 2 and all(len(runs) == 1 for runs in found.values())
+    right, away, between, reversed_, *of_recording = (runs[0] for runs in found.values())
+    assert right['state'] == 'ALIGNED' and right['worst_sigmas'] < 5.0
+    assert away['state'] != 'ALIGNED' and 0.1 < away['aligned_part'] < 0.9
     assert between['worst_sigmas'] < 5.0 and reversed_['declared_s'] is None
-    assert [run['end'] for run in of_recording] == [True, False]
+    assert [run['state'] == 'ALIGNED' for run in of_recording] == [True, False]
 
 
 @pytest.mark.parametrize('arguments, reason', [

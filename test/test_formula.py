@@ -18,8 +18,8 @@ from functools import lru_cache
 from alignment import cut_at, integrate
 from ins_align.estimation import formula, moments as q_method
 from ins_align.estimation.track import InertialTrack
+from ins_align.experiments.bound import exact_lever_remainder
 from ins_align.experiments.dense import bound
-from ins_align.experiments.note import exact_lever_remainder
 from ins_align.geometry.earth import EARTH_RATE, earth_rate_n
 from ins_align.simulation.simulate import simulate
 import numpy as np

@@ -80,7 +80,7 @@ def test_killed_figure_leaves_the_old_one(tmp_path, call):
     draw = """
 from ins_align.experiments.common import Report
 from ins_align.report import new_figure
-Report('x', 'X', pathlib.Path(sys.argv[2])).figure(new_figure(2, 2), '', 'x')
+Report('x', 'X', pathlib.Path(sys.argv[2])).figure(new_figure(2, 2), 'x')
 """
     program = KILLED.partition('from ins_align')[0] + draw
     done = subprocess.run([sys.executable, '-c', program, call, str(tmp_path)],

@@ -22,14 +22,19 @@ from __future__ import annotations
 import importlib
 from pathlib import Path
 
-# Module and function of each, in the order in which `all` runs them.
-NAMES = {'note': 'note.run', 'bound': 'bound.run', 'declare': 'declare.run',
-         'declare-worse': 'declare.run_worse', 'faults': 'faults.run',
-         'weak-spots': 'weak_spots.run', 'vehicle': 'weak_spots.run_vehicle',
-         'recordings': 'recordings.run'}
-NEED_DATA = ('recordings',)
-# Only by name: it measures the machine too, and needs ROS.
-MEASUREMENTS = {'bench': 'bench.run'}
+# Title, function and by default how many runs of each, in the order in which `all` runs them.
+NAMES = {
+    'note': ("The note's experiment", 'bound.run_note', 100),
+    'bound': ('The estimator at the Cramer-Rao bound', 'bound.run', 100),
+    'declare': ('Declared means right', 'declare.run', 1000),
+    'declare-worse': ('IMUs worse than configured', 'declare.run_worse', 500),
+    'faults': ('What drivers get wrong', 'faults.run', 1000),
+    'weak-spots': ('Where it is wrong and sure of itself', 'weak_spots.run', 24),
+    'vehicle': ('What a vehicle knows of its motion', 'weak_spots.run_vehicle', 24),
+    'recordings': ('Real recordings', 'recordings.run', 0)}
+NEED_DATA, TAKE_DATA = ('recordings',), ('weak-spots', 'vehicle', 'recordings')
+# Only by name: it measures the machine too, and needs ROS. Its runs are minutes of data.
+MEASUREMENTS = {'bench': ('Speed', 'bench.run', 60)}
 
 
 class ExperimentError(ValueError):
@@ -62,7 +67,17 @@ def run(name: str, out_dir: str | Path, data_dir: str | Path | None = None,
     for each in NAMES if name == 'all' else (name,):
         if each in NEED_DATA and data_dir is None:
             print(f'{each}: left out, it needs recordings (--data DIR)')
-            continue
-        module, function = (NAMES | MEASUREMENTS)[each].split('.')
-        getattr(importlib.import_module(f'ins_align.experiments.{module}'), function)(
-            out, None if data_dir is None else Path(data_dir), runs, jobs)
+        else:
+            _run(each, out, Path(data_dir) if data_dir and each in TAKE_DATA else None, runs, jobs)
+
+
+def _run(name: str, out: Path, data: Path | None, runs: int | None, jobs: int | None) -> None:
+    from ins_align.experiments.common import Report
+
+    title, path, default = (NAMES | MEASUREMENTS)[name]
+    runs = runs or default
+    module, function = path.split('.')
+    report = Report(name, title, out, (f' --runs {runs}' if default else '')
+                    + (' --data DIR' if data else ''))
+    report.write(getattr(importlib.import_module(f'ins_align.experiments.{module}'), function)(
+        report, runs, jobs, data))

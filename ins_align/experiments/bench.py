@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, ExitStack, suppress
-from operator import itemgetter
 import os
 from pathlib import Path
 import resource
@@ -37,11 +36,9 @@ import time
 from typing import Any
 
 from ins_align.aligner import Aligner
-from ins_align.experiments.common import config_for, JsonDict, Report
+from ins_align.experiments.common import config_for, field, JsonDict, Report
 from ins_align.simulation.simulate import give, simulate
-import numpy as np
 
-MINUTES = 60
 REPEATS = 3
 CPU_SECONDS = 20.0
 EPOCH_SECONDS = 600.0
@@ -56,35 +53,27 @@ with AnyReader([Path(sys.argv[1])]) as reader:
 CLI = '-m', 'ins_align.cli'
 BESIDE = '-m', 'ins_align.experiments.bench'
 NODE = '-m', 'ins_align.ros.main', '--ros-args', '-p', 'lever_arm:=[1.0, 1.0, 1.0]'
-DRIVE = '--scenario', 'car', '--imu-rate', '200'
 
 
-def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
+def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Measure everything one after the other, without anything else beside it."""
-    minutes = runs or MINUTES
-    report = Report('bench', 'Speed', out, f' --runs {minutes}')
     report.text('Ratios against something measured in the same run on the same machine; for '
                 'replay and start the median of three goes, for the node processor time of the '
                 'whole process while both run beside each other on the same messages.')
     with tempfile.TemporaryDirectory() as folder:
-        rows = [replay_against_bare_pass(Path(folder), storage, minutes) for storage in TARGETS]
-        rows += node_rows(Path(folder))
-    rows += [*epoch_rows(), row_of(
-        'ins_align --help; start of Python', *medians([*CLI, '--help'], ['-c', 'pass']), 's',
-        'less than 0.5 s longer')]
+        rows = [*(replay_against_bare_pass(Path(folder), storage, runs) for storage in TARGETS),
+                *node_rows(Path(folder)), *epoch_rows(), row(
+                    'ins_align --help; start of Python',
+                    *medians([*CLI, '--help'], ['-c', 'pass']), 's', 'less than 0.5 s longer')]
     report.table('Ours, what it is measured against, their ratio and what it should be at most',
-                 rows, [(name, '', itemgetter(name)) for name in rows[0]])
-    report.write(rows)
+                 rows, [field(name, name) for name in rows[0]])
+    return rows
 
 
-def cells(name: str, ours: str, other: str, ratio: str = '', target: str = '') -> JsonDict:
-    """Make a row of the table."""
-    return {'name': name, 'ours': ours, 'other': other, 'ratio': ratio, 'target': target}
-
-
-def row_of(name: str, ours: float, other: float, unit: str, target: str) -> JsonDict:
+def row(name: str, ours: float, other: float, unit: str, target: str = '') -> JsonDict:
     """Make a row of two measurements and their ratio."""
-    return cells(name, f'{ours:.3g} {unit}', f'{other:.3g} {unit}', f'{ours / other:.2f}', target)
+    return {'name': name, 'ours': f'{ours:.3g} {unit}', 'other': f'{other:.3g} {unit}',
+            'ratio': f'{ours / other:.2f}' if other else '', 'target': target}
 
 
 def elapsed(arguments: Sequence[str]) -> float:
@@ -103,35 +92,39 @@ def medians(*processes: Sequence[str]) -> list[float]:
     return [statistics.median(column) for column in zip(*times)]
 
 
+def recorded(folder: Path, *options: str) -> str:
+    """Simulate a recording."""
+    bag = str(folder / options[-1])
+    elapsed([*CLI, 'simulate', bag, '--scenario', 'car', '--imu-rate', '200', *options])
+    return bag
+
+
 def replay_against_bare_pass(folder: Path, storage: str, minutes: int) -> JsonDict:
     """Replay a recording, and only count its messages."""
-    bag = str(folder / f'bag_{storage}')
-    elapsed([*CLI, 'simulate', bag, *DRIVE, '--duration', f'{60 * minutes}', '--storage', storage])
-    return row_of(f'replay of {minutes} min, {storage}; bare pass', *medians(
+    bag = recorded(folder, '--duration', f'{60 * minutes}', '--storage', storage)
+    return row(f'replay of {minutes} min, {storage}; bare pass', *medians(
         [*CLI, 'replay', bag, '--params', f'{bag}/ins_align.yaml'], ['-c', COUNT, bag]), 's',
         TARGETS[storage])
 
 
 def node_rows(folder: Path) -> list[JsonDict]:
     """Compare processor times of nodes."""
-    bag = str(folder / 'played')
-    elapsed([*CLI, 'simulate', bag, *DRIVE, '--gnss-rate', '10',
-             '--duration', f'{CPU_SECONDS + 15.0}'])
+    bag = recorded(folder, '--gnss-rate', '10', '--duration', f'{CPU_SECONDS + 15.0}')
     rows = []
-    for name, title in (('bare', 'node, nobody listens; node that does nothing'),
-                        ('republish', 'node, ~/imu listened to; node that republishes')):
+    for title, *beside in (('node, nobody listens; node that does nothing', 'bare'),
+                           ('node, ~/imu listened to; node that republishes', 'republish',
+                            'listen')):
         with ExitStack() as stack:
-            nodes = [stack.enter_context(_process(*each)) for each in (NODE, (*BESIDE, name))]
-            if name == 'republish':
-                stack.enter_context(_process(*BESIDE, 'listen'))
+            nodes = [stack.enter_context(_process(*each))
+                     for each in (NODE, *((*BESIDE, name) for name in beside))]
             time.sleep(3.0)
             stack.enter_context(_process(*BESIDE, 'play', bag))
             time.sleep(8.0)
-            before = [_cpu_seconds(pid) for pid in nodes]
+            before = [_cpu_seconds(pid) for pid in nodes[:2]]
             time.sleep(CPU_SECONDS)
             spent = [100.0 * (_cpu_seconds(pid) - start) / CPU_SECONDS
                      for pid, start in zip(nodes, before)]
-        rows.append(row_of(title, *spent, '% CPU', '1.15'))
+        rows.append(row(title, *spent, '% CPU', '1.15'))
     return rows
 
 
@@ -170,11 +163,10 @@ def epoch_rows() -> list[JsonDict]:
             times.append(1e3 * (now - start))
             start = now
             resident.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
-    grown = resident[-1] - resident[len(resident) // 10]
-    return [cells(f'GNSS epoch of the estimator, {len(times)}: median; longest',
-                  f'{np.median(times):.3g} ms', f'{max(times):.3g} ms', target='20 ms'),
-            cells(f'largest memory in {EPOCH_SECONDS / 60:g} min; its growth after a tenth of '
-                  'them', f'{resident[-1]:.0f} MB', f'{grown:.1f} MB')]
+    return [row(f'GNSS epoch of the estimator, {len(times)}: longest; median', max(times),
+                statistics.median(times), 'ms', 'longest 20 ms'),
+            row(f'largest memory after {EPOCH_SECONDS / 60:g} min; after a tenth of them',
+                resident[-1], resident[len(resident) // 10], 'MB')]
 
 
 # The processes beside the node

@@ -11,11 +11,19 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What the experiments share: runs, how they are judged, tables and pages."""
+"""
+What the experiments share: cases and their runs, errors against truth, tables and pages.
+
+A case is a simulated vehicle whose messages are spoilt, aligned and judged against the truth.
+Every campaign draws cases from numbers, `run_case` runs them in the same way, and its tables have
+a row for all runs of a name.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from functools import partial
 import io
 import itertools
 import json
@@ -25,7 +33,7 @@ from typing import Any, NamedTuple
 
 from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
-from ins_align.experiments.spoilt import Message, SECOND, SENSORS, Stream, stream_of
+from ins_align.experiments.spoilt import LOT, Message, SECOND, SENSORS, Stream, stream_of
 from ins_align.geometry.rotation import Array, log_so3
 from ins_align.outputs import write_whole
 from ins_align.processes import pool, processors
@@ -39,13 +47,14 @@ GRADES = ('navigation', 'tactical', 'mems')
 BINS = (3.0, 5.0)       # sigmas that are counted
 COLOURS = 64            # of a figure
 UPDATE_EVERY = 5.0      # s
-LONGEST = 5.0           # s that a look stands for
-ANGLES = {'tilt': slice(0, 2), 'heading': slice(2, 3)}      # what is counted, and its axes
+LONGEST = 5.0           # s that an epoch stands for
+BETWEEN_LOT = 7         # IMU samples given at once where attitudes between epochs are judged
+ANGLES = ('tilt', 'heading')
 
 JsonDict = dict[str, Any]
-Groups = list[tuple[str, list[JsonDict]]]       # of trials, with names
 Column = tuple[str, str, Callable[[Any], Any]]  # title, format, and the value of a row's object
-Truth = Callable[[Any], Any]                    # attitudes at stamps
+Truth = Callable[[list[int]], Sequence[Any]]    # ``C_nb`` at stamps, None where it is not known
+Groups = list[tuple[str, list[JsonDict]]]       # names and their runs
 
 
 def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jobs: int | None,
@@ -60,19 +69,25 @@ def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jo
 
     every = list(itertools.chain(*groups))
     jobs = min(jobs or processors(), max(len(every), 1))
-
-    def grouped(results: Iterable[Any]) -> list[list[Any]]:
+    with ExitStack() as stack:
+        results = map(function, every) if jobs == 1 else stack.enter_context(pool(jobs)).map(
+            function, every, chunksize=max(1, min(10, len(every) // (4 * jobs))))
         shown = iter(tqdm(results, name, len(every), disable=None))     # None: not on a terminal
         return [list(itertools.islice(shown, len(group))) for group in groups]
 
-    if jobs == 1:
-        return grouped(map(function, every))
-    with pool(jobs) as executor:
-        return grouped(executor.map(function, every,
-                                    chunksize=max(1, min(10, len(every) // (4 * jobs)))))
 
+# Runs
 
-# What is run
+class Case(NamedTuple):
+    """One run: what is simulated, how its messages are spoilt, what is configured."""
+
+    name: str                       # the row of a table
+    scenario: str
+    simulate: JsonDict              # arguments of `simulate`
+    config: JsonDict = {}           # parameters of `Config` in place of the truth
+    spoil: Callable[[Stream], Any] | None = None
+    between: bool = False           # attitudes between epochs are judged, instead of those there
+
 
 def combination(index: int, seed: Sequence[int], *axes: Iterable[Any]) -> Any:
     """Return one of the combinations of `axes`; each comes once before any comes twice."""
@@ -87,6 +102,56 @@ def setup(random: np.random.Generator) -> JsonDict:
     return {'heading_deg': random.uniform(-180, 180), 'latitude_deg': random.uniform(-75, 75),
             'lever_arm': random.uniform(-1.5, 1.5, 3).tolist(),
             'mount_rpy_deg': random.uniform(-20, 20, 3).tolist()}
+
+
+def run_case(task: Sequence[Any]) -> JsonDict:
+    """Run what a function draws, the task being the function and its arguments; judge it."""
+    case = task[0](*task[1:])
+    simulation, stream, aligner = prepare(case)
+    looks = follow(aligner, stream.messages(aligner.config), between=case.between)
+    return outcome(case, simulation, stream, aligner, list(itertools.chain(*looks)))
+
+
+def prepare(case: Case) -> tuple[Simulation, Stream, Aligner]:
+    """Simulate, spoil the messages, and configure an aligner for what is left of the truth."""
+    simulation = simulate(case.scenario, **case.simulate)
+    stream = stream_of(simulation, BETWEEN_LOT if case.between else LOT)
+    if case.spoil is not None:
+        case.spoil(stream)
+    return simulation, stream, Aligner(config_for(simulation, **{**stream.config, **case.config}))
+
+
+def follow(aligner: Aligner, sent: Iterable[Message], every_s: float = UPDATE_EVERY,
+           between: bool = False) -> Iterator[list[Epoch]]:
+    """
+    Give an aligner messages in the order of arrival, and yield the epochs of each update.
+
+    An update without epochs yields what the status says, as an epoch without GNSS, so that silence
+    counts. Updates come every so often, with messages 'update' and 'reset', and at the end;
+    `between`: after every message, with the attitude now instead of epochs.
+    """
+    due = 0.0 if math.isfinite(every_s) else math.inf
+    for now, kind, payload in sent:
+        if kind in SENSORS:
+            give(aligner, kind, payload)
+        elif kind == 'reject':
+            aligner.reject(payload)
+        if between or now >= due or kind in ('update', 'reset'):
+            yield _epochs(aligner, aligner.update(), between)
+            due = now + every_s * SECOND
+        if kind == 'reset':
+            aligner.reset()
+    yield _epochs(aligner, aligner.flush(), between)
+
+
+def _epochs(aligner: Aligner, epochs: list[Epoch], between: bool) -> list[Epoch]:
+    stamp_ns = aligner.newest_imu_ns
+    if stamp_ns is None or (epochs and not between):
+        return epochs
+    status = aligner.status()
+    return [Epoch(stamp_ns, math.nan, status.state, status.initial,
+                  aligner.attitude_now() if between else status.current, np.full(3, np.nan),
+                  status.gyro_bias, status.accel_bias, dry=True)]
 
 
 def config_for(simulation: Simulation, **changes: Any) -> Config:
@@ -107,159 +172,96 @@ def exact_config_for(simulation: Simulation, **changes: Any) -> Config:
         'lever_arm_std': 0.0, 'gnss_delay_std': 0.0, **changes})
 
 
-def prepare(scenario: str, arguments: JsonDict, config: JsonDict, frame: str = 'enu',
-            spoil: Callable[[Stream], Any] | None = None) -> tuple[Simulation, Stream, Aligner]:
-    """Simulate, spoil the messages, and configure an aligner for what is left of the truth."""
-    simulation = simulate(scenario, **arguments)
-    stream = stream_of(simulation, frame)
-    if spoil is not None:
-        spoil(stream)
-    return simulation, stream, Aligner(config_for(simulation, **{**stream.config, **config}))
+# How they are judged
 
-
-class Look(NamedTuple):
-    """What an aligner says at an epoch, or between epochs: there `t_s` is None."""
-
-    stamp_ns: int
-    t_s: float | None
-    state: State
-    initial: Attitude | None
-    current: Attitude | None
-
-
-def follow(aligner: Aligner, sent: Iterable[Message], every_s: float = UPDATE_EVERY,
-           between: bool = False, watch: Callable[[list[Epoch]], Any] | None = None) -> list[Look]:
+def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Any = 0.0) -> JsonDict:
     """
-    Give an aligner messages in the order of arrival, and look at what it says every so often.
+    Compare an attitude with ``C_nb``, whose own sigma (3,), if any, is added in quadrature.
 
-    Without epochs it is looked at as well, so that silence counts; `every_s` 0: when the messages
-    have an 'update'. `between` asks for the attitude after every message instead of looking at
-    epochs; `watch` gets the epochs of each update.
+    ``angles_deg`` (3,) about east, north, up; ``nees``, their normalised squared error; tilt and
+    heading in degrees and in stated sigmas, of the tilt the larger one of two axes.
     """
-    looks: list[Look] = []
-
-    def look(epochs: list[Epoch]) -> None:
-        if watch is not None:
-            watch(epochs)
-        if epochs and not between:
-            looks.extend(Look(*(getattr(epoch, name) for name in Look._fields))
-                         for epoch in epochs)
-        elif aligner.newest_imu_ns is not None:
-            status = aligner.status()
-            looks.append(Look(aligner.newest_imu_ns, None, status.state, status.initial,
-                              aligner.attitude_now() if between else status.current))
-
-    due = 0.0 if every_s else math.inf
-    for now, kind, payload in sent:
-        if kind in SENSORS:
-            give(aligner, kind, payload)
-        elif kind == 'reject':
-            aligner.reject(payload)
-        if between or now >= due or kind in ('update', 'reset'):
-            look(aligner.update())
-            due = now + every_s * SECOND if every_s else math.inf
-        if kind == 'reset':
-            aligner.reset()
-    look(aligner.flush())
-    return looks
-
-
-# How it is judged
-
-class Error(NamedTuple):
-    """Error of an attitude against the truth."""
-
-    angles_deg: Array       # (3,), about east, north, up
-    sigma_deg: Array        # (3,), stated
-    nees: float             # normalised squared error of the three angles
-    tilt_sigmas: float      # the larger one of two, each in its sigma
-    heading_sigmas: float
-
-    @property
-    def worst_sigmas(self) -> float:
-        """Larger one of tilt and heading."""
-        return max(self.tilt_sigmas, self.heading_sigmas)
-
-    @property
-    def tilt_deg(self) -> float:
-        """Angle between the verticals."""
-        return float(np.hypot(*self.angles_deg[:2]))
-
-    def to_json(self) -> JsonDict:
-        """Return plain numbers."""
-        return {'error_deg': self.angles_deg.tolist(), 'sigma_deg': self.sigma_deg.tolist(),
-                'tilt_sigmas': self.tilt_sigmas, 'heading_sigmas': self.heading_sigmas}
-
-
-def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Array | None = None) -> Error:
-    """Compare an attitude with ``C_nb``, whose own sigma (3,), if any, is added in quadrature."""
     phi = log_so3(C_true @ attitude.C_nb.T)
-    covariance = attitude.covariance
-    if extra_std_deg is not None:
-        covariance = covariance + np.diag(np.radians(extra_std_deg) ** 2)
-    angles, sigma = np.degrees(phi), np.degrees(np.sqrt(np.diag(covariance)))
-    sigmas = np.abs(angles) / sigma
-    return Error(angles, sigma, float(phi @ np.linalg.solve(covariance, phi)),
-                 float(np.max(sigmas[:2])), float(sigmas[2]))
+    covariance = attitude.covariance + np.diag(np.radians(np.broadcast_to(extra_std_deg, 3)) ** 2)
+    angles, sigmas = np.degrees(phi), np.abs(phi) / np.sqrt(np.diag(covariance))
+    return {'angles_deg': angles, 'nees': float(phi @ np.linalg.solve(covariance, phi)),
+            'tilt_sigmas': float(np.max(sigmas[:2])), 'heading_sigmas': float(sigmas[2]),
+            'tilt_deg': float(np.hypot(*angles[:2])), 'heading_deg': float(abs(angles[2]))}
 
 
-def judged(look: Look | None, true: Truth) -> JsonDict | None:
-    """Compare the attitudes of a look with the truth at their stamps."""
-    if look is None or look.initial is None or look.current is None:
-        return None
-    return {'t_s': look.t_s} | {
-        name: error_of(attitude, true(attitude.stamp_ns)).to_json()
-        for name, attitude in (('initial', look.initial), ('current', look.current))}
+def outcome(case: Case, simulation: Simulation, stream: Stream, aligner: Aligner,
+            epochs: list[Epoch]) -> JsonDict:
+    """Return which run it was, how it ended, and how right it was."""
+    status = aligner.status()
+
+    def true(stamps: list[int]) -> Array:
+        return simulation.attitude_at(stream.true_stamps(stamps))
+
+    return {'name': case.name, 'scenario': case.scenario, 'imu': aligner.config.imu_grade,
+            'seed': case.simulate['seed'], 'state': status.state.value, 'reason': status.reason,
+            'counts': {name: count for name, count in status.counts.items() if count},
+            'least_heading_sigma_deg': min((epoch.initial.sigma_deg[2] for epoch in epochs
+                                            if epoch.initial is not None), default=None),
+            **moments(epochs, true), **while_aligned(epochs, stream.start_ns, true)}
 
 
-def moments(looks: Iterable[Look], true: Truth) -> JsonDict:
-    """Judge the first epoch that is levelled, the last if it is aligned, every declaration."""
-    epochs = [look for look in looks if look.t_s is not None]
-    aligned = [look.state is State.ALIGNED for look in epochs]
-    levelled = (look for look in epochs if look.state in (State.LEVELLED, State.ALIGNED))
-    declared = [judged(look, true) for look, before, now in zip(
-        epochs, [False, *aligned], aligned) if now and not before]
-    return {'levelled': judged(next(levelled, None), true),
-            'aligned': declared[0] if declared else None, 'declared': declared,
-            'final': judged(epochs[-1], true) if any(aligned[-1:]) else None}
+def moments(epochs: Iterable[Epoch], true: Truth) -> JsonDict:
+    """
+    Judge the first epoch that is levelled, every declaration, the last epoch if it is aligned.
+
+    The errors are the larger ones of the attitude at t0 and the current one. Lists, empty where
+    there was none.
+    """
+    epochs = [epoch for epoch in epochs if not epoch.dry]
+    aligned = [epoch.state is State.ALIGNED for epoch in epochs]
+    chosen = {
+        'levelled': [epoch for epoch in epochs
+                     if epoch.state in (State.LEVELLED, State.ALIGNED)][:1],
+        'declared': [epoch for epoch, before, now in zip(epochs, [False, *aligned], aligned)
+                     if now and not before],
+        'final': epochs[-1:] if any(aligned[-1:]) else []}
+    return {name: [moment(epoch.t_s, errors_of([epoch.initial, epoch.current], true))
+                   for epoch in each if epoch.initial is not None and epoch.current is not None]
+            for name, each in chosen.items()}
 
 
-def while_aligned(looks: Sequence[Look], start_ns: int, true: Truth,
-                  std_deg: Array | None = None) -> JsonDict:
+def moment(t_s: float, errors: list[JsonDict]) -> JsonDict:
+    """Return a time, s since t0, and the largest errors of tilt and heading."""
+    return {'t_s': t_s, **{name: max(error[name] for error in errors) for name in (
+        'tilt_sigmas', 'heading_sigmas', 'tilt_deg', 'heading_deg')}}
+
+
+def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth,
+                  std_deg: Any = 0.0) -> JsonDict:
     """
     Judge the current attitude whenever it is called aligned.
 
-    `true` may have None where nothing is known, `std_deg` (3,) says how well; `start_ns` is the
-    stamp of the first sample.
+    `std_deg` (3,) says how well the truth is known; `start_ns` is the stamp of the first sample.
     """
-    stamps = np.array([look.stamp_ns for look in looks], np.int64)
+    stamps = np.array([epoch.stamp_ns for epoch in epochs], np.int64)
     held = np.clip(np.diff(stamps, append=stamps[-1:]) / SECOND, 0.0, LONGEST)
-    aligned = {k: look.current for k, look in enumerate(looks)
-               if look.state is State.ALIGNED and look.current is not None}
-    truths = true([attitude.stamp_ns for attitude in aligned.values()]) if aligned else []
-    errors = {k: error_of(attitude, C_true, std_deg)
-              for (k, attitude), C_true in zip(aligned.items(), truths) if C_true is not None}
-    first = next(iter(errors), None)
-    wrong = [k for k, error in errors.items() if error.worst_sigmas > BINS[1]]
-    return {'declared_s': None if first is None else (stamps[first] - start_ns) / SECOND,
-            'declared_sigmas': None if first is None else errors[first].worst_sigmas,
-            'worst_sigmas': max((e.worst_sigmas for e in errors.values()), default=0.0),
-            'worst_heading_deg': max((abs(e.angles_deg[2]) for e in errors.values()),
-                                     default=0.0),
-            'beyond_s': np.sum(held[wrong]),
-            'aligned_part': np.sum(held[[*aligned]]) / max(np.sum(held), 1e-9)}
+    aligned = [k for k, epoch in enumerate(epochs)
+               if epoch.state is State.ALIGNED and epoch.current is not None]
+    errors = {k: error for k, error in zip(aligned, errors_of(
+        [epochs[k].current for k in aligned], true, std_deg)) if error is not None}
+    sigmas = {k: worst([error]) for k, error in errors.items()}
+    return {'first': [moment(epochs[k].t_s, [errors[k]]) for k in [*errors][:1]],
+            'declared_s': next(((stamps[k] - start_ns) / SECOND for k in errors), None),
+            'epochs': len(errors), 'worst_sigmas': most(sigmas.values()),
+            'worst_heading_deg': most(error['heading_deg'] for error in errors.values()),
+            'beyond': [beyond(sigmas.values(), limit) for limit in BINS],
+            'beyond_s': np.sum(held[[k for k in errors if sigmas[k] > BINS[1]]]),
+            'aligned_part': np.sum(held[aligned]) / max(np.sum(held), 1e-9)}
 
 
-def worse(moment: JsonDict | None, *angles: str) -> float:
-    """
-    Error of a judged moment in sigmas; -1 if there was none.
+def errors_of(attitudes: list[Any], true: Truth, std_deg: Any = 0.0) -> list[Any]:
+    """Compare attitudes with the truth; None where that is not known."""
+    truths = true([attitude.stamp_ns for attitude in attitudes]) if attitudes else ()
+    return [None if C_true is None else error_of(attitude, C_true, std_deg)
+            for attitude, C_true in zip(attitudes, truths)]
 
-    The worse of the attitude at t0 and the current one, of any of `ANGLES` or of all.
-    """
-    return -1.0 if moment is None else max(
-        moment[name][f'{angle}_sigmas'] for name in ('initial', 'current')
-        for angle in angles or ANGLES)
 
+# Tables, figures and pages; rows of a table are a name and its runs, or dictionaries
 
 def most(values: Iterable[float]) -> float | None:
     """Return the largest value, None if there is none."""
@@ -276,12 +278,75 @@ def rms(values: Any, axis: Any = None) -> Any:
     return np.sqrt(np.mean(np.square(values), axis=axis))
 
 
-def without(trials: list[JsonDict], *omitted: str) -> list[JsonDict]:
-    """Return trials without what need not be written."""
-    return [{key: value for key, value in t.items() if key not in omitted} for t in trials]
+def field(title: str, name: str, digits: str = '') -> Column:
+    """Return the column of what rows, which are dictionaries, have under a name."""
+    return title, digits, lambda row: row[name]
 
 
-# Pages
+def groups_of(runs: list[JsonDict], names: Iterable[str]) -> Groups:
+    """Group runs by name; the last group is all."""
+    return [*((name, [run for run in runs if run['name'] == name]) for name in names),
+            ('all', runs)]
+
+
+def worst(moments: Iterable[JsonDict], *angles: str) -> float | None:
+    """Return the largest error of judged moments in sigmas, of some of `ANGLES` or all."""
+    return most(moment[f'{angle}_sigmas'] for moment in moments for angle in angles or ANGLES)
+
+
+def beyond(values: Iterable[float | None], limit: float) -> int:
+    """Count values above a limit."""
+    return sum(value is not None and value > limit for value in values)
+
+
+def count(values: Iterable[Any]) -> int:
+    """Count what there is."""
+    return sum(map(bool, values))
+
+
+def over(title: str, name: str, value: Callable[[list[Any]], Any], digits: str = '') -> Column:
+    """Return the column of a value of what the runs of a row have under a name, if not None."""
+    return title, digits, lambda group: value(
+        [run[name] for run in group[1] if run[name] is not None])
+
+
+WHICH: list[Column] = [('case', '', lambda group: group[0]),
+                       ('runs', '', lambda group: len(group[1]))]
+
+
+def moment_columns(name: str) -> list[Column]:
+    """Return how many runs came to a moment, when, and how wrong each angle was."""
+    def first(title: str, value: Callable[[list[JsonDict]], Any], digits: str = '') -> Column:
+        return over(title, name, lambda found: value([each[0] for each in found if each]), digits)
+
+    def share(found: list[JsonDict], angle: str, limit: float) -> str | None:
+        wrong = beyond((moment[f'{angle}_sigmas'] for moment in found), limit)
+        return f'{wrong} ({100 * wrong / len(found):.1f} %)' if found else None
+
+    columns = [*WHICH, first('declared', len),
+               first('median, s', lambda found: median([each['t_s'] for each in found]), '.1f')]
+    for angle in ANGLES:
+        columns += [first(f'{angle} beyond {limit:g}', partial(share, angle=angle, limit=limit))
+                    for limit in BINS]
+        columns += [first(f'worst {angle}, sigma', lambda found, angle=angle: worst(found, angle),
+                          '.1f'),
+                    first(f'{angle}, deg', lambda found, angle=angle: most(
+                        each[f'{angle}_deg'] for each in found), '.2g')]
+    return columns
+
+
+ALIGNED_COLUMNS: list[Column] = [
+    *WHICH, over('declared', 'first', count),
+    over('at the end', 'state', lambda states: states.count(State.ALIGNED.value)),
+    over('declared beyond 3', 'first', lambda found: beyond(map(worst, found), BINS[0])),
+    *(over(f'beyond {limit:g}', 'worst_sigmas', partial(beyond, limit=limit)) for limit in BINS),
+    ('beyond 5, s', '.1f', lambda group: most(run['beyond_s'] for run in group[1]
+                                              if run['first'])),
+    over('worst, sigma', 'worst_sigmas', most, '.1f'),
+    over('heading, deg', 'worst_heading_deg', most, '.2g'),
+    over('aligned, %', 'aligned_part', lambda parts: 100 * np.mean(parts), '.0f'),
+    over('after, s', 'declared_s', median, '.1f')]
+
 
 class Report:
     """Collects the text of an experiment, prints it, writes it with the command that makes it."""
@@ -306,11 +371,11 @@ class Report:
         self._parts.append(f'{title}\n\n```text\n{table}\n```' if rows else f'{title}: none.')
         print(f'{title}\n\n{table}\n', flush=True)
 
-    def figure(self, figure: Any, suffix: str, caption: str) -> None:
+    def figure(self, figure: Any, caption: str) -> None:
         """Write a figure as PNG and refer to it."""
         from PIL import Image
 
-        file = f'{self._name}{suffix}.png'
+        file = f'{self._name}.png'
         drawn = io.BytesIO()
         figure.savefig(drawn, dpi=110)
         # A palette makes the files of the documentation a third as large.
@@ -327,19 +392,8 @@ class Report:
             write_whole(self._out / f'{self._name}.{suffix}', lambda file: file.write(content))
 
 
-def whose() -> list[Column]:
-    """Return the columns that say which trial it is."""
-    return [(title, '', lambda t, key=key: t[key]) for title, key in (
-        ('index', 'index'), ('fault', 'fault'), ('scenario', 'scenario'), ('IMU', 'imu'))]
-
-
-def groups_of(trials: list[JsonDict], faults: Iterable[str]) -> Groups:
-    """Group trials by fault; the last group is all."""
-    return [*((name, [t for t in trials if t['fault'] == name]) for name in faults),
-            ('all', trials)]
-
-
-def draw(width: float, height: float, panels: Sequence[Sequence[JsonDict]], **shared: Any) -> Any:
+def line_figure(width: float, height: float, panels: Sequence[Sequence[JsonDict]],
+                **shared: Any) -> Any:
     """
     Draw lines over time in a grid of panels, inches; what they share is for ``subplots``.
 

@@ -22,11 +22,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+import itertools
+from operator import itemgetter
 from typing import Any
 
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array
-from ins_align.gnss.messages import ENU_FROM_NED, fixes, MessageError, velocities
+from ins_align.gnss.messages import fixes, MessageError, velocities
 from ins_align.simulation.scenarios import displaced
 from ins_align.simulation.simulate import Simulation
 import numpy as np
@@ -38,7 +40,7 @@ Message = tuple[int, str, Any]      # when it arrives (ns), what it is, and itse
 SECOND = 1_000_000_000
 HOUR = 3600 * SECOND
 GRAVITY = 9.80665  # m/s^2
-LATENESS = round(Config().gnss_lateness * SECOND)
+LATENESS_NS = round(Config().gnss_lateness * SECOND)
 LOT = 100       # IMU samples given at once, in which the lateness of their stamps is taken for one
 GNSS = 'fix', 'velocity'
 SENSORS = 'imu', *GNSS
@@ -62,26 +64,31 @@ class Stream:
     velocity: np.ndarray
     first: int              # stamps between which the vehicle is simulated
     last: int
+    lot: int = LOT          # IMU samples given at once
     config: dict[str, Any] = field(default_factory=dict)        # what else is configured
     resets: list[int] = field(default_factory=list)     # when somebody asks for a new start
+    updates: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))  # or for results
     update_every: float = 0.0       # s, in the mean; 0: regularly, once a second
     expected: dict[str, int] = field(default_factory=dict)      # counters known beforehand
-    # Stamps from the first on and before the second are off by the third.
-    shift: tuple[int, int, int] = 0, 0, 0
+    # Stamps behind each of the former are off by one of the latter, of which there is one more.
+    clock: tuple[Any, Any] = (), (0,)
+
+    @property
+    def start_ns(self) -> int:
+        """Return the stamp of the first IMU sample."""
+        return int(next(iter(self.imu['stamp']), self.first))
 
     def true_stamps(self, stamps: Any) -> Any:
         """When what bears these stamps has been, by the simulation's clock."""
-        start, end, shift = self.shift
-        stamps = np.asarray(stamps)
-        moved = np.where((stamps >= start) & (stamps < end), stamps - shift, stamps)
-        return np.clip(moved, self.first, self.last)
+        edges, offsets = map(np.asarray, self.clock)
+        return np.clip(stamps - offsets[np.searchsorted(edges, stamps)], self.first, self.last)
 
-    def measured_at(self, stamps: Any) -> Any:
-        """When IMU samples with such stamps were measured, if they are stamped late or ahead."""
-        late = self.imu['stamp'] - self.imu['arrival']
-        medians = np.array([int(np.median(late[k:k + LOT])) for k in range(0, len(late), LOT)])
-        places = np.searchsorted(self.imu['stamp'][::LOT], stamps) - 1
-        return np.clip(stamps - medians[np.maximum(places, 0)], self.first, self.last)
+    def stamp_imu(self, stamps: np.ndarray) -> None:
+        """Stamp IMU samples otherwise than when they are measured, which is when they arrive."""
+        self.imu['stamp'] = stamps
+        late = stamps - self.imu['arrival']
+        self.clock = stamps[::LOT][1:], [int(np.median(late[k:k + LOT]))
+                                         for k in range(0, len(late), LOT)]
 
     def moment(self, random: Random, low: float = 0.1, high: float = 0.9) -> int:
         """Draw an instant from a part of the recording."""
@@ -108,53 +115,54 @@ class Stream:
             for name in names:
                 self.keep(name, ~within(getattr(self, name), window))
 
-    def displace(self, chosen: np.ndarray, away: Array) -> None:
-        """Move positions by ENU offsets in metres, or by one for all."""
-        here = self.fix['lla'][chosen]
-        self.fix['lla'][chosen] = displaced(here, np.broadcast_to(away, here.shape))
+    def put_off(self, name: str, chosen: np.ndarray, away: Array) -> None:
+        """Add ENU errors to positions (m) or velocities (m/s), or one to all that are chosen."""
+        if name == 'velocity':
+            self.velocity['velocity'][chosen] += away
+        else:
+            here = self.fix['lla'][chosen]
+            self.fix['lla'][chosen] = displaced(here, np.broadcast_to(away, here.shape))
 
-    def messages(self, config: Config, lot: int = LOT, update: Any = ()) -> Iterator[Message]:
+    def messages(self, config: Config) -> Iterator[Message]:
         """
         Yield what an aligner is given, in the order of arrival; IMU samples in lots.
 
-        Kinds are the names of the arrays, 'update' at the times given, 'reset', and 'reject' with
-        the reason for a message that cannot be used.
+        Kinds are the names of the arrays, 'update', 'reset', and 'reject' with the reason for a
+        message that cannot be used.
         """
-        kinds = *SENSORS, 'update', 'reset'
-        arrivals = [*(getattr(self, name)['arrival'] for name in SENSORS),
-                    np.asarray(update, np.int64), np.array(self.resets, np.int64)]
-        lengths = [len(times) for times in arrivals]
-        order = np.argsort(np.concatenate(arrivals), kind='stable')
-        kind = np.repeat(range(len(kinds)), lengths)[order]
-        places = order - (np.cumsum(lengths) - lengths)[kind]
-        for block in np.split(np.arange(len(order)), np.flatnonzero(np.diff(kind)) + 1):
-            what = kind[block[0]]
-            size = lot if what == 0 else 1
-            for start in range(0, len(block), size):
-                chosen = places[block[start:start + size]]
-                yield (int(arrivals[what][chosen[-1]]),
-                       *self._payload(config, kinds[what], chosen))
+        fix = self.fix
+        payloads = {'fix': fixes(*(fix[name] for name in fix.dtype.names[1:])),
+                    'velocity': self._velocities(config),
+                    'update': [None] * len(self.updates), 'reset': [None] * len(self.resets)}
+        arrivals = {**{name: getattr(self, name)['arrival'] for name in SENSORS},
+                    'update': self.updates, 'reset': self.resets}
+        events = sorted(((int(time), kind, place) for kind, times in arrivals.items()
+                         for place, time in enumerate(times)), key=itemgetter(0))
+        for kind, block in itertools.groupby(events, itemgetter(1)):
+            times, _, places = zip(*block)
+            if kind == 'imu':
+                for start in range(0, len(places), self.lot):
+                    lot = self.imu[list(places[start:start + self.lot])]
+                    yield (int(lot['arrival'][-1]), kind,
+                           (lot['stamp'], lot['gyro'], lot['accel']))
+                continue
+            for time, place in zip(times, places):
+                payload = payloads[kind][place]
+                yield time, 'reject' if isinstance(payload, str) else kind, payload
 
-    def _payload(self, config: Config, kind: str, chosen: np.ndarray) -> tuple[str, Any]:
-        if kind not in SENSORS:
-            return kind, None
-        rows = getattr(self, kind)[chosen]
-        if kind == 'imu':
-            return kind, (rows['stamp'], rows['gyro'], rows['accel'])
-        if kind == 'fix':
-            return kind, fixes(rows['stamp'], rows['lla'], rows['covariance'],
-                               rows['covariance_type'], rows['status'])[0]
+    def _velocities(self, config: Config) -> list[Any]:
+        """Return velocities, or why each cannot be used."""
+        rows = self.velocity
         stated = None if config.velocity_type == 'TwistStamped' else rows['covariance']
         try:
-            return kind, velocities(rows['stamp'], str(rows['frame_id'][0]), rows['velocity'],
-                                    stated, config)[0]
+            return velocities(rows['stamp'], ''.join(set(rows['frame_id'])), rows['velocity'],
+                              stated, config)
         except MessageError:
-            return 'reject', 'velocity_body_frame'
+            return ['velocity_body_frame'] * len(rows)
 
 
-def stream_of(simulation: Simulation, frame: str = 'enu') -> Stream:
-    """Return the messages of a simulation, velocities in ENU or NED."""
-    turn = ENU_FROM_NED if frame == 'ned' else np.eye(3)
+def stream_of(simulation: Simulation, lot: int = LOT) -> Stream:
+    """Return the messages of a simulation, its velocities taken for ENU."""
     imu = np.zeros(len(simulation.imu_stamps_ns), _IMU)
     imu['arrival'] = imu['stamp'] = simulation.imu_stamps_ns
     imu['gyro'], imu['accel'] = simulation.gyro, simulation.accel
@@ -164,10 +172,10 @@ def stream_of(simulation: Simulation, frame: str = 'enu') -> Stream:
         rows['arrival'], rows['stamp'] = simulation.gnss_arrival_ns, simulation.gnss_stamps_ns
     fix['lla'], fix['covariance'] = simulation.lla_deg, simulation.position_covariance
     fix['covariance_type'] = 3
-    velocity['velocity'] = simulation.velocity @ turn
-    velocity['covariance'] = turn @ simulation.velocity_covariance @ turn
+    velocity['velocity'] = simulation.velocity
+    velocity['covariance'] = simulation.velocity_covariance
     return Stream(imu, fix, velocity, int(simulation.imu_stamps_ns[0]),
-                  int(simulation.imu_stamps_ns[-1]), {'velocity_frame': frame})
+                  int(simulation.imu_stamps_ns[-1]), lot, {'velocity_frame': 'enu'})
 
 
 def within(rows: np.ndarray, window: Window) -> np.ndarray:
@@ -190,17 +198,15 @@ def directions(random: Random, number: int) -> Array:
 # Faults of GNSS
 
 def _outliers(stream: Stream, random: Random) -> None:
-    chosen = some(random, stream.fix, 0.01, 0.1)
-    stream.displace(chosen, random.uniform(10.0, 100.0, (len(chosen), 1))
-                    * directions(random, len(chosen)))
-    chosen = some(random, stream.velocity, 0.01, 0.1)
-    stream.velocity['velocity'][chosen] += (random.uniform(0.5, 10.0, (len(chosen), 1))
-                                            * directions(random, len(chosen)))
+    for name, least, most in ('fix', 10.0, 100.0), ('velocity', 0.5, 10.0):
+        chosen = some(random, getattr(stream, name), 0.01, 0.1)
+        stream.put_off(name, chosen, random.uniform(least, most, (len(chosen), 1))
+                       * directions(random, len(chosen)))
 
 
 def _position_jump(stream: Stream, random: Random) -> None:
     later = stream.fix['stamp'] >= stream.moment(random)
-    stream.displace(later, 10 ** random.uniform(1.3, 3.3) * directions(random, 1))
+    stream.put_off('fix', later, 10 ** random.uniform(1.3, 3.3) * directions(random, 1))
 
 
 def _null_island(stream: Stream, random: Random) -> None:
@@ -282,7 +288,7 @@ def _late_gnss(stream: Stream, random: Random) -> None:
     """Send GNSS late, and out of order, but within what is allowed."""
     for name in GNSS:
         rows = getattr(stream, name)
-        rows['arrival'] += random.integers(0, LATENESS, len(rows))
+        rows['arrival'] += random.integers(0, LATENESS_NS, len(rows))
         stream.expected[f'{name}_late'] = 0
 
 
@@ -291,10 +297,10 @@ def _too_late_gnss(stream: Stream, random: Random) -> None:
     for name in GNSS:
         rows = getattr(stream, name)
         chosen = some(random, rows, 0.1 * part, part)
-        rows['arrival'][chosen] += random.integers(LATENESS + SECOND // 20, 5 * SECOND,
+        rows['arrival'][chosen] += random.integers(LATENESS_NS + SECOND // 20, 5 * SECOND,
                                                    len(chosen))
         newest = np.minimum(rows['arrival'], stream.imu['stamp'][-1])
-        stream.expected[f'{name}_late'] = int(np.sum(rows['stamp'] < newest - LATENESS))
+        stream.expected[f'{name}_late'] = int(np.sum(rows['stamp'] < newest - LATENESS_NS))
 
 
 def _gnss_clock(stream: Stream, shift: int) -> None:
@@ -398,7 +404,7 @@ def _set_clock(stream: Stream, moment: int, shift: int, **expected: int) -> None
     """Put all stamps from a moment on off by something."""
     for rows in stream.imu, stream.fix, stream.velocity:
         rows['stamp'][rows['stamp'] >= moment] += shift
-    stream.shift = (moment + shift, stream.last + shift + SECOND, shift)
+    stream.clock = [moment + shift, stream.last + shift + SECOND], [0, shift, 0]
     stream.expected |= expected
 
 

@@ -28,18 +28,15 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ins_align.aligner import Aligner, State
-from ins_align.config import Config, PRESETS
+from ins_align.config import PRESETS
 from ins_align.experiments.common import (
-    BINS, Column, follow, JsonDict, median, most, parallel, prepare, Report, while_aligned)
-from ins_align.experiments.spoilt import directions, GNSS, LOT, Random, SECOND, Stream
+    ALIGNED_COLUMNS, BINS, Case, Groups, JsonDict, parallel, Report, run_case)
+from ins_align.experiments.spoilt import directions, GNSS, Random, SECOND, Stream
 from ins_align.geometry.rotation import Array
 import numpy as np
 
-RUNS = 24
 DURATION = 90.0         # s, unless a case says otherwise
-BETWEEN_LOT = 7         # IMU samples given at once where the attitude between epochs is judged
-RECORDING, STARTS = 'car_drive0708', (0.0, 100.0, 200.0, 300.0, 400.0)      # s
+RECORDING = 'car_drive0708'
 WINDOW, EVERY = 120.0, 10.0     # s of the recorded car in `vehicle`, from start to start
 MOUNT_STD_DEG = 1.0
 
@@ -80,17 +77,13 @@ def _stepping(stream: Stream, random: Random) -> None:
     """Add to velocities without noise one of steps of 10 to 60 s, and state the middle one."""
     _states(stream, random, 0.1)
     for chosen in _spells(random, stream.seconds('velocity'), (10.0, 60.0), (0.0, 0.0)):
-        stream.velocity['velocity'][chosen] += (
-            random.choice([0.03, 0.1, 0.5]) * random.standard_normal((len(chosen), 3)))
+        stream.put_off('velocity', chosen, random.choice([0.03, 0.1, 0.5])
+                       * random.standard_normal((len(chosen), 3)))
 
 
 def _multipath(stream: Stream, random: Random, size: float, name: str = 'velocity') -> None:
     for chosen in _spells(random, stream.seconds(name), (5.0, 15.0), (20.0, 100.0)):
-        away = size * directions(random, 1)
-        if name == 'fix':
-            stream.displace(chosen, away)
-        else:
-            stream.velocity['velocity'][chosen] += away
+        stream.put_off(name, chosen, size * directions(random, 1))
 
 
 def _positions(stream: Stream, random: Random, offsets: float = 0.0, stated: float = 0.0) -> None:
@@ -126,19 +119,19 @@ def _bunches(stream: Stream, random: Random) -> None:
     """Stamp IMU samples when the last of a bunch is read, 60 us apart."""
     size, k = random.integers(2, 6), np.arange(len(stream.imu))
     last = np.minimum(k // size * size + size - 1, len(k) - 1)
-    stream.imu['stamp'] = stream.imu['stamp'][last] + k % size * 60_000
+    stream.stamp_imu(stream.imu['stamp'][last] + k % size * 60_000)
 
 
 def _late_stamps(stream: Stream, random: Random, mean_s: float) -> None:
     late = np.rint(random.exponential(mean_s * SECOND, len(stream.imu))).astype(np.int64)
-    stream.imu['stamp'] = np.maximum.accumulate(stream.imu['stamp'] + late) + np.arange(len(late))
+    stream.stamp_imu(np.maximum.accumulate(stream.imu['stamp'] + late) + np.arange(len(late)))
 
 
 def _one_stamp(stream: Stream, random: Random, at_s: float, wild_s: float = 0.0) -> None:
     """Put one IMU stamp into the future; or let all be the same from some time on."""
-    k = int(np.searchsorted(stream.seconds('imu'), at_s))
-    stream.imu['stamp'][k:k + 1 if wild_s else None] = (
-        stream.imu['stamp'][k] + round(wild_s * SECOND))
+    k, stamps = int(np.searchsorted(stream.seconds('imu'), at_s)), stream.imu['stamp'].copy()
+    stamps[k:k + 1 if wild_s else None] = stamps[k] + round(wild_s * SECOND)
+    stream.stamp_imu(stamps)
 
 
 def _gnss_clock(stream: Stream, random: Random, at_s: float = 0.0, by_s: float = 0.0,
@@ -156,6 +149,7 @@ def _parked(stream: Stream, random: Random, at_s: float, hours: float) -> None:
     for name in 'imu', *GNSS:
         getattr(stream, name)['stamp'][stream.seconds(name) >= at_s] += round(
             3600 * hours) * SECOND
+    stream.stamp_imu(stream.imu['stamp'])
     walked = PRESETS['mems'].rate_random_walk * math.sqrt(3600 * hours)
     stream.imu['gyro'][stream.seconds('imu') >= at_s] += walked * random.standard_normal(3)
 
@@ -188,7 +182,7 @@ def _bias_jump(stream: Stream, random: Random, sensor: str, size: float, at_s: f
     stream.imu[sensor][np.ix_(later, chosen)] += size * random.choice([-1.0, 1.0], axes)
 
 
-class Case(NamedTuple):
+class Spot(NamedTuple):
     """A row of a table: what is simulated, how its messages are spoilt, what is configured."""
 
     name: str
@@ -212,92 +206,92 @@ AWAY = {'duration': 300.0, 'outages': ((60.0, 300.0),)}
 GARAGE = {'duration': 2040.0, 'stand_still': 1980.0, 'outages': ((0.55, 1980.0),)}
 BUMPY = {'duration': 390.0, 'stand_still': 300.0, 'gnss_delay': 0.15}
 
-CASES = (
-    Case('nothing wrong', MIXED),
-    Case('a throw, nothing wrong', LAUNCH),
+SPOTS = (
+    Spot('nothing wrong', MIXED),
+    Spot('a throw, nothing wrong', LAUNCH),
     # Told wrongly
-    Case('told for certain, and right', MIXED, config=TOLD),
-    *(Case(f'told for certain, delay {by:g} s off', MIXED, simulate={'gnss_delay': by},
+    Spot('told for certain, and right', MIXED, config=TOLD),
+    *(Spot(f'told for certain, delay {by:g} s off', MIXED, simulate={'gnss_delay': by},
            config=TOLD) for by in (0.05, 0.1, 0.2)),
-    *(Case(f'told for certain, lever arm {off:g} m off', MIXED, partial(_told_lever, off=off),
+    *(Spot(f'told for certain, lever arm {off:g} m off', MIXED, partial(_told_lever, off=off),
            config=TOLD) for off in (1.0, 2.0)),
-    Case('MEMS told to be tactical', CAR + FLIGHT, None, LONG, {'imu_grade': 'tactical'}),
-    Case('tactical told to be navigation', (('car', 'tactical'), ('flight', 'tactical')), None,
+    Spot('MEMS told to be tactical', CAR + FLIGHT, None, LONG, {'imu_grade': 'tactical'}),
+    Spot('tactical told to be navigation', (('car', 'tactical'), ('flight', 'tactical')), None,
          LONG, {'imu_grade': 'navigation'}),
     # Noise of GNSS
-    *(Case(f'velocity errors that last {time:g} s', MIXED, partial(_lasting, time_s=time),
+    *(Spot(f'velocity errors that last {time:g} s', MIXED, partial(_lasting, time_s=time),
            EXACT) for time in (1.0, 2.0)),
-    Case('multipath: 0.5 m/s for 5 to 15 s, every 20 to 100 s', CAR,
+    Spot('multipath: 0.5 m/s for 5 to 15 s, every 20 to 100 s', CAR,
          partial(_multipath, size=0.5), HOURS, part=4),
-    Case('velocities of 0.03, 0.1, 0.5 m/s in turn, stated 0.1', CAR, _stepping,
+    Spot('velocities of 0.03, 0.1, 0.5 m/s in turn, stated 0.1', CAR, _stepping,
          {**HOURS, **EXACT}, part=4),
-    Case('vertical velocity 10 times as noisy as stated', CAR, partial(_states, std=0.1),
+    Spot('vertical velocity 10 times as noisy as stated', CAR, partial(_states, std=0.1),
          {'velocity_std_vertical': 1.0}),
-    *(Case(f'{rest / 60:g} min at rest, noise {factor:g} times as stated', CAR + LAUNCH,
+    *(Spot(f'{rest / 60:g} min at rest, noise {factor:g} times as stated', CAR + LAUNCH,
            partial(_states, std=0.1 / factor),
            {'duration': rest + 60.0, 'stand_still': rest}, part=part)
       for rest, part in ((120.0, 2), (600.0, 6)) for factor in (1.2, 1.5)),
-    Case('positions alone, wander by 1.5 m, stated 0.5 m', CAR + FLIGHT, _positions,
+    Spot('positions alone, wander by 1.5 m, stated 0.5 m', CAR + FLIGHT, _positions,
          {**LONG, **WANDERING}),
-    Case('positions alone, wander by 1.5 m, stated so', CAR + FLIGHT,
+    Spot('positions alone, wander by 1.5 m, stated so', CAR + FLIGHT,
          partial(_positions, stated=1.58), {**LONG, **WANDERING}),
-    Case('positions alone, 5 m off for 5 to 15 s, stated 0.05 m', CAR + FLIGHT,
+    Spot('positions alone, 5 m off for 5 to 15 s, stated 0.05 m', CAR + FLIGHT,
          partial(_positions, offsets=5.0), {**LONG, **RTK}),
     # GNSS that comes and goes
-    Case('GNSS every 5 s, navigation grade', (('flight', 'navigation'),), None,
+    Spot('GNSS every 5 s, navigation grade', (('flight', 'navigation'),), None,
          {'gnss_rate': 0.2, 'duration': 100.0}),
-    Case('1 Hz sent again at 5 Hz', CAR + FLIGHT, _resent),
-    Case('GNSS stays away after 60 s', CAR + FLIGHT, None, AWAY, part=3),
-    Case('GNSS stays away after 60 s, vif', (('flight', 'tactical'),), None,
+    Spot('1 Hz sent again at 5 Hz', CAR + FLIGHT, _resent),
+    Spot('GNSS stays away after 60 s', CAR + FLIGHT, None, AWAY, part=3),
+    Spot('GNSS stays away after 60 s, vif', (('flight', 'tactical'),), None,
          {**AWAY, 'duration': 600.0, 'outages': ((60.0, 600.0),)}, {'method': 'vif'}, part=6),
-    Case('tunnels of 60 to 150 s, last velocity beside no fix', CAR, _tunnels,
+    Spot('tunnels of 60 to 150 s, last velocity beside no fix', CAR, _tunnels,
          {'duration': 600.0}, part=4),
-    Case('no fix at 0, 0 for 20 s', CAR + FLIGHT, _looking),
-    Case('three epochs, then 33 min in a garage', CAR, None, GARAGE, part=12),
-    Case('velocities stop after 30 s, positions 1 m', CAR, lambda stream, random: stream.keep(
+    Spot('no fix at 0, 0 for 20 s', CAR + FLIGHT, _looking),
+    Spot('three epochs, then 33 min in a garage', CAR, None, GARAGE, part=12),
+    Spot('velocities stop after 30 s, positions 1 m', CAR, lambda stream, random: stream.keep(
         'velocity', stream.seconds('velocity') < 30.0), {**LATER, 'position_std': 1.0}),
-    Case('velocities from 5 s on, positions wander', HOVER, lambda stream, random: stream.keep(
+    Spot('velocities from 5 s on, positions wander', HOVER, lambda stream, random: stream.keep(
         'velocity', stream.seconds('velocity') >= 5.0), WANDERING),
-    Case('vertical velocity is no number', CAR + FLIGHT, lambda stream, random: np.copyto(
+    Spot('vertical velocity is no number', CAR + FLIGHT, lambda stream, random: np.copyto(
         stream.velocity['velocity'][:, 2], np.nan)),
     # Clocks
-    Case('IMU stamped in bunches of 2 to 5', CAR + FLIGHT, _bunches),
-    Case('IMU stamped late by 4 ms, exponential', CAR + FLIGHT,
+    Spot('IMU stamped in bunches of 2 to 5', CAR + FLIGHT, _bunches),
+    Spot('IMU stamped late by 4 ms, exponential', CAR + FLIGHT,
          partial(_late_stamps, mean_s=0.004)),
-    Case('one IMU stamp 5 s ahead', CAR + FLIGHT, partial(_one_stamp, at_s=50.5, wild_s=5.0)),
-    Case('IMU stamps stand still after 60 s', CAR + FLIGHT, partial(_one_stamp, at_s=60.0)),
-    Case('delay steps by 80 ms at 60 s', HOVER, partial(_gnss_clock, at_s=60.0, by_s=0.08),
+    Spot('one IMU stamp 5 s ahead', CAR + FLIGHT, partial(_one_stamp, at_s=50.5, wild_s=5.0)),
+    Spot('IMU stamps stand still after 60 s', CAR + FLIGHT, partial(_one_stamp, at_s=60.0)),
+    Spot('delay steps by 80 ms at 60 s', HOVER, partial(_gnss_clock, at_s=60.0, by_s=0.08),
          LONG),
-    Case('clocks drift apart by 100 ppm', CAR + FLIGHT, partial(_gnss_clock, part=1e-4),
+    Spot('clocks drift apart by 100 ppm', CAR + FLIGHT, partial(_gnss_clock, part=1e-4),
          HOURS, part=4),
     # The IMU
-    Case('IMU sends no numbers after 60 s', CAR + FLIGHT, lambda stream, random: np.copyto(
+    Spot('IMU sends no numbers after 60 s', CAR + FLIGHT, lambda stream, random: np.copyto(
         stream.imu['gyro'][:, 1], np.nan, where=stream.seconds('imu') >= 60.0)),
-    Case('parked for 3 h, IMU silent, biases walked', FLIGHT,
+    Spot('parked for 3 h, IMU silent, biases walked', FLIGHT,
          partial(_parked, at_s=60.0, hours=3.0), LONG),
-    Case('IMU losses of 50 to 450 ms every 10 s', CAR, partial(_gaps, length=(0.05, 0.45)),
+    Spot('IMU losses of 50 to 450 ms every 10 s', CAR, partial(_gaps, length=(0.05, 0.45)),
          LONG),
-    Case('IMU losses of 50 to 600 ms, attitude between epochs', LAUNCH + FLIGHT,
+    Spot('IMU losses of 50 to 600 ms, attitude between epochs', LAUNCH + FLIGHT,
          partial(_gaps, length=(0.05, 0.6)), between=True),
-    Case('nothing wrong, attitude between epochs', LAUNCH + FLIGHT + HOVER, between=True),
-    *(Case(f'gyros warm up by 0.5 deg/s in 60 s, {motions[0][0]}', motions, _warm_up, LONG)
+    Spot('nothing wrong, attitude between epochs', LAUNCH + FLIGHT + HOVER, between=True),
+    *(Spot(f'gyros warm up by 0.5 deg/s in 60 s, {motions[0][0]}', motions, _warm_up, LONG)
       for motions in (CAR, FLIGHT)),
-    *(Case(f'white vibration, 1 m/s^2 and 3 deg/s, from {start:g} s on', CAR + FLIGHT,
+    *(Spot(f'white vibration, 1 m/s^2 and 3 deg/s, from {start:g} s on', CAR + FLIGHT,
            partial(_vibration, start_s=start), LATER) for start in (0.0, 25.0, 85.0)),
-    Case('vibration at 27 Hz, IMU at 25 Hz', CAR + FLIGHT, partial(_vibration, tone_hz=27.0),
+    Spot('vibration at 27 Hz, IMU at 25 Hz', CAR + FLIGHT, partial(_vibration, tone_hz=27.0),
          {'imu_rate': 25.0}),
-    Case('5 min at rest, vibration 0.2 m/s^2 and 0.3 deg/s, delay 0.15 s', CAR + LAUNCH,
+    Spot('5 min at rest, vibration 0.2 m/s^2 and 0.3 deg/s, delay 0.15 s', CAR + LAUNCH,
          partial(_vibration, force=0.2, rate_deg=0.3), BUMPY, part=4),
-    *(Case(f'gyro {axis} alone reversed, {motions[0][0]}', motions, None, {'flip_gyro': axis})
+    *(Spot(f'gyro {axis} alone reversed, {motions[0][0]}', motions, None, {'flip_gyro': axis})
       for axis, motions in (('x', LAUNCH), ('z', LAUNCH), ('z', CAR))),
-    Case('gyros with half their rates', CAR, lambda stream, random: np.multiply(
+    Spot('gyros with half their rates', CAR, lambda stream, random: np.multiply(
         stream.imu['gyro'], 0.5, out=stream.imu['gyro'])),
-    Case('gyros 20 ms later than accelerometers', LAUNCH, lambda stream, random: np.copyto(
+    Spot('gyros 20 ms later than accelerometers', LAUNCH, lambda stream, random: np.copyto(
         stream.imu['gyro'][2:], stream.imu['gyro'][:-2].copy())),
-    *(Case(f'gyro bias jumps by 0.1 deg/s at {at_s:g} s, {axes} of 3', CAR, partial(
+    *(Spot(f'gyro bias jumps by 0.1 deg/s at {at_s:g} s, {axes} of 3', CAR, partial(
         _bias_jump, sensor='gyro', size=np.radians(0.1), at_s=at_s, axes=axes), LONG)
       for axes, at_s in ((1, 60.0), (3, 30.0))),
-    Case('accelerometer bias jumps by 0.1 m/s^2 at 60 s, 1 of 3', HOVER,
+    Spot('accelerometer bias jumps by 0.1 m/s^2 at 60 s, 1 of 3', HOVER,
          partial(_bias_jump, sensor='accel', size=0.1, at_s=60.0), LONG),
 )
 
@@ -313,14 +307,14 @@ def _mounted(seed: int, mount_deg: tuple[float, ...] = ()) -> JsonDict:
 
 
 def _vehicle(name: str, scenario: str, arguments: JsonDict, vehicle: str = 'car',
-             mount_deg: tuple[float, ...] = (), trust: bool = True) -> Case:
-    return Case(name, ((scenario, 'mems'),), None, arguments, {
+             mount_deg: tuple[float, ...] = (), trust: bool = True) -> Spot:
+    return Spot(name, ((scenario, 'mems'),), None, arguments, {
         'vehicle': vehicle, 'mount_yaw_std': MOUNT_STD_DEG, 'trust_imu_axes': trust,
         'heading_std_threshold': 2.0}, drawn=partial(_mounted, mount_deg=mount_deg))
 
 
 ROAD, STREETS, OFF = {'duration': 40.0}, {'duration': 60.0}, (0.0, 0.0, 5.0)
-VEHICLE_CASES = (
+VEHICLE_SPOTS = (
     _vehicle('straight road, 10 m/s', 'highway', ROAD),
     _vehicle('the same, vehicle: none', 'highway', ROAD, 'none'),
     _vehicle('the same, axes not trusted', 'highway', ROAD, trust=False),
@@ -340,72 +334,51 @@ VEHICLE_CASES = (
     _vehicle('towed 70 deg across', 'car', {**STREETS, 'crab_deg': 70.0}),
     _vehicle('on a ferry, 70 deg across, in waves', 'swing', {**STREETS, 'crab_deg': 70.0}),
 )
-RECORDED: tuple[JsonDict, ...] = ({}, {'vehicle': 'car'},
-                                  {'vehicle': 'car', 'heading_std_threshold': 2.0})
+RECORDED: dict[str, tuple[JsonDict, float]] = {
+    'none': ({}, 1.0), 'vehicle: car': ({'vehicle': 'car'}, 1.0),
+    'vehicle: car, heading_std_threshold: 2': (
+        {'vehicle': 'car', 'heading_std_threshold': 2.0}, 1.0)}
 
 
 # Runs
 
-def run_case(task: tuple[str, int]) -> JsonDict:
-    """Simulate one run of the case with a name, spoil it, feed it and judge what comes out."""
-    name, index = task
-    case = next(case for case in (*CASES, *VEHICLE_CASES) if case.name == name)
-    scenario, grade = case.motions[index % len(case.motions)]
-    spoil = case.spoil and (lambda stream: case.spoil(stream, np.random.default_rng([6, index])))
-    simulation, stream, aligner = prepare(scenario, {
-        'imu_grade': grade, 'seed': index, 'duration': DURATION, **case.drawn(index),
-        **case.simulate}, case.config, spoil=spoil)
-    sent = stream.messages(aligner.config, BETWEEN_LOT if case.between else LOT)
-    looks = follow(aligner, sent, between=case.between)
-    status = aligner.status()
-    return {'scenario': scenario, 'grade': grade, 'seed': index, 'reason': status.reason,
-            'end': status.state is State.ALIGNED,
-            **while_aligned(looks, int(stream.imu['stamp'][0]), lambda stamps:
-                            simulation.attitude_at(stream.measured_at(stamps)))}
+def draw(name: str, index: int) -> Case:
+    """Draw a run of the spot with a name."""
+    spot = next(spot for spot in (*SPOTS, *VEHICLE_SPOTS) if spot.name == name)
+    scenario, grade = spot.motions[index % len(spot.motions)]
+    return Case(name, scenario, {
+        'imu_grade': grade, 'seed': index, 'duration': DURATION, **spot.drawn(index),
+        **spot.simulate}, spot.config, spot.spoil and (lambda stream: spot.spoil(
+            stream, np.random.default_rng([6, index]))), spot.between)
 
 
-def run_cases(cases: Sequence[Case], runs: int, jobs: int | None,
-              name: str) -> dict[str, list[JsonDict]]:
-    """Run every case with `runs`, or a part of it."""
-    results = parallel(run_case, [
-        [(case.name, index) for index in range(max(1, runs // case.part))] for case in cases],
-        jobs, name)
-    return {case.name: each for case, each in zip(cases, results)}
+def run_spots(spots: Sequence[Spot], runs: int, jobs: int | None) -> Groups:
+    """Run every spot so many times, or a part of them."""
+    return list(zip((spot.name for spot in spots), parallel(run_case, [
+        [(draw, spot.name, index) for index in range(max(1, runs // spot.part))]
+        for spot in spots], jobs, 'spots')))
 
 
-def recorded_car(data_dir: Path | None) -> Path | None:
-    """Return the recording of the car if it is in the folder."""
-    return next(iter(sorted(data_dir.glob(f'{RECORDING}*'))), None) if data_dir else None
+def run_recorded(data: Path | None, every_s: float, length_s: float, jobs: int | None,
+                 variants: dict[str, tuple[JsonDict, float]]) -> Groups:
+    """Align windows of the car, if it is recorded there, with parameters and a sign of gyro z."""
+    from ins_align.experiments.recordings import load, run_window
+
+    path = next(iter(sorted(data.glob(f'{RECORDING}*'))), None) if data else None
+    if path is None:
+        return []
+    starts = np.arange(0.0, max(load(path).duration - every_s, 1.0), every_s).tolist()
+    return list(zip(variants, parallel(run_window, [
+        [(path, start, length_s, *variant) for start in starts] for variant in variants.values()],
+        jobs, 'recorded car')))
 
 
-def run_recorded(path: Path, start_s: float, z_sign: float, config: JsonDict) -> JsonDict:
-    """Align a recording from some time to its end."""
-    from ins_align.experiments.recordings import KNOWN_LEVER_ARMS, load
-
-    recording = load(path)
-    signs = np.array([1.0, 1.0, z_sign])
-    first = recording.sample_at(start_s)
-    sent = ((now, kind, (payload[0], payload[1] * signs, payload[2]) if kind == 'imu' else payload)
-            for now, kind, payload in recording.sent(first, int(recording.imu_before[-1])))
-    aligner = Aligner(Config(lever_arm=KNOWN_LEVER_ARMS[RECORDING], **config))
-    looks = follow(aligner, sent)
-    return {'start_s': start_s, 'end': aligner.status().state is State.ALIGNED, **while_aligned(
-        looks, int(recording.imu.stamps_ns[first]), recording.attitudes_at,
-        recording.reference_std_deg)}
-
-
-def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
+def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``weak-spots``, and its cases of the recorded car if it is there."""
-    runs, path = runs or RUNS, recorded_car(data_dir)
-    found = run_cases(CASES, runs, jobs, 'weak spots')
-    if path is not None:
-        found |= {f'recorded car, {name}': [run_recorded(path, start, sign, config)
-                                            for start in STARTS]
-                  for name, sign, config in (
-                      ('lever arm told to 3 cm', 1.0, {'lever_arm_std': 0.03}),
-                      ('gyro z reversed', -1.0, {}))}
-    report = Report('weak-spots', 'Where it is wrong and sure of itself', out,
-                    f' --runs {runs}' + (' --data DIR' if path else ''))
+    found = run_spots(SPOTS, runs, jobs)
+    found += run_recorded(data, 100.0, 3600.0, jobs, {
+        'recorded car, lever arm told to 3 cm': ({'lever_arm_std': 0.03}, 1.0),
+        'recorded car, gyro z reversed': ({}, -1.0)})
     report.text(
         f'{runs} runs of each case, fewer where they are long, of {DURATION:g} s unless the case '
         'needs more. Car and flight in turn, or a hover, a throw, all of these; MEMS grade unless '
@@ -414,57 +387,27 @@ def run(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) ->
         f'first declaration, and at any time at which it was called ALIGNED; runs beyond '
         f'{BINS[0]:g} and {BINS[1]:g}, the seconds beyond {BINS[1]:g} of the longest, the worst '
         'error in sigmas and, of heading, in degrees, the part of the time at which it was '
-        'ALIGNED, and after how many seconds of data it was declared, the median.')
-    if path is None:
-        report.text('The recorded car is left out: --data DIR names the folder of it.')
-    report.table('Weak spots', found.items(), COLUMNS)
-    report.write({'runs': runs, 'cases': found})
+        'ALIGNED, and after how many seconds of data it was declared, the median. With --data DIR '
+        'that has it, the recorded car too.')
+    report.table('Weak spots', found, ALIGNED_COLUMNS)
+    return {'runs': runs, 'cases': dict(found)}
 
 
-def run_vehicle(out: Path, data_dir: Path | None, runs: int | None, jobs: int | None) -> None:
+def run_vehicle(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``vehicle``, and the recorded car if it is there."""
-    runs, path = runs or RUNS, recorded_car(data_dir)
-    found = run_cases(VEHICLE_CASES, runs, jobs, 'vehicle')
-    report = Report('vehicle', 'What a vehicle knows of its motion', out,
-                    f' --runs {runs}' + (' --data DIR' if path else ''))
+    from ins_align.experiments.recordings import DECLARED_COLUMNS
+
+    found = run_spots(VEHICLE_SPOTS, runs, jobs)
     report.text(
         f'{runs} runs of each case, MEMS, GNSS velocity 0.1 m/s at 5 Hz, the mounting off by '
         f'{MOUNT_STD_DEG:g} deg (1 sigma, pitch and yaw) and stated so, `vehicle: car` unless the '
         'case says otherwise, `trust_imu_axes` and a heading threshold of 2 deg. Columns as in '
         'weak-spots; "not used": the runs at whose end the reason says that the motion '
         'contradicts `vehicle`.')
-    report.table('Simulated', found.items(), [*COLUMNS, (
-        'not used', '', lambda c: sum('contradicts vehicle' in r['reason'] for r in c[1]))])
-    if path is not None:
-        from ins_align.experiments.recordings import DECLARED_COLUMNS, load, run_window
-
-        starts = np.arange(0.0, max(load(path).duration - EVERY, 0.0), EVERY)
-        windows = parallel(run_window, [[(path, start, WINDOW, config)
-                                         for start in starts.tolist()]
-                                        for config in RECORDED], jobs, 'recorded car')
-        report.table(f'The recorded car, started anew every {EVERY:g} s', [
-            (', '.join(f'{name}: {value}' for name, value in config.items()) or 'none', each)
-            for config, each in zip(RECORDED, windows)], DECLARED_COLUMNS)
-    report.write({'runs': runs, 'cases': found})
-
-
-def of_declared(key: str, results: list[JsonDict]) -> list[float]:
-    """Return a number of the runs in which something was declared."""
-    return [result[key] for result in results if result['declared_s'] is not None]
-
-
-# Of the name of a case and its results.
-COLUMNS: list[Column] = [
-    ('case', '', lambda c: c[0]), ('runs', '', lambda c: len(c[1])),
-    ('declared', '', lambda c: len(of_declared('declared_s', c[1]))),
-    ('at the end', '', lambda c: sum(result['end'] for result in c[1])),
-    *((title, '', lambda c, key=key, limit=limit: sum(
-        sigmas > limit for sigmas in of_declared(key, c[1]))) for title, key, limit in (
-            ('declared beyond 3', 'declared_sigmas', BINS[0]),
-            ('beyond 3', 'worst_sigmas', BINS[0]), ('beyond 5', 'worst_sigmas', BINS[1]))),
-    *((title, digits, lambda c, key=key: most(of_declared(key, c[1])))
-      for title, digits, key in (
-          ('beyond 5, s', '.1f', 'beyond_s'), ('worst, sigma', '.1f', 'worst_sigmas'),
-          ('heading, deg', '.2g', 'worst_heading_deg'))),
-    ('aligned, %', '.0f', lambda c: 100 * np.mean([result['aligned_part'] for result in c[1]])),
-    ('after, s', '.1f', lambda c: median(of_declared('declared_s', c[1])))]
+    report.table('Simulated', found, [*ALIGNED_COLUMNS, ('not used', '', lambda group: sum(
+        'contradicts vehicle' in each['reason'] for each in group[1]))])
+    recorded = run_recorded(data, EVERY, WINDOW, jobs, RECORDED)
+    if recorded:
+        report.table(f'The recorded car, started anew every {EVERY:g} s', recorded,
+                     DECLARED_COLUMNS)
+    return {'runs': runs, 'cases': dict(found), 'recorded': dict(recorded)}
