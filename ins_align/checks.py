@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 import math
 from typing import Union
 
@@ -31,6 +32,7 @@ from ins_align.gnss.motion import (
     EMPTY, GRID, on_grid, Series, series_of, track, velocity_frame, velocity_from_positions,
     VelocityFrame, without_wild_positions)
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
+from ins_align.results import State, Status
 import numpy as np
 
 MIN_COURSE_SPEED = 2.0  # m/s above which a course means something
@@ -167,21 +169,30 @@ class InputChecks:
         while len(self._cells) > CELLS:
             del self._cells[next(iter(self._cells))]
 
+    def judge(self, status: Status) -> Status:
+        """Return a status that is a FAULT where nothing can be aligned with such messages."""
+        faults = [] if status.state is State.ALIGNED else self.faults()
+        return replace(status, state=State.FAULT, reason='; '.join(faults)) if faults else status
+
     def faults(self) -> list[str]:
-        """Return what is wrong, each in a sentence."""
+        """Return what is wrong with units and coordinates, each in a sentence."""
         fixes, velocities = (
             series_of(*np.split(np.array(rows), [1], axis=1)) if rows else EMPTY
             for rows in (self._fixes, self._velocities))
         motion = on_grid(velocities) if velocities.times.size > 1 else velocity_from_positions(
             track(fixes))
-        found = [degrees_fault(
-            math.inf if self._too_fast > 1e-3 * self._samples else 0.0, self._turn_ratio(motion))]
-        found.append(exchange_fault(fixes, velocities) or (
-            BEYOND_THE_POLES if self._beyond_the_poles > MIN_LATE else ''))
+        degrees = degrees_fault(
+            math.inf if self._too_fast > 1e-3 * self._samples else 0.0, self._turn_ratio(motion))
+        exchanged = exchange_fault(fixes, velocities) or (
+            BEYOND_THE_POLES if self._beyond_the_poles > MIN_LATE else '')
+        return [fault for fault in (degrees, exchanged) if fault]
+
+    def late_messages(self) -> list[str]:
+        """Return that messages come too late, in a sentence, where they do."""
         late = [lateness for lateness in self._late if lateness > self._config.gnss_lateness]
         if len(late) >= max(MIN_LATE, LATE_SHARE * len(self._late)) and max(late) < MAX_LATENESS:
-            found.append(lateness_advice(float(np.quantile(late, 0.99)))[0])
-        return [fault for fault in found if fault]
+            return [lateness_advice(float(np.quantile(late, 0.99)))[0]]
+        return []
 
     def _turn_ratio(self, motion: Series) -> float | None:
         if len(self._cells) < 2:
