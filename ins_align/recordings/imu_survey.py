@@ -32,7 +32,7 @@ from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, skew
 from ins_align.gnss.motion import GRID, Series
 from ins_align.imu.buffer import MAX_GAP_NS
-from ins_align.imu.noise import force_fault, RangeCheck
+from ins_align.imu.noise import force_fault, RangeCheck, white_noise
 from ins_align.recordings.topic_survey import rounded, Surveyed
 import numpy as np
 
@@ -137,11 +137,15 @@ def _add_noise(imu: Surveyed, samples: Series, rest: tuple[float, float] | None,
     part = slice(None) if rest is None else slice(*np.searchsorted(times, rest))
     rate, force = values[part].mean(axis=0).reshape(2, 3)
     off_gravity = float(np.linalg.norm(force) - gravity)
-    triads = np.split(values, 2, axis=1)
-    widths = [_add_resolution(imu, sensor, triad) for sensor, triad in zip(SENSORS, triads)]
-    walks, lost = zip(*(
-        _noise(triad[part], width, float(np.median(np.diff(times))), 0.5 if rest else QUIET)
-        for triad, width in zip(triads, widths)))
+    widths = [_add_resolution(imu, sensor, triad)
+              for sensor, triad in zip(SENSORS, np.split(values, 2, axis=1))]
+    interval = float(np.median(np.diff(times)))
+    walks, lost = _walks(times[part], values[part], 0.5 if rest else QUIET).tolist(), [0.0, 0.0]
+    for k, width in enumerate(widths):
+        # Noise of half a quantum carries small values over it; less leaves an error that lasts.
+        if walks[k] < width * math.sqrt(interval):
+            lost[k] = width / math.sqrt(3.0)  # uniform, 1 sigma
+            walks[k] = max(walks[k], lost[k] * math.sqrt(interval))
     # What the Earth's rate does not explain is bias, in whatever direction.
     bias = abs(float(np.linalg.norm(rate)) - EARTH_RATE) / math.sqrt(3.0)
     measured = ImuNoise(*walks, *map(math.hypot, lost, (bias, off_gravity) if rest else (0, 0)))
@@ -231,24 +235,18 @@ def _add_resolution(imu: Surveyed, sensor: Sensor, values: Array) -> float:
     return max(0.5 * quantum, dead_band)
 
 
-def _noise(values: Array, half_width: float, interval: float, quiet: float) -> tuple[float, float]:
-    """Return the white noise of a sensor, per sqrt(Hz), and the bias that rounding hides."""
-    walk = 0.0
+def _walks(times: Array, values: Array, quiet: float) -> Array:
+    """Return white noise of gyros and accelerometers, per sqrt(Hz), shape (2,), of quiet times."""
+    walks, interval = np.zeros(2), float(np.median(np.diff(times)))
     for average in {1, max(round(AVERAGING / interval), 1)}:
-        count = values.shape[0] // average
-        means = values[:count * average].reshape(count, average, 3).mean(axis=1)
-        second = np.diff(means, n=2, axis=0) ** 2
-        length = max(round(WINDOW / (interval * average)), 5)
-        windows = second.shape[0] // length
-        if windows:
-            variance = second[:windows * length].reshape(windows, length, 3).mean(axis=(1, 2)) / 6
-            walk = max(walk, math.sqrt(
-                float(np.quantile(variance, quiet)) * interval * average))
-    # Noise of half a quantum carries small values over it; less leaves an error that lasts.
-    if walk / math.sqrt(interval) >= half_width:
-        return walk, 0.0
-    lost = half_width / math.sqrt(3.0)  # uniform, 1 sigma
-    return max(walk, lost * math.sqrt(interval)), lost
+        count = times.size // average
+        stamps, means = (column[:count * average].reshape(count, average, -1).mean(axis=1)
+                         for column in (times * 1e9, values))
+        edges = np.arange(0, count, max(round(WINDOW / (interval * average)), 8))
+        if edges.size > 1:
+            walks = np.maximum(walks, np.quantile(white_noise(
+                stamps[:, 0].astype(np.int64), means, edges[:-1], edges[1:]), quiet, axis=0))
+    return walks
 
 
 def _cells(times: Array, samples: Array) -> tuple[Array, Array]:
