@@ -97,7 +97,7 @@ def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: floa
     up /= np.linalg.norm(up) or 1.0
     grid, cells = _cells(times, values)
     ratio = turn_ratio(grid, cells[:, :3], up, velocities)
-    rates = degrees_fault(max_rate, ratio)
+    rates = degrees_fault(max_rate, grid, *np.split(cells, 2, axis=1), velocities)
     if max_rate == 0.0:
         rates = 'all angular rates are 0'
     elif ratio is not None and ratio < 0.0 and not rates:
@@ -165,8 +165,8 @@ def _add_noise(imu: Surveyed, samples: Series, rest: tuple[float, float] | None,
             settings if rest else settings | biases,
             angle_random_walk=math.degrees(60.0 * walks[0]), velocity_random_walk=60.0 * walks[1])
     if rest is None:
-        imu.add(f'imu_grade: {Config.imu_grade} is the default; not seen at rest, which would show '
-                'biases' + f'; its noise is no worse than that of {grade}' * covers,
+        imu.add(f'imu_grade: {Config.imu_grade} is the default; not seen at rest, which would '
+                'show biases' + f'; its noise is no worse than that of {grade}' * covers,
                 imu_grade=grade)
         return
     degrees_s = np.degrees(rate).tolist()

@@ -63,8 +63,9 @@ COLUMNS = {
     'last_s': ('to, s', '.1f'), 'stamp_age_s': ('stamp age, s', '.3f'),
     'stamp_age_spread_s': ('spread, s', '.3f'), 'gaps': ('gaps', ''),
     'longest_gap_s': ('longest, s', '.1f'), 'longest_gap_start_s': ('at, s', '.1f')}
-NOT_LOOKED_FOR = ('not looked for: scale factors and axes of the IMU (gyro_scale_std), biases across '
-                  'gravity, slow errors of the GNSS')
+NOT_LOOKED_FOR = (
+    'not looked for: scale factors and axes of the IMU (gyro_scale_std), biases across gravity, '
+    'slow errors of the GNSS')
 
 
 @dataclass
