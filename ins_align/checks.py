@@ -21,23 +21,26 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 import math
 from typing import Union
 
-from ins_align.config import Config
-from ins_align.geometry.rotation import Array, Index
+from ins_align.config import Config, STANDARD_GRAVITY
+from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, Index
 from ins_align.gnss.messages import Fix, numbers_of, Velocity
 from ins_align.gnss.motion import (
     EMPTY, GRID, on_grid, Series, series_of, track, velocity_frame, velocity_from_positions,
     VelocityFrame, without_wild_positions)
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
+from ins_align.results import State, Status
 import numpy as np
 
 MIN_COURSE_SPEED = 2.0  # m/s above which a course means something
 MIN_COURSE_RATE = 0.05  # rad/s
 MIN_CORRELATION = 0.7
-DEGREES_RATIO = 15.0  # times the turn of the course: between 1 and 57, nearer to degrees
 ANY_GYRO_RATE = 70.0  # rad/s: more than the 4000 deg/s that any usual gyroscope measures
+LENGTH_CELLS, MIN_LENGTHS = 20, 20  # of GRID s over which forces are summed up; sums to judge by
+SHORTER, AS_LONG = 0.85, 0.15  # a quarter of the sums is so short; within this they are right
 MIN_MISFIT = 0.1  # of the logarithm of a length: by so much exchanged positions fit better
 MAX_LATENESS = 60.0  # s, the limit of the parameter gnss_lateness
 LATE_SHARE, MIN_LATE = 0.1, 10  # of GNSS messages that are worth a word
@@ -45,11 +48,38 @@ BEYOND_THE_POLES = 'latitudes are beyond the poles: they are exchanged with the 
 CELLS, GNSS_MESSAGES = 600, 3000  # kept of the latest data: 5 minutes, at up to 10 Hz
 
 
-def degrees_fault(max_rate: float, ratio: float | None) -> str:
-    """Say that angular rates, at most `max_rate`, are in deg/s; `ratio` is from `turn_ratio`."""
-    if max_rate > ANY_GYRO_RATE or (ratio is not None and abs(ratio) > DEGREES_RATIO):
-        return 'the angular rates look like deg/s: they must be rad/s'
-    return ''
+def degrees_fault(max_rate: float, times: Array, gyro: Array, accel: Array, velocities: Series,
+                  ) -> str:
+    """
+    Say that angular rates, at most `max_rate`, are in deg/s; empty where they are not.
+
+    Of rates, rad/s, and specific forces, m/s^2, shape (N, 3), averaged over GRID s, at increasing
+    times, s; velocities are as from `on_grid`. The sum of the specific force over some seconds,
+    turned as the rates say, is as long as the change of velocity and gravity make it, whatever
+    the attitude and the axes are; turned 57 times as far it becomes shorter.
+    """
+    sent, as_degrees = (_lengths(times, rates, accel, velocities)
+                        for rates in (gyro, np.radians(gyro)))
+    shorter = (sent.size >= MIN_LENGTHS and np.quantile(sent, 0.25) < SHORTER
+               and abs(np.median(as_degrees) - 1.0) < AS_LONG)
+    return 'the angular rates look like deg/s: they must be rad/s' * bool(
+        shorter or max_rate > ANY_GYRO_RATE)
+
+
+def _lengths(times: Array, gyro: Array, accel: Array, velocities: Series) -> Array:
+    """Return how long sums of specific forces are over how long they should be, shape (K,)."""
+    if velocities.times.size < 2 or times.size <= LENGTH_CELLS:
+        return np.zeros(0)
+    turned = cumulative_rotations(exp_so3(GRID * gyro)) @ accel[..., None]
+    ends = times + 0.5 * GRID
+    v_n = np.column_stack([np.interp(ends, velocities.times, v) for v in velocities.vectors.T])
+    felt, seen = (sums[LENGTH_CELLS:] - sums[:-LENGTH_CELLS]
+                  for sums in (np.cumsum(GRID * turned[..., 0], axis=0), v_n))
+    seconds = ends[LENGTH_CELLS:] - ends[:-LENGTH_CELLS]
+    good = ((seconds < GRID * (LENGTH_CELLS + 0.5)) & (ends[:-LENGTH_CELLS] > velocities.times[0])
+            & (ends[LENGTH_CELLS:] < velocities.times[-1]))
+    seen[:, 2] += STANDARD_GRAVITY * seconds
+    return np.asarray(np.linalg.norm(felt[good], axis=1) / np.linalg.norm(seen[good], axis=1))
 
 
 def turn_ratio(times: Array, gyro: Array, up: Array, velocities: Series) -> float | None:
@@ -167,28 +197,31 @@ class InputChecks:
         while len(self._cells) > CELLS:
             del self._cells[next(iter(self._cells))]
 
+    def judge(self, status: Status) -> Status:
+        """Return a status that is a FAULT where nothing can be aligned with such messages."""
+        faults = [] if status.state is State.ALIGNED else self.faults()
+        return replace(status, state=State.FAULT, reason='; '.join(faults)) if faults else status
+
     def faults(self) -> list[str]:
-        """Return what is wrong, each in a sentence."""
+        """Return what is wrong with units and coordinates, each in a sentence."""
         fixes, velocities = (
             series_of(*np.split(np.array(rows), [1], axis=1)) if rows else EMPTY
             for rows in (self._fixes, self._velocities))
         motion = on_grid(velocities) if velocities.times.size > 1 else velocity_from_positions(
             track(fixes))
-        found = [degrees_fault(
-            math.inf if self._too_fast > 1e-3 * self._samples else 0.0, self._turn_ratio(motion))]
-        found.append(exchange_fault(fixes, velocities) or (
-            BEYOND_THE_POLES if self._beyond_the_poles > MIN_LATE else ''))
+        cells = sorted(self._cells)
+        sums = np.array([self._cells[cell] for cell in cells]).reshape(-1, 7)
+        degrees = degrees_fault(
+            math.inf if self._too_fast > 1e-3 * self._samples else 0.0,
+            (np.array(cells) + 0.5) * GRID, *np.split(sums[:, 1:] / sums[:, :1], 2, axis=1),
+            motion)
+        exchanged = exchange_fault(fixes, velocities) or (
+            BEYOND_THE_POLES if self._beyond_the_poles > MIN_LATE else '')
+        return [fault for fault in (degrees, exchanged) if fault]
+
+    def late_messages(self) -> list[str]:
+        """Return that messages come too late, in a sentence, where they do."""
         late = [lateness for lateness in self._late if lateness > self._config.gnss_lateness]
         if len(late) >= max(MIN_LATE, LATE_SHARE * len(self._late)) and max(late) < MAX_LATENESS:
-            found.append(lateness_advice(float(np.quantile(late, 0.99)))[0])
-        return [fault for fault in found if fault]
-
-    def _turn_ratio(self, motion: Series) -> float | None:
-        if len(self._cells) < 2:
-            return None
-        cells = sorted(self._cells)
-        sums = np.array([self._cells[cell] for cell in cells])
-        means = sums[:, 1:] / sums[:, :1]
-        up = means[:, 3:].mean(axis=0)
-        return turn_ratio((np.array(cells) + 0.5) * GRID, means[:, :3],
-                          up / (math.hypot(*up.tolist()) or 1.0), motion)
+            return [lateness_advice(float(np.quantile(late, 0.99)))[0]]
+        return []

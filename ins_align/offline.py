@@ -86,9 +86,10 @@ class _Run:
     def result(self, **of_recording: Any) -> Result:
         """Return what came of it, at the end."""
         self._epochs += self._aligner.flush(dry=True)
-        status = self._aligner.status()
-        if status.state is not State.ALIGNED and (faults := self._checks.faults()):
-            status = dataclasses.replace(status, reason='; '.join([status.reason, *faults]))
+        status = self._checks.judge(self._aligner.status())
+        if status.state is not State.ALIGNED:
+            status = dataclasses.replace(
+                status, reason='; '.join([status.reason, *self._checks.late_messages()]))
         return Result(config=self._config, status=status,
                       epochs=in_order_of_time(self._epochs), **of_recording)
 

@@ -190,10 +190,11 @@ def test_same_numbers_as_with_standard_messages(simulation, expected, tmp_path, 
 
 def test_info_knows_them(simulation, tmp_path):
     info = inspect(write(tmp_path / 'bag', simulation, SENSOR_GPS, COMBINED))
-    assert [(topic.name, topic.kind, topic.timing.count) for topic in info.topics] == [
+    assert [(topic.name, topic.kind, topic.figures['messages']) for topic in info.topics] == [
         ('/imu', 'imu', 4001), ('/gnss', 'fix', 200), ('/gnss', 'velocity', 200)]
-    assert all(topic.faults == () for topic in info.topics)
-    assert info.topics[2].frame.frame == 'enu' and info.topics[1].sigma == pytest.approx((2.5, 5))
+    assert all(topic.faults == [] for topic in info.topics)
+    assert info.topics[2].figures['frame'] == 'enu'
+    assert info.topics[1].figures['sigma'] == pytest.approx((2.5, 5))
     assert info.command is not None
 
 

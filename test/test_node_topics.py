@@ -144,6 +144,7 @@ def test_wrong_units_and_late_messages_are_said_as_replay_says_them(tmp_path):
         with playing(script_of(simulated_messages(simulation)), tmp_path, 10.0):
             listener.wait_for(lambda: 'look like deg/s' in listener.status.get('reason', ''))
             listener.wait_for(lambda: 'set gnss_lateness to' in listener.status['reason'])
+            listener.wait_for(lambda: listener.status['state'] == 'FAULT')
     assert 'the angular rates look like deg/s: they must be rad/s' in node.output
     # The way between processes comes on top, ten times as long on the clock of the data.
     late = re.findall(r'GNSS messages come up to ([\d.]+) s later', node.output)

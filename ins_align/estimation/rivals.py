@@ -318,17 +318,20 @@ def in_words(rival: Rival, x: Array, gnss_delay: float) -> str:
 
 
 def level_in_words(level: Rival, noise: ImuNoise) -> str:
-    """Return how a level is worse than the configured noise, as the end of a sentence, or ''."""
-    words = ''
+    """
+    Return how a level is worse than the configured noise, as the end of a sentence, or ''.
+
+    A setting is named only for the accelerometers alone. What makes the gyros look worse is seldom
+    their bias, and with a larger one configured it takes longer and gets no better.
+    """
     if level.gyro > 1:
-        bias, walk = (level.gyro * math.degrees(value)
-                      for value in (noise.gyro_bias_std, noise.rate_random_walk))
-        words += (f'; the gyros look worse than configured: gyro_bias_std {bias:.2g} and '
-                  f'rate_random_walk {60 * walk:.2g} fit better')
+        return (f'; the gyros look worse than configured, as with {level.gyro:g} times the bias '
+                '(coarse readings, scale factors, vibration and GNSS errors that last look like '
+                'that too): sigmas allow for it')
     if level.accel > 1:
-        words += ('; the accelerometers look worse than configured: accel_bias_std '
-                  f'{level.accel * noise.accel_bias_std:.2g} fits better')
-    return words
+        return ('; the accelerometers look worse than configured: accel_bias_std '
+                f'{level.accel * noise.accel_bias_std:.2g} fits better')
+    return ''
 
 
 def gyro_matrix_std(scale_std: float) -> Array:

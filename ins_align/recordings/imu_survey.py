@@ -23,8 +23,8 @@ the likelihood is largest, with a noise of its own in each window; the noise is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 from ins_align.checks import degrees_fault, turn_ratio
 from ins_align.config import Config, ImuNoise, PRESETS
@@ -32,7 +32,8 @@ from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, skew
 from ins_align.gnss.motion import GRID, Series
 from ins_align.imu.buffer import MAX_GAP_NS
-from ins_align.imu.noise import force_fault, RangeCheck
+from ins_align.imu.noise import force_fault, RangeCheck, white_noise
+from ins_align.recordings.topic_survey import rounded, Surveyed
 import numpy as np
 
 WINDOW = 2.0  # s in which noise is measured
@@ -46,12 +47,14 @@ MIN_REST = 5.0  # s
 ON_LATTICE = 0.1  # of a quantum: how far a value may be off its multiples
 MIN_REPEATS = 3  # samples for each value: with fewer the digits of a text may be the quantum
 MIN_ZEROS, MIN_ZERO_SHARE = 20, 0.01  # samples that are exactly 0 because of a dead band
+# What a chip reaches in a minute or two of turns, deg.
+CHIP_THRESHOLDS = {'tilt_std_threshold': 1.0, 'heading_std_threshold': 2.0}
 
 CELL = 0.05  # s over which the IMU is integrated at a time
 FIT_WINDOW, MIN_EPOCHS = 10.0, 20  # s and GNSS epochs in a window
 MIN_WINDOWS = 3
 DELAYS = np.arange(-0.5, 1.25, 0.1)  # s
-MAX_DELAY_STD = 0.025  # s: what is known less well is not told
+MAX_DELAY_STD = 0.05  # s: what is known less well is not told
 # 1 sigma before the fit: gyro bias, rad/s, lever arm, m, accelerometer bias, m/s^2, for a
 # velocity noise of VELOCITY_STD, m/s. Rotation and v_0 are free.
 VELOCITY_STD = 0.2
@@ -59,108 +62,127 @@ PRIOR_STD = np.repeat([1e4, 1e4, math.radians(0.5), 3.0, 0.5], 3)
 MOVING = 1.0  # m/s
 MAX_TURN_STD = 0.2  # rad: a rotation that is known less well is open
 OUTLIER = 6.0  # times the median size of residuals
+LASTING = 0.1  # correlation from epoch to epoch; of white noise the fit makes a negative one
 LONGEST = 3600.0  # s from the first motion on that are looked at: memory is bounded
 
 
-@dataclass(frozen=True)
-class Resolution:
-    """How finely a sensor tells small values, of its coarsest axis, rad/s or m/s^2."""
+class Sensor(NamedTuple):
+    """How the figures of a sensor are printed: units, and their sizes in SI units."""
 
-    quantum: float  # 0: none is seen
-    dead_band: float  # no value between 0 and this; 0: there is none
-    zeros: float  # share of samples that are exactly 0
-
-    @property
-    def half_width(self) -> float:
-        """Largest error of what is rounded to a multiple of the quantum or to 0."""
-        return max(0.5 * self.quantum, self.dead_band)
+    name: str
+    unit: str
+    size: float
+    walk_unit: str
+    walk_size: float
 
 
-@dataclass(frozen=True)
-class ImuFacts:
-    """Figures of an IMU as it was recorded; vectors are tuples, in the axes of the IMU."""
-
-    mean_force: float  # of the magnitude, m/s^2
-    up: tuple[float, ...]  # direction of the mean specific force
-    max_rate_deg_s: float  # of 99.9 percent
-    gyro: Resolution
-    accel: Resolution
-    angle_random_walk: float  # deg/sqrt(h), per axis, at rest; otherwise an upper bound
-    velocity_random_walk: float  # m/s/sqrt(h)
-    rounds: tuple[bool, bool]  # gyros, accelerometers: noise is too small to show biases
-    rest_s: float  # longest time at rest
-    rest_rate_deg_s: tuple[float, ...] | None  # mean rate there: bias and the Earth's rate
-    rest_force_error: float | None  # magnitude there less gravity, m/s^2
-    turn_ratio: float | None  # rate about the vertical over that of the course
-    faults: tuple[str, ...]
-    too_small: tuple[str, ...]  # sensors at the end of their range, in words
-    grade: str  # preset whose figures cover these, or come closest
-    grade_covers: bool
-    settings: tuple[str, ...]  # parameters that these figures ask for, with values
+SENSORS = (Sensor('gyroscopes', 'deg/s', math.radians(1.0), 'deg/sqrt(h)', math.radians(1.0) / 60),
+           Sensor('accelerometers', 'm/s^2', 1.0, 'm/s/sqrt(h)', 1.0 / 60.0))
 
 
-def survey_imu(times: Array, samples: Array, velocities: Series, gravity: float,
-               ) -> ImuFacts | None:
+def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: float) -> None:
     """
-    Measure an IMU; None: there are too few samples.
+    Add to an IMU what its samples tell.
 
-    Of rates, rad/s, and specific forces, m/s^2, finite, shape (N, 6), at increasing times, s, on
-    the scale of GNSS velocities as from `on_grid`, which may be empty; gravity is in m/s^2.
+    Of rates, rad/s, and specific forces, m/s^2, finite, shape (N, 6), and of GNSS velocities, m/s,
+    as from `on_grid`, over the same seconds; the latter may be empty. Gravity is in m/s^2.
     """
-    if times.size < 20 or times[-1] <= times[0]:
-        return None
-    interval = float(np.median(np.diff(times)))
-    sensors = samples[:, :3], samples[:, 3:]
-    sizes = np.linalg.norm(samples.reshape(-1, 2, 3), axis=2)
-    mean_force, max_rate = float(np.mean(sizes[:, 1])), float(np.quantile(sizes[:, 0], 0.999))
-    up = sensors[1].mean(axis=0)
+    times, values = samples
+    if times.size < 20:
+        imu.add('it has too few usable samples', fault=True)
+        return
+    sizes = np.linalg.norm(values.reshape(-1, 2, 3), axis=2)
+    force, max_rate = float(np.mean(sizes[:, 1])), float(np.quantile(sizes[:, 0], 0.999))
+    up = values[:, 3:].mean(axis=0)
     up /= np.linalg.norm(up) or 1.0
-    grid, cells = _cells(times, samples)
+    grid, cells = _cells(times, values)
     ratio = turn_ratio(grid, cells[:, :3], up, velocities)
-    degrees = degrees_fault(max_rate, ratio)
-    faults = [force_fault(mean_force), degrees]
-    if ratio is not None and ratio < 0.0 and not degrees:
-        faults.append('in left turns the rate about the upward axis is negative: a sign of the '
-                      'gyroscopes or of the specific force is wrong (+9.8 along up at rest)')
+    rates = degrees_fault(max_rate, grid, *np.split(cells, 2, axis=1), velocities)
     if max_rate == 0.0:
-        faults.append('all angular rates are 0')
-    rest = _longest_rest(grid, cells, velocities)
-    part, quiet = slice(None), QUIET
-    rate = force = None
-    if rest:
-        mean = cells[rest].mean(axis=0)
-        rate, force = mean[:3], float(np.linalg.norm(mean[3:]) - gravity)
-        part, quiet = slice(*np.searchsorted(times, grid[[rest[0], rest[-1]]]).tolist()), 0.5
-    resolutions = [_resolution(values) for values in sensors]
-    walks, lost = zip(*(_noise(values[part], resolution.half_width, interval, quiet)
-                        for values, resolution in zip(sensors, resolutions)))
+        rates = 'all angular rates are 0'
+    elif ratio is not None and ratio < 0.0 and not rates:
+        rates = ('in left turns the rate about the upward axis is negative: a sign of the '
+                 'gyroscopes or of the specific force is wrong (+9.8 along up at rest)')
+    for fault in filter(None, (force_fault(force), rates)):
+        imu.add(fault, fault=True)
+    x, y, z = up.tolist()
+    imu.add(f'specific force: {force:.2f} m/s^2 on average, mean direction '
+            f'({x:+.2f}, {y:+.2f}, {z:+.2f})', mean_force=force, up=[x, y, z])
+    if imu.faults:
+        return  # the rest would be in wrong units, or of other axes
+    if z < 0.5:
+        imu.add('on average the specific force does not point along the z axis of the IMU: the '
+                'attitude will be that of the axes as they are, however the IMU is mounted')
+    imu.add(f'angular rate: up to {math.degrees(max_rate):.0f} deg/s',
+            max_rate_deg_s=math.degrees(max_rate), turn_ratio=ratio)
+    _add_end_of_range(imu, samples)
+    _add_noise(imu, samples, _longest_rest(grid, cells, velocities), gravity)
+
+
+def _add_end_of_range(imu: Surveyed, samples: Series) -> None:
+    """Say which sensors were at the end of their range, and where that is."""
+    check = RangeCheck()
+    check.add((samples.times * 1e9).astype(np.int64), samples.vectors)
+    largest = np.abs(samples.vectors).reshape(-1, 2, 3).max(axis=(0, 2))
+    for sensor, value, count in zip(SENSORS, largest, np.count_nonzero(check.densities, axis=0)):
+        if count:
+            imu.add(f'{sensor.name} at the end of their range, {value / sensor.size:.4g} '
+                    f'{sensor.unit}, in {count} samples: let the driver set a larger one')
+
+
+def _add_noise(imu: Surveyed, samples: Series, rest: tuple[float, float] | None, gravity: float,
+               ) -> None:
+    """Add resolution, noise, biases and grade, of all or of what is at rest."""
+    times, values = samples
+    part = slice(None) if rest is None else slice(*np.searchsorted(times, rest))
+    rate, force = values[part].mean(axis=0).reshape(2, 3)
+    off_gravity = float(np.linalg.norm(force) - gravity)
+    widths = [_add_resolution(imu, sensor, triad)
+              for sensor, triad in zip(SENSORS, np.split(values, 2, axis=1))]
+    interval = float(np.median(np.diff(times)))
+    walks, lost = _walks(times[part], values[part], 0.5 if rest else QUIET).tolist(), [0.0, 0.0]
+    for k, width in enumerate(widths):
+        # Noise of half a quantum carries small values over it; less leaves an error that lasts.
+        if walks[k] < width * math.sqrt(interval):
+            lost[k] = width / math.sqrt(3.0)  # uniform, 1 sigma
+            walks[k] = max(walks[k], lost[k] * math.sqrt(interval))
     # What the Earth's rate does not explain is bias, in whatever direction.
-    biases = (0.0 if rate is None else abs(float(np.linalg.norm(rate)) - EARTH_RATE)
-              / math.sqrt(3.0), 0.0 if force is None else abs(force))
-    measured = ImuNoise(walks[0], walks[1], math.hypot(biases[0], lost[0]),
-                        math.hypot(biases[1], lost[1]))
+    bias = abs(float(np.linalg.norm(rate)) - EARTH_RATE) / math.sqrt(3.0)
+    measured = ImuNoise(*walks, *map(math.hypot, lost, (bias, off_gravity) if rest else (0, 0)))
     grade, covers = _grade(measured)
-    return ImuFacts(
-        mean_force, tuple(up.tolist()), math.degrees(max_rate), *resolutions,
-        math.degrees(walks[0]) * 60.0, walks[1] * 60.0, (lost[0] > 0.0, lost[1] > 0.0),
-        len(rest) * GRID, None if rate is None else tuple(np.degrees(rate).tolist()), force, ratio,
-        tuple(filter(None, faults)), _at_end_of_range(times, samples), grade, covers,
-        _settings(measured, grade, rate is not None, lost[0] > 0.0))
-
-
-def _settings(measured: ImuNoise, grade: str, at_rest: bool, rounds: bool) -> tuple[str, ...]:
-    """Return the grade where it is known, and what it does not cover."""
-    settings = [f'imu_grade={grade}'] if at_rest and grade != Config.imu_grade else []
-    preset = PRESETS[grade if at_rest else Config.imu_grade]
-    if measured.gyro_bias_std > BIAS_SIGMAS * preset.gyro_bias_std or (
-            rounds and measured.gyro_bias_std > preset.gyro_bias_std):
-        settings.append(f'gyro_bias_std={math.degrees(measured.gyro_bias_std):.2g}')
-    if measured.accel_bias_std > BIAS_SIGMAS * preset.accel_bias_std:
-        settings.append(f'accel_bias_std={measured.accel_bias_std:.2g}')
+    preset = PRESETS[grade if rest else Config.imu_grade]
+    settings, biases = {}, {}
     # Other noise is measured by the alignment itself; what is rounded away does not look noisy.
-    if rounds and measured.angle_random_walk > preset.angle_random_walk:
-        settings.append(f'angle_random_walk={math.degrees(measured.angle_random_walk) * 60.0:.2g}')
-    return tuple(settings)
+    if lost[0] and measured.angle_random_walk > preset.angle_random_walk:
+        settings['angle_random_walk'] = rounded(math.degrees(60.0 * measured.angle_random_walk))
+    if measured.gyro_bias_std > preset.gyro_bias_std * (1.0 if lost[0] else BIAS_SIGMAS):
+        biases['gyro_bias_std'] = rounded(math.degrees(measured.gyro_bias_std))
+    if measured.accel_bias_std > preset.accel_bias_std * BIAS_SIGMAS:
+        biases['accel_bias_std'] = rounded(measured.accel_bias_std)
+    shown = [f'{walk / sensor.walk_size:.2g} {sensor.walk_unit}' + ' of rounding' * (hidden > 0.0)
+             for walk, hidden, sensor in zip(walks, lost, SENSORS)]
+    imu.add(f'noise: {", ".join(shown)}' + ('' if rest else ' at most, measured in motion'),
+            settings if rest else settings | biases,
+            angle_random_walk=math.degrees(60.0 * walks[0]), velocity_random_walk=60.0 * walks[1])
+    if rest is None:
+        imu.add(f'imu_grade: {Config.imu_grade} is the default; not seen at rest, which would '
+                'show biases' + f'; its noise is no worse than that of {grade}' * covers,
+                imu_grade=grade)
+        return
+    degrees_s = np.degrees(rate).tolist()
+    within = [f' +- {width / sensor.size:.2g}' * (hidden > 0.0)
+              for width, hidden, sensor in zip(widths, lost, SENSORS)]
+    imu.add(f'at rest for {rest[1] - rest[0]:.0f} s: rate '
+            f'({", ".join(f"{each:+.4f}" for each in degrees_s)}){within[0]} deg/s, specific '
+            f'force {off_gravity:+.3f}{within[1]} m/s^2 off gravity', biases,
+            rest_s=rest[1] - rest[0], rest_rate_deg_s=degrees_s, rest_force_error=off_gravity)
+    noisy = any(walk > NOISE_MARGIN * limit and not hidden
+                for walk, limit, hidden in zip(walks, preset, lost))
+    imu.add(f'suits imu_grade {grade}' if covers else f'worse than imu_grade {grade}'
+            + ': more noise is measured while aligning' * noisy,
+            {} if grade == Config.imu_grade else
+            {'imu_grade': grade, **(CHIP_THRESHOLDS if grade == 'chip' else {})},
+            imu_grade=grade)
 
 
 def _grade(measured: ImuNoise) -> tuple[str, bool]:
@@ -179,8 +201,12 @@ def _grade(measured: ImuNoise) -> tuple[str, bool]:
     return name, all(covered)
 
 
-def _resolution(values: Array) -> Resolution:
-    """Return the resolution of a sensor, values of shape (N, 3)."""
+def _add_resolution(imu: Surveyed, sensor: Sensor, values: Array) -> float:
+    """
+    Add the resolution of a sensor, values of shape (N, 3), of its coarsest axis.
+
+    Returns the largest error of what is rounded to a multiple of the quantum or to 0.
+    """
     quantum = dead_band = zeros = 0.0
     for axis in values.T:
         levels = np.unique(axis)
@@ -199,39 +225,28 @@ def _resolution(values: Array) -> Resolution:
             # Further out there are values as usual: else these zeros are something else.
             if np.count_nonzero(sizes < 2.0 * smallest) > MIN_ZEROS and smallest > dead_band:
                 dead_band = smallest
-    return Resolution(quantum, dead_band if dead_band > 1.5 * quantum else 0.0, zeros)
+    dead_band *= dead_band > 1.5 * quantum
+    exactly = f': {zeros:.0%} of the samples of an axis are exactly 0' * (zeros > 0.01)
+    for figure, text, value in (
+            ('quantum', 'round to multiples of', quantum),
+            ('dead_band', 'have a dead band: nothing between 0 and', dead_band)):
+        line = f'{sensor.name} {text} {value / sensor.size:.2g} {sensor.unit}{exactly}'
+        imu.add(line if value else '', **{f'{sensor.name}_{figure}': value})
+    return max(0.5 * quantum, dead_band)
 
 
-def _at_end_of_range(times: Array, samples: Array) -> tuple[str, ...]:
-    """Say which sensors were at the end of their range, and where that is."""
-    check = RangeCheck()
-    check.add((times * 1e9).astype(np.int64), samples)
-    largest = np.abs(samples).reshape(-1, 2, 3).max(axis=(0, 2))
-    return tuple(
-        f'{name} at the end of their range, {value:.4g} {unit}, in {count} samples: let the '
-        'driver set a larger one' for name, value, unit, count in zip(
-            ('gyroscopes', 'accelerometers'), largest, ('rad/s', 'm/s^2'),
-            np.count_nonzero(check.densities, axis=0)) if count)
-
-
-def _noise(values: Array, half_width: float, interval: float, quiet: float) -> tuple[float, float]:
-    """Return the white noise of a sensor, per sqrt(Hz), and the bias that rounding hides."""
-    walk = 0.0
+def _walks(times: Array, values: Array, quiet: float) -> Array:
+    """Return white noise of gyros and accelerometers, per sqrt(Hz), shape (2,), of quiet times."""
+    walks, interval = np.zeros(2), float(np.median(np.diff(times)))
     for average in {1, max(round(AVERAGING / interval), 1)}:
-        count = values.shape[0] // average
-        means = values[:count * average].reshape(count, average, 3).mean(axis=1)
-        second = np.diff(means, n=2, axis=0) ** 2
-        length = max(round(WINDOW / (interval * average)), 5)
-        windows = second.shape[0] // length
-        if windows:
-            variance = second[:windows * length].reshape(windows, length, 3).mean(axis=(1, 2)) / 6
-            walk = max(walk, math.sqrt(
-                float(np.quantile(variance, quiet)) * interval * average))
-    # Noise of half a quantum carries small values over it; less leaves an error that lasts.
-    if walk / math.sqrt(interval) >= half_width:
-        return walk, 0.0
-    lost = half_width / math.sqrt(3.0)  # uniform, 1 sigma
-    return max(walk, lost * math.sqrt(interval)), lost
+        count = times.size // average
+        stamps, means = (column[:count * average].reshape(count, average, -1).mean(axis=1)
+                         for column in (times * 1e9, values))
+        edges = np.arange(0, count, max(round(WINDOW / (interval * average)), 8))
+        if edges.size > 1:
+            walks = np.maximum(walks, np.quantile(white_noise(
+                stamps[:, 0].astype(np.int64), means, edges[:-1], edges[1:]), quiet, axis=0))
+    return walks
 
 
 def _cells(times: Array, samples: Array) -> tuple[Array, Array]:
@@ -242,10 +257,10 @@ def _cells(times: Array, samples: Array) -> tuple[Array, Array]:
     return times[0] + (index[starts] + 0.5) * GRID, np.add.reduceat(samples, starts) / counts
 
 
-def _longest_rest(grid: Array, cells: Array, velocities: Series) -> list[int]:
-    """Return the cells of the longest time at rest; empty if there is none."""
+def _longest_rest(grid: Array, cells: Array, velocities: Series) -> tuple[float, float] | None:
+    """Return when the longest time at rest begins and ends, s; None if there is none."""
     if velocities.times.size < 2:
-        return []
+        return None
     speed = np.interp(grid, velocities.times, np.hypot(*velocities.vectors[:, :2].T))
     after = np.clip(np.searchsorted(velocities.times, grid), 1, velocities.times.size - 1)
     near = np.abs(grid - velocities.times[after - 1]) < 2.0 * GRID
@@ -253,28 +268,12 @@ def _longest_rest(grid: Array, cells: Array, velocities: Series) -> list[int]:
     runs = np.flatnonzero(np.diff(still.astype(np.int8))).reshape(-1, 2).tolist()
     for start, end in sorted(runs, key=lambda run: run[0] - run[1]):
         # The first and the last second may belong to stopping and setting off.
-        rest = list(range(start + 2, end - 2))
+        rest = slice(start + 2, end - 2)
         if (end - start) * GRID >= MIN_REST and np.all(
                 cells[rest].std(axis=0) < np.repeat([REST_RATE, REST_FORCE], 3)):
-            return rest
-    return []
-
-
-@dataclass(frozen=True)
-class Delay:
-    """GNSS stamps less the times of measurement, on the clock of the IMU, s."""
-
-    mean: float
-    std: float
-    drift: float  # mean of the second half less that of the first
-
-
-@dataclass(frozen=True)
-class MotionFit:
-    """What the fit tells; None: there is not enough motion or data to tell."""
-
-    delay: Delay | None
-    velocity_std: tuple[float, float] | None  # horizontal per axis and vertical, m/s
+            first, last = grid[rest][[0, -1]].tolist()
+            return first - 0.5 * GRID, last + 0.5 * GRID
+    return None
 
 
 class _Imu:
@@ -315,29 +314,34 @@ class _Imu:
         return rows
 
 
-def fit_motion(times: Array, gyro: Array, accel: Array, velocities: Series, gravity: float,
-               offsets: tuple[float, ...] = (0.0,)) -> MotionFit:
+def fit_motion(samples: Series, velocities: Series, gravity: float,
+               offsets: tuple[float, ...] = (0.0,)) -> dict[str, float]:
     """
     Fit the motion of an IMU to that of a GNSS receiver.
 
-    Samples, shape (N, 3), rad/s and m/s^2, at increasing times, s, and velocities, ENU, m/s, are
-    on the same clock but for the delay, which is searched from 0.5 s below to 1.2 s above each of
-    the offsets, s.
+    Samples, shape (N, 6), rad/s and m/s^2, and velocities, ENU, m/s, are on the same clock but for
+    the delay, which is searched from 0.5 s below to 1.2 s above each of the offsets, s.
+
+    Returns figures, s and m/s, as far as motion and data tell them: ``gnss_delay`` (stamps less
+    the times of measurement on the clock of the IMU), ``gnss_delay_std``, ``gnss_delay_drift``
+    (that of the second half less that of the first), ``velocity_noise`` (horizontal, per axis),
+    ``velocity_noise_vertical``; ``velocity_lasting`` is the part of the horizontal noise that is
+    alike in neighbouring epochs and after ``velocity_lasting_s`` no more than 1 / e of that.
     """
     delays = np.concatenate([offset + DELAYS for offset in offsets])
     moving = np.flatnonzero(np.hypot(*velocities.vectors[:, :2].T) > MOVING)
     start = velocities.times[moving[0]] - 2.0 * FIT_WINDOW if moving.size else 0.0
     velocities = Series(*(column[(velocities.times >= start) & (
         velocities.times < start + LONGEST)] for column in velocities))
-    part = slice(*np.searchsorted(times, [start - delays.max() - 1.0, start + LONGEST]).tolist())
-    times, gyro, accel = times[part], gyro[part], accel[part]
-    nothing = MotionFit(None, None)
+    part = slice(*np.searchsorted(samples.times, [
+        start - delays.max() - 1.0, start + LONGEST]).tolist())
+    times, values = samples.times[part], samples.vectors[part]
     if velocities.times.size < MIN_WINDOWS * MIN_EPOCHS or times.size < 2:
-        return nothing
+        return {}
     windows = _windows(times, velocities.times, delays)
     if windows.shape[0] < MIN_WINDOWS:
-        return nothing
-    imu = _Imu(times, gyro, accel)
+        return {}
+    imu = _Imu(times, *np.split(values, 2, axis=1))
     epochs, v_n = velocities.times[windows], velocities.vectors[windows]
     good = np.ones(windows.shape)
     costs, _, turn_std = zip(*(_fit(imu, epochs - delay, v_n, good, gravity) for delay in delays))
@@ -359,15 +363,30 @@ def fit_motion(times: Array, gyro: Array, accel: Array, velocities: Series, grav
                      for half in np.array_split(coarse, 2, axis=1))
     known = (std < MAX_DELAY_STD and np.count_nonzero(telling) >= MIN_WINDOWS
              and 0 < place % DELAYS.size < DELAYS.size - 1)
+    figures = {'gnss_delay': delay, 'gnss_delay_std': std, 'gnss_delay_drift': second - first}
+    interval = float(np.median(np.diff(velocities.times)))
     # Of windows in motion, if there are: standing, receivers are better than they are.
     chosen = np.hypot(v_n[..., 0], v_n[..., 1]).mean(axis=1) > MOVING
     chosen |= np.count_nonzero(chosen) < MIN_WINDOWS
-    # The median does without the outliers; the fit has taken some of the noise away.
-    scale = math.sqrt(3.0 * good.sum() / free.sum()) / 0.6745
-    residuals = np.abs(left[1][chosen][good[chosen] > 0.0])
-    return MotionFit(
-        Delay(delay, std, second - first) if known else None,
-        (float(np.median(residuals[:, :2]) * scale), float(np.median(residuals[:, 2]) * scale)))
+    # The fit has taken some of the noise away.
+    return (figures if known else {}) | _noise_left(
+        left[1][chosen], good[chosen], math.sqrt(3.0 * good.sum() / free.sum()), interval)
+
+
+def _noise_left(left: Array, good: Array, scale: float, interval: float) -> dict[str, float]:
+    """Return the noise of velocities, of residuals, shape (M, n, 3), weights (M, n), a factor."""
+    # The median does without the outliers.
+    size = scale / 0.6745 * np.abs(left[good > 0.0])
+    noise, vertical = float(np.median(size[:, :2])), float(np.median(size[:, 2]))
+    figures = {'velocity_noise': noise, 'velocity_noise_vertical': vertical}
+    horizontal, n = left[..., :2] * good[..., None], good.shape[1]
+    alike = np.array([np.sum(horizontal[:, lag:] * horizontal[:, :n - lag])
+                      / max(np.sum(good[:, lag:] * good[:, :n - lag]), 1.0)
+                      for lag in range(n // 2)])
+    if alike[1] > LASTING * alike[0]:
+        figures |= {'velocity_lasting': noise * math.sqrt(alike[1] / alike[0]),
+                    'velocity_lasting_s': interval * int(np.argmax(alike < alike[1] / math.e))}
+    return figures
 
 
 def _windows(times: Array, epochs: Array, delays: Array) -> np.ndarray:

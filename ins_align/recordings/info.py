@@ -25,7 +25,7 @@ from typing import Any
 
 from ins_align.checks import (
     BEYOND_THE_POLES, beyond_the_poles, exchange_fault, lateness_advice, MAX_LATENESS)
-from ins_align.config import Config, config_from_mapping, parse_override
+from ins_align.config import Config, config_from_mapping
 from ins_align.geometry.earth import normal_gravity
 from ins_align.gnss.buffer import MAX_AHEAD_NS
 from ins_align.gnss.messages import enu_from_ned
@@ -36,11 +36,10 @@ from ins_align.gnss.motion import (
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings import BagError, printable
 from ins_align.recordings.bag import Bag
-from ins_align.recordings.imu_survey import (
-    fit_motion, ImuFacts, MotionFit, Resolution, survey_imu)
+from ins_align.recordings.imu_survey import fit_motion, survey_imu
 from ins_align.recordings.reader import choose_topics
 from ins_align.recordings.topic_survey import (
-    Gap, MAX_ASTRAY, read_candidates, Recorded, TopicInfo)
+    in_words, read_candidates, Recorded, rounded, Surveyed, TopicInfo)
 from ins_align.report import format_table
 import numpy as np
 
@@ -48,7 +47,8 @@ MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
 MIN_AHEAD = 0.3  # s: clocks that differ by less may be jitter
 MAX_AHEAD, MAX_BEHIND = MAX_AHEAD_NS * 1e-9, 10.0  # s: stamps further apart are of two clocks
 MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s and so many sigmas beyond it: a delay to be set
-MIN_START = 5.0  # s that an alignment starts before a manoeuvre
+MIN_APART = 5.0  # s between manoeuvres that are listed
+MAX_LISTED = 8
 MAX_NO_FIX = 0.1  # share of positions without a fix that is worth a word
 FRAMES_THAT_FIT = ('enu', 'ned')
 FRAME_FAULTS = {
@@ -57,10 +57,19 @@ FRAME_FAULTS = {
     'turned': 'it is turned by {0.angle_deg:.0f} deg against the change of position: its axes are '
               'not east and north',
     'contradiction': 'it is {0.speed_ratio:.2g} times the change of position: check its unit'}
+# Of the table of topics: title and format by figure.
+COLUMNS = {
+    'messages': ('messages', ''), 'rate_hz': ('Hz', '.1f'), 'first_s': ('from, s', '.1f'),
+    'last_s': ('to, s', '.1f'), 'stamp_age_s': ('stamp age, s', '.3f'),
+    'stamp_age_spread_s': ('spread, s', '.3f'), 'gaps': ('gaps', ''),
+    'longest_gap_s': ('longest, s', '.1f'), 'longest_gap_start_s': ('at, s', '.1f')}
+NOT_LOOKED_FOR = (
+    'not looked for: scale factors and axes of the IMU (gyro_scale_std), biases across gravity, '
+    'slow errors of the GNSS')
 
 
-@dataclass(frozen=True)
-class Info:
+@dataclass
+class Info(Surveyed):
     """What is known of a recording before an alignment."""
 
     bag: str
@@ -68,14 +77,9 @@ class Info:
     start_ns: int
     topics: tuple[TopicInfo, ...]
     chosen: dict[str, str | None]  # topic by kind that the command reads
-    gnss_lateness_s: float | None  # of GNSS behind newer IMU samples, 99 percent
-    manoeuvres: Manoeuvres | None
-    motion: MotionFit | None  # motion of the IMU against that of the GNSS
-    heading: str  # whether the motion shows it, in words
-    notes: tuple[str, ...]
-    obstacles: tuple[str, ...]  # why it cannot be aligned
-    command: str | None  # to align it, quoted for a shell; None: it cannot be
-    warnings: tuple[str, ...]
+    obstacles: tuple[str, ...] = ()  # why it cannot be aligned
+    command: str | None = None  # to align it, quoted for a shell; None: it cannot be
+    warnings: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the object that ``--json`` writes."""
@@ -85,248 +89,223 @@ class Info:
 def inspect(path: str | os.PathLike[str]) -> Info:
     """Tell what a recording holds; a BagError says that it cannot be read at all."""
     with Bag(path) as bag:
-        return _Survey(bag).info()
-
-
-class _Survey:
-    """Looks at the topics and draws the conclusions."""
-
-    def __init__(self, bag: Bag) -> None:
-        self._bag = bag
-        self._notes: list[str] = []
-        self._settings: list[str] = []
-        self._obstacles: list[str] = []
-        self._all = read_candidates(bag)
-        self._imus, self._fixes, self._velocities = (
-            [data for data in self._all if data.kind == kind]
-            for kind in ('imu', 'fix', 'velocity'))
-
-    def info(self) -> Info:
-        """Return everything that is known."""
-        positions, gravity = self._positions()
+        candidates = read_candidates(bag)
+        imus, fixes, velocities = topics = [
+            [data for data in candidates if data.kind == kind]
+            for kind in ('imu', 'fix', 'velocity')]
+        positions, gravity = _survey_fixes(fixes, velocities)
+        for data in velocities:
+            _survey_velocity(data, positions)
         motion, grid = differences(positions), velocity_from_positions(positions)
-        for data in self._velocities:
-            _look_at_velocity(data, positions)
-        if (velocity := _best(self._velocities)) is not None:
-            motion = _in_enu(velocity)
+        if (velocity := _best(velocities)) is not None:
+            motion = velocity.series()
+            if velocity.figures.get('frame') == 'ned':
+                motion = Series(motion.times, enu_from_ned(motion.vectors))
             grid = on_grid(motion)
-        for data in self._imus:
-            _look_at_imu(data, grid, gravity, alone=len(self._imus) == 1)
-        imu, fix = (_best(topics) or next(iter(topics), None)
-                    for topics in (self._imus, self._fixes))
-        gnss = [data for data in (fix, velocity) if data is not None]
-        fit = lateness = None
-        if imu is not None:
-            self._advise_imu(imu)
-        self._advise_gnss(fix, velocity)
-        if imu is not None:
-            lateness = _lateness(imu, gnss)
-            self._compare_clocks(imu, gnss)
-            if gnss and not self._obstacles:
-                if not imu.faults and (source := velocity or _best(self._fixes)) is not None:
-                    fit = _fit(imu, source, motion, gravity)
-                self._advise_motion(min(imu.age_s - data.age_s for data in gnss), lateness, fit,
-                                    velocity)
-        for topics in (self._imus, self._fixes, self._velocities):
-            good = [data.name for data in topics if not data.faults]
-            if len(good) > 1:
-                self._notes.append(f'{", ".join(good)}: each could be read, the command takes the '
-                                   'one with the most messages; choose for yourself')
+        for data in imus:
+            _survey_imu(data, grid, gravity, alone=len(imus) == 1)
+        imu, fix = (_best(of_kind) or next(iter(of_kind), None) for of_kind in (imus, fixes))
         chosen = {'imu': imu, 'fix': fix, 'velocity': velocity}
-        command = self._command(chosen)
         # The end of a file that was cut off is known from what could be read of it.
-        start_ns = self._bag.start_ns or 0
-        end_ns = max([self._bag.end_ns or start_ns, *(
-            int(data.recorded_ns.max()) for data in self._all if data.recorded_ns.size)])
-        found = find_manoeuvres(grid)
-        return Info(
-            str(self._bag.path), (end_ns - start_ns) * 1e-9, start_ns,
-            (*self._imus, *self._fixes, *self._velocities),
-            {kind: None if data is None else data.name for kind, data in chosen.items()},
-            lateness, found, fit, heading_in_words(found), tuple(self._notes),
-            tuple(self._obstacles), command, tuple(self._bag.warnings))
-
-    def _positions(self) -> tuple[Series, float]:
-        """Look at positions; return the track of the best, without spikes, and gravity there."""
-        for data in self._fixes:
-            if data.stamps_ns.size and not data.usable.any():
-                beyond = [beyond_the_poles(*place) for place in data.values[:, :2].tolist()]
-                data.faults += ('no message has a fix' if data.no_fix_share == 1.0 else
-                                BEYOND_THE_POLES if np.mean(beyond) > 0.5 else
-                                'no message has a fix and numbers that can be used',)
-        fix = _best(self._fixes)
-        if fix is None:
-            return EMPTY, 9.81
-        for velocity in self._velocities:
-            if fault := exchange_fault(fix.series(), velocity.series()):
-                fix.faults += (fault,)
-                fix.values = fix.values[:, [1, 0, 2]]
-                break
-        positions_deg = fix.series()
-        latitude, _, altitude = np.median(positions_deg.vectors, axis=0).tolist()
-        return (without_wild_positions(track(positions_deg)),
-                float(normal_gravity(math.radians(latitude), altitude)))
-
-    def _advise(self, when: object, note: str = '', setting: str = '') -> None:
-        if when:
-            self._notes.extend(filter(None, [note]))
-            self._settings.extend(filter(None, [setting]))
-
-    def _advise_imu(self, imu: Recorded) -> None:
-        if imu.imu is None:
-            return
-        gap = imu.timing.longest_gap or Gap(0.0, 0.0)
-        self._notes.extend(imu.imu.too_small)
-        self._settings.extend(imu.imu.settings)
-        self._advise(imu.unmeasured and not imu.faults,
-                     f'{imu.name}: {imu.unmeasured}; its numbers are used all the same '
-                     '(covariances that are not known are 0)')
-        self._advise(gap.duration_s > MAX_GAP_NS * 1e-9,
-                     f'the IMU is silent for {gap.duration_s:.1f} s at {gap.start_s:.1f} s: an '
-                     'alignment starts over after that')
-        self._advise(imu.imu.up[2] < 0.5,
-                     'on average the specific force does not point along the z axis of the IMU: '
-                     'the attitude will be that of the axes as they are, however the IMU is '
-                     'mounted')
-
-    def _advise_gnss(self, fix: Recorded | None, velocity: Recorded | None) -> None:
-        no_fix = fix.no_fix_share or 0.0 if fix is not None else 0.0
-        self._advise(no_fix > MAX_NO_FIX, f'{no_fix:.0%} of the positions are without a fix')
-        if velocity is None or velocity.frame is None:
-            self._advise(self._velocities, setting='use_velocity=false')
-            self._advise(fix, 'there is no velocity that can be used: it is aligned from '
-                         'positions alone, which takes longer unless they are RTK')
-            return
-        name = velocity.frame.frame
-        self._advise(name == 'unknown', 'nothing tells the frame of the velocity (too little '
-                     'motion): it is taken as east-north-up')
-        self._advise(name == 'ned' or name == 'enu' and velocity.refused,
-                     setting=f'velocity_frame={name}')
-        self._advise(velocity.frame.upside_down, 'the vertical velocity has the wrong sign')
-        self._advise(velocity.vertical_absent, setting='velocity_vertical=absent')
-
-    def _compare_clocks(self, imu: Recorded, gnss: list[Recorded]) -> None:
-        for data in gnss:
-            late = data.age_s - imu.age_s
-            if data.stamps_ns.size and not -MAX_AHEAD < late < MAX_BEHIND:
-                self._obstacles.append(
-                    f'the stamps of {data.name} are {abs(late):.1f} s '
-                    f'{"behind" if late > 0.0 else "ahead of"} those of {imu.name}: they are of '
-                    'different clocks')
-
-    def _advise_motion(self, ahead: float, lateness: float | None, fit: MotionFit | None,
-                       velocity: Recorded | None) -> None:
-        if fit is None or (delay := fit.delay) is None:
-            self._advise(
-                ahead >= MIN_AHEAD, f'the stamps of GNSS messages are {ahead:.1f} s ahead of '
-                'those of the IMU: their clocks differ, which gnss_delay corrects as far as '
-                'messages were recorded at once', f'gnss_delay={ahead:.1f}')
-        else:
-            least = MIN_DELAY + DELAY_SIGMAS * delay.std
-            self._advise(
-                abs(delay.mean) > least, f'the GNSS measures {abs(delay.mean):.2f} s '
-                f'{"before" if delay.mean > 0.0 else "after"} its stamps, as the motion of the '
-                'IMU shows: set gnss_delay', f'gnss_delay={delay.mean:.2f}')
-            self._advise(
-                abs(delay.drift) > least + DELAY_SIGMAS * delay.std, 'the delay of the GNSS '
-                f'changes by {delay.drift:+.2f} s from the first half to the second: the clocks '
-                'of IMU and GNSS drift apart')
-            if lateness is not None and delay.mean < -least:
-                lateness += delay.mean  # a delay above 0 adds to gnss_lateness by itself
-        # Velocities that mostly come without a covariance.
-        if fit is not None and fit.velocity_std is not None and velocity is not None and (
-                velocity.covariance_share or 0.0) < 0.5:
-            horizontal, vertical = (f'{max(std, 1e-3):.2g}' for std in fit.velocity_std)
-            self._settings.append(f'velocity_std={horizontal}')
-            self._advise(not velocity.vertical_absent, setting=f'velocity_std_vertical={vertical}')
-        if lateness is not None and Config.gnss_lateness < lateness < MAX_LATENESS:
-            advice, value = lateness_advice(lateness)
-            self._advise(True, advice, f'gnss_lateness={value}')
-
-    def _command(self, chosen: dict[str, Recorded | None]) -> str | None:
-        """Return the command, tried as far as its choice of topics goes."""
-        path = str(self._bag.path)
-        arguments = ['ins_align', 'replay', path if not path.startswith('-') else f'./{path}']
-        names: dict[str, str] = {}
-        for kind, data in chosen.items():
-            if data is not None and data.faults:
-                self._obstacles.append(f'{data.name} cannot be used: {data.faults[0]}')
-            if data is not None and sum(other.kind == kind for other in self._all) > 1:
-                names[kind] = data.name
-                arguments += [f'--{kind}-topic', data.name]
-        for setting in self._settings:
-            arguments += ['--set', setting]
-        config = config_from_mapping(dict(map(parse_override, self._settings)))
-        try:
-            choose_topics(self._bag, config, **names)
-        except BagError as error:
-            self._obstacles.append(str(error))
-        return None if self._obstacles else shlex.join(arguments)
+        start_ns = bag.start_ns or 0
+        end_ns = max([bag.end_ns or start_ns, *(
+            int(data.recorded_ns.max()) for data in candidates if data.recorded_ns.size)])
+        info = Info(str(bag.path), (end_ns - start_ns) * 1e-9, start_ns,
+                    tuple(data for of_kind in topics for data in of_kind),
+                    {kind: data and data.name for kind, data in chosen.items()})
+        _add_manoeuvres(info, find_manoeuvres(grid))
+        obstacles = [f'{data.name} cannot be used: {data.faults[0]}'
+                     for data in chosen.values() if data is not None and data.faults]
+        if velocity is None:
+            info.add('there is no velocity that can be used: it is aligned from positions alone, '
+                     'which takes longer unless they are RTK' * (fix is not None),
+                     {'use_velocity': False} if velocities else {})
+        gnss = [data for data in (fix, velocity) if data is not None]
+        if imu is not None and gnss:
+            obstacles += _different_clocks(imu, gnss)
+            if not obstacles:
+                _add_timing(info, imu, gnss, motion, gravity)
+        for of_kind in topics:
+            good = [data.name for data in of_kind if not data.faults]
+            if len(good) > 1:
+                info.add(f'{", ".join(good)}: each could be read, the command takes the one with '
+                         'the most messages; choose for yourself')
+        _propose(info, bag, chosen, obstacles)
+    return info
 
 
-def _look_at_velocity(data: Recorded, positions: Series) -> None:
+def _survey_fixes(fixes: list[Recorded], velocities: list[Recorded]) -> tuple[Series, float]:
+    """Look at positions; return the track of the best, without spikes, and gravity there."""
+    for data in fixes:
+        if data.stamps_ns.size and not data.usable.any():
+            beyond = [beyond_the_poles(*place) for place in data.values[:, :2].tolist()]
+            data.add('no message has a fix' if data.figures['no_fix_share'] == 1.0 else
+                     BEYOND_THE_POLES if np.mean(beyond) > 0.5 else
+                     'no message has a fix and numbers that can be used', fault=True)
+    fix = _best(fixes)
+    if fix is None:
+        return EMPTY, 9.81
+    for velocity in velocities:
+        if fault := exchange_fault(fix.series(), velocity.series()):
+            fix.add(fault, fault=True)
+            fix.values = fix.values[:, [1, 0, 2]]
+            break
+    positions_deg = fix.series()
+    latitude, _, altitude = np.median(positions_deg.vectors, axis=0).tolist()
+    return (without_wild_positions(track(positions_deg)),
+            float(normal_gravity(math.radians(latitude), altitude)))
+
+
+def _survey_velocity(data: Recorded, positions: Series) -> None:
     """Find the frame of a velocity and what makes it useless."""
     if not data.usable.any():
         if data.stamps_ns.size:
-            data.faults += ('no message has numbers that can be used',)
+            data.add('no message has numbers that can be used', fault=True)
         return
-    data.frame = velocity_frame(data.series(), positions)
-    if data.refused and data.frame.frame not in FRAMES_THAT_FIT:
-        data.faults += (data.refused,)
-    if data.frame.frame in FRAME_FAULTS:
-        data.faults += (FRAME_FAULTS[data.frame.frame].format(data.frame),)
+    frame = velocity_frame(data.series(), positions)
+    name = frame.frame
+    if data.refused and name not in FRAMES_THAT_FIT:
+        data.add(data.refused, fault=True)
+    if name in FRAME_FAULTS:
+        data.add(FRAME_FAULTS[name].format(frame), fault=True)
+    text = 'frame: not known, too little motion: it is taken as east-north-up'
+    if name in FRAMES_THAT_FIT:
+        text = f'frame: {name} (fits the change of position over {frame.windows} distances)'
+    data.add('' if name in FRAME_FAULTS else text,
+             {'velocity_frame': name} if name == 'ned' or name == 'enu' and data.refused else {},
+             frame=name, speed_ratio=frame.speed_ratio)
+    if frame.upside_down:
+        data.add('the vertical velocity has the wrong sign')
     moved = (data.values[data.usable] != 0.0).any(axis=0)
-    data.vertical_absent = bool(moved[:2].any() and not moved[2])
+    if moved[:2].any() and not moved[2]:
+        data.add('vertical velocity: always 0', {'velocity_vertical': 'absent'})
 
 
-def _look_at_imu(data: Recorded, motion: Series, gravity: float, alone: bool) -> None:
+def _survey_imu(data: Recorded, motion: Series, gravity: float, alone: bool) -> None:
     """Measure an IMU and find what makes it useless."""
-    if data.unmeasured and not alone:
-        data.faults += (data.unmeasured,)
-    data.imu = survey_imu(*data.series(), motion, gravity)
-    if data.imu is not None:
-        data.faults += data.imu.faults
-    elif data.stamps_ns.size:
-        data.faults += ('it has too few usable samples',)
-    rate = data.timing.rate_hz
+    if data.unmeasured:
+        data.add(data.unmeasured + '; its numbers are used all the same (covariances that are not '
+                 'known are 0)' * alone, fault=not alone)
+    rate, gap = (data.figures.get(name) for name in ('rate_hz', 'longest_gap_s'))
     if rate is not None and rate < MIN_RATE:
-        data.faults += (f'its rate is {rate:.2g} Hz: an alignment starts over after '
-                        f'{MAX_GAP_NS * 1e-9:g} s without a sample',)
-
-
-def _in_enu(velocity: Recorded) -> Series:
-    series = velocity.series()
-    if velocity.frame is not None and velocity.frame.frame == 'ned':
-        return Series(series.times, enu_from_ned(series.vectors))
-    return series
-
-
-def _fit(imu: Recorded, gnss: Recorded, motion: Series, gravity: float) -> MotionFit:
-    """Compare the motion of the IMU with that of the GNSS, on the clocks of their stamps."""
-    apart = imu.age_s - gnss.age_s
-    samples = imu.series()
-    return fit_motion(samples.times, *np.split(samples.vectors, 2, axis=1),
-                      Series(motion.times + apart, motion.vectors), gravity,
-                      (0.0, apart) if abs(apart) >= MIN_AHEAD else (0.0,))
-
-
-def _lateness(imu: Recorded, gnss: list[Recorded]) -> float | None:
-    """Return how late GNSS messages come after newer IMU samples, 99 percent of them, s."""
-    newest = np.maximum.accumulate(imu.stamps_ns[imu.usable])
-    late = [np.zeros(0)]
-    for data in gnss if newest.size else ():
-        before = np.searchsorted(imu.recorded_ns[imu.usable], data.recorded_ns[data.usable]) - 1
-        late.append((newest[before] - data.stamps_ns[data.usable])[before >= 0] * 1e-9)
-    lateness = np.concatenate(late)
-    return float(np.quantile(lateness, 0.99)) if lateness.size else None
+        data.add(f'its rate is {rate:.2g} Hz: an alignment starts over after '
+                 f'{MAX_GAP_NS * 1e-9:g} s without a sample', fault=True)
+    elif gap is not None and gap > MAX_GAP_NS * 1e-9:
+        data.add(f'silent for {gap:.1f} s at {data.figures["longest_gap_start_s"]:.1f} s: an '
+                 'alignment starts over after that')
+    if data.stamps_ns.size:
+        survey_imu(data, data.series(), motion, gravity)
 
 
 def _best(topics: list[Recorded]) -> Recorded | None:
     """Return the topic to read: without faults, its frame known, the most messages."""
     good = [data for data in topics if not data.faults]
     return max(good, default=None, key=lambda data: (
-        data.frame is not None and data.frame.frame in FRAMES_THAT_FIT,
-        data.timing.count * data.usable_share))
+        data.figures.get('frame') in FRAMES_THAT_FIT, np.count_nonzero(data.usable)))
+
+
+def _add_manoeuvres(info: Info, found: Manoeuvres | None) -> None:
+    """Add how the vehicle moves, and whether that shows the heading."""
+    info.add(f'heading from the motion: {heading_in_words(found)}')
+    if found is None:
+        return
+    info.add(f'up to {found.max_speed:.1f} m/s; velocity changes by up to '
+             f'{found.largest_change:.1f} m/s within {MANOEUVRE_TIME:g} s',
+             max_speed=found.max_speed, largest_change=found.largest_change)
+    apart = [start for before, start in zip((-math.inf, *found.starts), found.starts)
+             if start - before > MIN_APART]
+    listing = [f'{start:.0f}' for start in apart[:MAX_LISTED]] + ['...'] * (
+        len(apart) > MAX_LISTED)
+    info.add(f'changes by {MANOEUVRE_SPEED:g} m/s: {len(found.starts)}, at '
+             f'{", ".join(listing)} s' if apart else '', manoeuvres_s=list(found.starts))
+
+
+def _different_clocks(imu: Recorded, gnss: list[Recorded]) -> list[str]:
+    """Say which stamps are of another clock than those of the IMU."""
+    late = [(data, data.age_s - imu.age_s) for data in gnss if data.stamps_ns.size]
+    return [f'the stamps of {data.name} are {abs(age):.1f} s '
+            f'{"behind" if age > 0.0 else "ahead of"} those of {imu.name}: they are of different '
+            'clocks' for data, age in late if not -MAX_AHEAD < age < MAX_BEHIND]
+
+
+def _add_timing(info: Info, imu: Recorded, gnss: list[Recorded], motion: Series, gravity: float,
+                ) -> None:
+    """Add how stamps and arrival of GNSS messages compare with the IMU, and their noise."""
+    source = gnss[-1]
+    apart = imu.age_s - source.age_s
+    lateness = _lateness(imu, gnss)
+    found = fit_motion(imu.series(), Series(motion.times + apart, motion.vectors), gravity,
+                       (0.0, apart) if abs(apart) >= MIN_AHEAD else (0.0,))
+    info.add('', gnss_lateness=lateness, **found)
+    ahead = min(imu.age_s - data.age_s for data in gnss)
+    if 'gnss_delay' in found:
+        delay, std, drift = (found[f'gnss_delay{name}'] for name in ('', '_std', '_drift'))
+        least = MIN_DELAY + DELAY_SIGMAS * std
+        info.add(f'delay of the GNSS against the IMU: {delay:+.2f} s +- {max(std, 0.01):.2f} s, '
+                 'as the motion of the IMU shows',
+                 {'gnss_delay': round(delay, 2)} if abs(delay) > least else {})
+        if abs(drift) > least + DELAY_SIGMAS * std:
+            info.add(f'the delay of the GNSS changes by {drift:+.2f} s from the first half to the '
+                     'second: the clocks of IMU and GNSS drift apart')
+        if delay < -least:
+            lateness += delay  # a delay above 0 adds to gnss_lateness by itself
+    elif ahead >= MIN_AHEAD:
+        info.add(f'the stamps of GNSS messages are {ahead:.1f} s ahead of those of the IMU: their '
+                 'clocks differ, which gnss_delay corrects as far as messages were recorded at '
+                 'once', {'gnss_delay': round(ahead, 1)})
+    if source.kind == 'velocity' and 'velocity_noise' in found:
+        _add_velocity_noise(info, source)
+    if Config.gnss_lateness < lateness < MAX_LATENESS:
+        text, value = lateness_advice(lateness)
+        info.add(text, {'gnss_lateness': float(value)})
+
+
+def _add_velocity_noise(info: Info, velocity: Recorded) -> None:
+    """Word the noise of velocities, which is set where most come without a covariance."""
+    noise = [info.figures['velocity_noise'], info.figures['velocity_noise_vertical']]
+    names = ['velocity_std', 'velocity_std_vertical']
+    if 'velocity_vertical' in velocity.settings:
+        names.pop()
+    settings = {name: rounded(max(std, 1e-3)) for name, std in zip(names, noise)}
+    info.add(f'noise of the GNSS velocity: {noise[0]:.2g} m/s horizontally, {noise[1]:.2g} m/s '
+             'vertically', settings if velocity.figures['covariance_share'] < 0.5 else {})
+    if (lasting := info.figures.get('velocity_lasting')) is not None:
+        info.add(f'{lasting:.2g} m/s of it last for {info.figures["velocity_lasting_s"]:.1f} s or '
+                 'more: sigmas will be larger than white noise makes them')
+
+
+def _lateness(imu: Recorded, gnss: list[Recorded]) -> float:
+    """Return how late GNSS messages come after newer IMU samples, 99 percent of them, s."""
+    newest = np.maximum.accumulate(imu.stamps_ns[imu.usable])
+    late = [np.zeros(1)]
+    for data in gnss:
+        before = np.searchsorted(imu.recorded_ns[imu.usable], data.recorded_ns[data.usable]) - 1
+        late.append((newest[before] - data.stamps_ns[data.usable])[before >= 0] * 1e-9)
+    return float(np.quantile(np.concatenate(late), 0.99))
+
+
+def _propose(info: Info, bag: Bag, chosen: dict[str, Recorded | None], obstacles: list[str],
+             ) -> None:
+    """Set the command, tried as far as its choice of topics goes, or why there is none."""
+    arguments = ['ins_align', 'replay', info.bag if info.bag[0] != '-' else f'./{info.bag}']
+    names: dict[str, str] = {}
+    settings: dict[str, Any] = {}
+    for kind, data in chosen.items():
+        if data is None:
+            continue
+        settings |= data.settings
+        if sum(other.kind == kind for other in info.topics) > 1:
+            names[kind] = data.name
+            arguments += [f'--{kind}-topic', data.name]
+    settings |= info.settings
+    for setting in in_words(settings):
+        arguments += ['--set', setting]
+    try:
+        choose_topics(bag, config_from_mapping(settings), **names)
+    except BagError as error:
+        obstacles.append(str(error))
+    info.obstacles, info.warnings = tuple(obstacles), tuple(bag.warnings)
+    info.command = None if obstacles else shlex.join(arguments)
 
 
 def describe(info: Info) -> str:
@@ -336,108 +315,22 @@ def describe(info: Info) -> str:
              f'  {info.duration_s:.1f} s, recorded from {recorded:%Y-%m-%d %H:%M:%S} UTC']
     if info.topics:
         lines += ['', format_table(list(map(_row, info.topics)), [
-            'topic', 'type', 'messages', 'Hz', 'from, s', 'to, s', 'stamp age, s', 'spread, s',
-            'gaps', 'longest, s'], '  ')]
-    for topic in info.topics:
-        lines += ['', f'  {topic.name}', *(f'    {line}' for line in _about(topic))]
-    lines += ['', f'  heading from the motion: {info.heading}',
-              *(f'    {line}' for line in _about_motion(info.manoeuvres, info.motion))]
-    if info.notes:
-        lines += ['', '  notes', *(f'    - {note}' for note in info.notes)]
+            'topic', 'type', *(title for title, _ in COLUMNS.values())], '  ')]
+    for title, surveyed in (*((topic.name, topic) for topic in info.topics), ('together', info)):
+        lines += ['', f'  {title}', *(
+            f'    cannot be used: {fault}' for fault in surveyed.faults), *(
+            f'    {line}' for line in surveyed.lines)]
     if info.command is None:
         lines += ['', '  it cannot be aligned', *(f'    - {text}' for text in info.obstacles)]
     else:
-        lines += ['', '  to align it, with the lever arm added: --lever-arm X Y Z',
+        lines += [f'    {NOT_LOOKED_FOR}', '',
+                  '  to align it, with the lever arm added: --lever-arm X Y Z',
                   f'    {info.command}']
     return '\n'.join(printable(line) for text in lines for line in text.split('\n'))
 
 
-def _row(topic: TopicInfo) -> list[Any]:
-    timing, gap = topic.timing, topic.timing.longest_gap
-    numbers = [(timing.rate_hz, 1), (timing.first_s, 1), (timing.last_s, 1),
-               (timing.stamp_age_s, 3), (timing.stamp_age_spread_s, 3)]
-    return [topic.name, topic.msgtype.rsplit('/', 1)[-1], timing.count,
-            *('-' if value is None else f'{value:.{digits}f}' for value, digits in numbers),
-            timing.gaps, '-' if gap is None else f'{gap.duration_s:.1f} at {gap.start_s:.1f}']
-
-
-def _about(topic: TopicInfo) -> list[str]:
-    """Say in lines what has been found out about a topic."""
-    timing, frame, share = topic.timing, topic.frame, topic.covariance_share
-    lines = [f'cannot be used: {fault}' for fault in topic.faults]
-    lines += [f'{count} {text}' for count, text in (
-        (timing.undecodable, 'messages cannot be decoded'),
-        (timing.astray, f'stamps are more than {MAX_ASTRAY:g} s off the others'),
-        (timing.out_of_order, 'stamps are not later than the one before')) if count]
-    if topic.no_fix_share is not None:
-        lines.append(f'without a fix: {topic.no_fix_share:.1%}')
-    if frame is not None and frame.frame in FRAMES_THAT_FIT:
-        lines.append(f'frame: {frame.frame} (fits the change of position over {frame.windows} '
-                     'distances)')
-    elif frame is not None and frame.frame == 'unknown':
-        lines.append('frame: not known, too little motion')
-    lines += ['vertical velocity: always 0'] * topic.vertical_absent
-    if topic.sigma is not None:
-        unit = 'm' if topic.kind == 'fix' else 'm/s'
-        lines.append(f'states sigmas of {topic.sigma[0]:.2g} {unit} horizontally, '
-                     f'{topic.sigma[1]:.2g} {unit} vertically'
-                     + ('' if share == 1.0 else f' in {share:.0%} of the messages'))
-    elif share is not None:
-        lines.append('states no covariance')
-    return lines + ([] if topic.imu is None else _about_imu(topic.imu))
-
-
-def _about_imu(imu: ImuFacts) -> list[str]:
-    x, y, z = imu.up
-    walks = [f'{walk:.2g} {unit}' + ' of rounding' * rounds for walk, unit, rounds in zip(
-        (imu.angle_random_walk, imu.velocity_random_walk), ('deg/sqrt(h)', 'm/s/sqrt(h)'),
-        imu.rounds)]
-    lines = [
-        f'specific force: {imu.mean_force:.2f} m/s^2 on average, mean direction '
-        f'({x:+.2f}, {y:+.2f}, {z:+.2f})',
-        f'angular rate: up to {imu.max_rate_deg_s:.0f} deg/s',
-        *_about_resolution('gyroscopes', imu.gyro, math.degrees(1.0), 'deg/s'),
-        *_about_resolution('accelerometers', imu.accel, 1.0, 'm/s^2'),
-        f'noise: {", ".join(walks)}' + ('' if imu.rest_s else ' at most, measured in motion')]
-    if imu.rest_rate_deg_s is not None and imu.rest_force_error is not None:
-        rounded = f' +- {math.degrees(imu.gyro.half_width):.2g}' * imu.rounds[0]
-        lines.append(
-            f'at rest for {imu.rest_s:.0f} s: rate '
-            f'({", ".join(f"{rate:+.4f}" for rate in imu.rest_rate_deg_s)}){rounded} deg/s, '
-            f'specific force {imu.rest_force_error:+.3f}'
-            + f' +- {imu.accel.half_width:.2g}' * imu.rounds[1] + ' m/s^2 off gravity')
-    if not imu.rest_s:
-        return [*lines, f'imu_grade: no worse than {imu.grade}' if imu.grade_covers else
-                f'imu_grade: never at rest to measure it; {Config.imu_grade} is the default']
-    return [*lines, f'suits imu_grade {imu.grade}' if imu.grade_covers else
-            f'worse than imu_grade {imu.grade}: more noise is measured while aligning'
-            + ', more bias is among the settings' * ('bias_std' in str(imu.settings))]
-
-
-def _about_resolution(name: str, found: Resolution, scale: float, unit: str) -> list[str]:
-    zeros = f': {found.zeros:.0%} of the samples of an axis are exactly 0' * (found.zeros > 0.01)
-    return [f'{name} {text} {value * scale:.2g} {unit}{zeros}' for text, value in (
-        ('round to multiples of', found.quantum),
-        ('have a dead band: nothing between 0 and', found.dead_band)) if value]
-
-
-def _about_motion(found: Manoeuvres | None, fit: MotionFit | None) -> list[str]:
-    lines = []
-    if found is not None:
-        lines.append(f'up to {found.max_speed:.1f} m/s; velocity changes by up to '
-                     f'{found.largest_change:.1f} m/s within {MANOEUVRE_TIME:g} s')
-    if found is not None and (starts := found.starts):
-        apart = [start for before, start in zip((-math.inf, *starts), starts)
-                 if start - before > MIN_START]
-        listing = [f'{start:.0f}' for start in apart[:8]] + ['...'] * (len(apart) > 8)
-        lines.append(f'changes by {MANOEUVRE_SPEED:g} m/s: {len(starts)}, at '
-                     f'{", ".join(listing)} s' + (
-                         f'; --start {starts[0] - MIN_START:.0f} leaves out what came before'
-                         if starts[0] > MIN_START else ''))
-    if fit is not None and fit.delay is not None:
-        lines.append(f'delay of the GNSS against the IMU: {fit.delay.mean:+.2f} s +- '
-                     f'{max(fit.delay.std, 0.01):.2f} s')
-    if fit is not None and fit.velocity_std is not None:
-        lines.append('noise of the GNSS velocity: {:.2g} m/s horizontally, {:.2g} m/s vertically'
-                     .format(*fit.velocity_std))
-    return lines
+def _row(topic: TopicInfo) -> list[str]:
+    figures = topic.figures
+    return [topic.name, topic.msgtype.rsplit('/', 1)[-1], *(
+        '-' if (value := figures.get(name)) is None else format(value, digits)
+        for name, (_, digits) in COLUMNS.items())]

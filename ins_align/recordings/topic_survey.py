@@ -15,24 +15,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.drivers import type_in_words
 from ins_align.gnss.messages import MessageError, numbers_of
-from ins_align.gnss.motion import Series, series_of, VelocityFrame
+from ins_align.gnss.motion import Series, series_of
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.recordings import Topic
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import (
     decode_gnss, decode_imu, deserialize, Gnss, IMU_TYPE, ImuSamples, KINDS, Refused, unmeasured,
     VELOCITY_TYPES)
-from ins_align.recordings.imu_survey import ImuFacts
 from ins_align.recordings.reader import is_command, may_be_velocity, REFERENCE_NAMESPACE
 import numpy as np
 
@@ -40,46 +39,65 @@ MAX_ASTRAY = 60.0  # s: a stamp further off the recorded time than the others is
 GAP_INTERVALS = 3.5  # times the usual interval without a message is a gap
 
 
-class Gap(NamedTuple):
-    """Time without messages, seconds."""
-
-    start_s: float  # of the recording
-    duration_s: float
+def rounded(value: float) -> float:
+    """Return a value with two digits, as a parameter is set."""
+    return float(f'{value:.2g}')
 
 
-@dataclass(frozen=True)
-class Timing:
-    """When the messages of a topic came; seconds of the recording."""
+def in_words(settings: Mapping[str, Any]) -> list[str]:
+    """Return parameters as ``--set`` takes them."""
+    return [f'{name}={str(value).lower()}' for name, value in settings.items()]
 
-    count: int
-    undecodable: int
-    rate_hz: float | None = None
-    first_s: float | None = None  # recorded
-    last_s: float | None = None
-    stamp_age_s: float | None = None  # recorded time less the header's stamp, median
-    stamp_age_spread_s: float | None = None  # 98 percent of the ages lie within this
-    astray: int = 0  # stamps more than MAX_ASTRAY off the usual age
-    out_of_order: int = 0  # stamps that are not later than the one before
-    gaps: int = 0
-    longest_gap: Gap | None = None
+
+@dataclass(kw_only=True)
+class Surveyed:
+    """
+    What has been found out about a recording or a topic.
+
+    Attributes
+    ----------
+    lines : list of str
+        Sentences, which ``ins_align info`` prints.
+    figures : dict
+        Numbers by name, in SI units where the name has no other.
+    settings : dict
+        Parameters that an alignment needs, with their values.
+    faults : list of str
+        Why it is useless as it is.
+
+    """
+
+    lines: list[str] = field(default_factory=list)
+    figures: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+    faults: list[str] = field(default_factory=list)
+
+    def add(self, text: str, settings: Mapping[str, Any] | None = None, *, fault: bool = False,
+            **figures: Any) -> None:
+        """Add a finding: a sentence ('': none), parameters that it sets, figures by name."""
+        if fault:
+            self.faults.append(text)
+        elif text:
+            sets = ', '.join(in_words(settings or {}))
+            self.lines.append(text + (sets and f' (sets {sets})'))
+        self.settings |= settings or {}
+        self.figures |= figures
 
 
 @dataclass
-class TopicInfo:
-    """A topic that an alignment could read."""
+class TopicInfo(Surveyed):
+    """
+    A topic that an alignment could read.
+
+    Figures of all are ``messages``, ``rate_hz``, ``first_s`` and ``last_s`` (recorded),
+    ``stamp_age_s`` (recorded time less the header's stamp, median), ``stamp_age_spread_s`` (98
+    percent of the ages lie within this), ``gaps``, ``longest_gap_s`` and ``longest_gap_start_s``;
+    all but the first are missing where there is no message. Seconds are those of the recording.
+    """
 
     name: str
     msgtype: str
     kind: str  # imu, fix or velocity
-    timing: Timing = Timing(0, 0)
-    faults: tuple[str, ...] = ()  # each makes the topic useless as it is
-    usable_share: float = 0.0  # of the messages: finite and, of fixes, with a fix
-    no_fix_share: float | None = None  # of fixes
-    covariance_share: float | None = None  # of GNSS messages that state a covariance
-    sigma: tuple[float, float] | None = None  # stated, horizontal and vertical, median
-    frame: VelocityFrame | None = None  # of velocities
-    vertical_absent: bool = False  # of velocities: the vertical one is always 0
-    imu: ImuFacts | None = None
 
 
 class Recorded(TopicInfo):
@@ -112,10 +130,10 @@ class Recorded(TopicInfo):
         self._sigmas: list[tuple[float, float]] = []  # of messages that state a covariance
         self._parts: list[tuple[Any, ...]] = []  # recorded_ns, stamps_ns, values, usable
         if kind == 'velocity' and is_command(topic):
-            self.faults = ('its name is that of a command, not of a measurement',)
+            self.add('its name is that of a command, not of a measurement', fault=True)
 
-    def add(self, times_ns: np.ndarray, first: bytes, decoded: ImuSamples | Sequence[Gnss],
-            ) -> None:
+    def take(self, times_ns: np.ndarray, first: bytes, decoded: ImuSamples | Sequence[Gnss],
+             ) -> None:
         """Take consecutive messages, decoded, of which the first one is given as it was."""
         if not self._parts:
             self._look_at(first)
@@ -152,36 +170,54 @@ class Recorded(TopicInfo):
                                             '(covariance -1)')
 
     def finish(self) -> None:
-        """Put together what has been added, and say what it tells of itself."""
+        """Put together what has been taken, and say what it tells of itself."""
         if self._parts:
             self.recorded_ns, self.stamps_ns, self.values, self.usable = map(
                 np.concatenate, zip(*self._parts))
             self._parts = []
         count = self.stamps_ns.size
+        self.add('', messages=count + self._undecodable)
         if not count:
-            self.timing = Timing(self._undecodable, self._undecodable)
-            self.faults += (self._why or 'its messages cannot be decoded' if self._undecodable
-                            else 'it has no messages',)
+            self.add(self._why or 'its messages cannot be decoded' if self._undecodable
+                     else 'it has no messages', fault=True)
             return
         ages_ns = self.recorded_ns - self.stamps_ns
         # The median: one of the ages, no mean of two clocks.
         self._age_ns = int(np.sort(ages_ns)[count // 2])
         astray = np.abs(ages_ns - self._age_ns) > MAX_ASTRAY * 1e9
-        self.timing = self._timing(ages_ns * 1e-9, astray)
         self.usable &= ~astray
-        self.usable_share = float(np.mean(self.usable))
+        in_order = self.stamps_ns[~astray]
+        self._add_timing(np.unique(in_order), ages_ns * 1e-9, astray)
+        for name, number, text in (
+                ('undecodable', self._undecodable, 'messages cannot be decoded'),
+                ('astray', int(np.count_nonzero(astray)),
+                 f'stamps are more than {MAX_ASTRAY:g} s off the others'),
+                ('out_of_order', int(np.count_nonzero(np.diff(in_order) <= 0)),
+                 'stamps are not later than the one before')):
+            self.add(number and f'{number} {text}' or '', **{name: number})
+        self.add('', usable_share=float(np.mean(self.usable)))
         if self.kind == 'fix':
-            self.no_fix_share = self._without_fix / count
+            share = self._without_fix / count
+            self.add(f'without a fix: {share:.1%}', no_fix_share=share)
         if self.kind != 'imu':
-            self.covariance_share = len(self._sigmas) / count
-        if self._sigmas:
-            horizontal, vertical = np.median(self._sigmas, axis=0).tolist()
-            self.sigma = horizontal, vertical
+            self._add_sigma(len(self._sigmas) / count)
+
+    def _add_sigma(self, share: float) -> None:
+        """Say what sigma a share of the messages states."""
+        if not self._sigmas:
+            self.add('states no covariance', covariance_share=share)
+            return
+        sigma = np.median(self._sigmas, axis=0).tolist()
+        horizontal, vertical = (f'{std:.2g} {"m" if self.kind == "fix" else "m/s"}'
+                                for std in sigma)
+        self.add(f'states sigmas of {horizontal} horizontally, {vertical} vertically'
+                 + ('' if share == 1.0 else f' in {share:.0%} of the messages'),
+                 covariance_share=share, sigma=sigma)
 
     @property
     def age_s(self) -> float:
         """Usual recorded time less stamp; 0 where there is no message."""
-        return self.timing.stamp_age_s or 0.0
+        return self._age_ns * 1e-9
 
     def series(self) -> Series:
         """
@@ -193,24 +229,20 @@ class Recorded(TopicInfo):
         times_ns = self.stamps_ns[self.usable] - self._start_ns + self._age_ns
         return series_of(times_ns.astype(float) * 1e-9, self.values[self.usable])
 
-    def _timing(self, ages: Array, astray: np.ndarray) -> Timing:
-        """Return when messages came, whose ages are given in seconds."""
-        in_order = self.stamps_ns[~astray]
-        stamps_ns = np.unique(in_order)
+    def _add_timing(self, stamps_ns: np.ndarray, ages: Array, astray: np.ndarray) -> None:
+        """Add when messages came: stamps in order, and ages in seconds."""
         intervals = np.diff(stamps_ns) * 1e-9
         usual = float(np.median(intervals)) if intervals.size else math.inf
-        gaps = np.flatnonzero(intervals > GAP_INTERVALS * usual)
-        longest = None
-        if gaps.size:
-            place = gaps[np.argmax(intervals[gaps])]
-            start_ns = int(stamps_ns[place]) - self._start_ns + self._age_ns
-            longest = Gap(start_ns * 1e-9, float(intervals[place]))
+        gaps = int(np.count_nonzero(intervals > GAP_INTERVALS * usual))
         first, last = ((self.recorded_ns[[0, -1]] - self._start_ns) * 1e-9).tolist()
-        return Timing(
-            ages.size + self._undecodable, self._undecodable, 1.0 / usual or None, first, last,
-            float(np.median(ages)), float(np.ptp(np.quantile(ages[~astray], (0.01, 0.99)))),
-            int(np.count_nonzero(astray)), int(np.count_nonzero(np.diff(in_order) <= 0)),
-            gaps.size, longest)
+        self.add('', rate_hz=1.0 / usual or None, first_s=first, last_s=last,
+                 stamp_age_s=self.age_s, gaps=gaps, stamp_age_spread_s=float(
+                     np.ptp(np.quantile(ages[~astray], (0.01, 0.99)))))
+        if gaps:
+            place = int(np.argmax(intervals))
+            start_ns = int(stamps_ns[place]) - self._start_ns + self._age_ns
+            self.add('', longest_gap_s=float(intervals[place]),
+                     longest_gap_start_s=start_ns * 1e-9)
 
 
 def read_candidates(bag: Bag) -> list[Recorded]:
@@ -227,7 +259,7 @@ def read_candidates(bag: Bag) -> list[Recorded]:
             decoded = ({'imu': decode_imu(messages, topic)} if KINDS[topic.msgtype] == ('imu',)
                        else decode_gnss(messages, topic, Config(velocity_frame='enu')))
             for data in recorded[topic]:
-                data.add(block.times_ns[block.topics == number], messages[0], decoded[data.kind])
+                data.take(block.times_ns[block.topics == number], messages[0], decoded[data.kind])
     candidates = [data for each in recorded.values() for data in each]
     for data in candidates:
         data.finish()

@@ -346,7 +346,7 @@ class AlignmentNode(Node):
         now = time.monotonic()
         first = self._next_status == 0.0  # nobody is known yet who publishes anything
         self._next_status = now + STATUS_PERIOD
-        status = self._aligner.status()
+        status = self._checks.judge(self._aligner.status())
         level = level_of(status.state)
         silent = 0.0 if self._imu_heard is None else now - self._imu_heard
         more = [] if first else self._input_faults(status, silent > IMU_SILENT)
@@ -378,7 +378,7 @@ class AlignmentNode(Node):
             (VELOCITY_TOPIC, self._config.use_velocity is True
              and not status.counts.get('velocity'))) if wanted]
         return [*topic_faults(self, self._inputs, expected, VELOCITY_TYPES),
-                *([] if status.state is State.ALIGNED else self._checks.faults())]
+                *([] if status.state is State.ALIGNED else self._checks.late_messages())]
 
     def _log_reason(self, reason: list[str], more: list[str], state: State, now: float) -> None:
         """Log what is new in the reason, and every 10 s what stays and is not as it should be."""
