@@ -612,10 +612,7 @@ def test_velocity_without_its_vertical(flight, result):
 
 @pytest.mark.parametrize('settings, known_from', [
     ({}, 8.0), ({}, math.inf), ({'use_velocity': False}, 8.0), ({'use_position': True}, math.inf),
-    pytest.param({'use_velocity': False}, math.inf, marks=pytest.mark.xfail(
-        strict=True, reason='sigmas are far too small without any altitude')),
-    pytest.param({'use_position': True}, 8.0, marks=pytest.mark.xfail(
-        strict=True, reason='an altitude that appears spoils what was known'))])
+    ({'use_velocity': False}, math.inf), ({'use_position': True}, 8.0)])
 def test_positions_without_their_altitude(flight, settings, known_from):
     aligner = Aligner(config_for(flight, **settings))
     for k in range(len(flight.gnss_stamps_ns)):
@@ -629,7 +626,12 @@ def test_positions_without_their_altitude(flight, settings, known_from):
     counts = aligner.status().counts
     assert counts.get('fix_nan', 0) == counts.get('fix_jump', 0) == 0
     assert counts.get('fix_no_altitude', 0) > 0
-    if settings.get('use_velocity') is not False:
+    if settings.get('use_velocity') is False:
+        assert 'no altitude' in epochs[0].reason
+        if known_from == math.inf:
+            assert epochs[-1].current is None and epochs[-1].reason == epochs[0].reason
+            return
+    else:
         assert epochs[-1].state is State.ALIGNED
     assert normalised_error(epochs[-1].current, flight) < chi2.ppf(0.9999, 3)
 
@@ -946,18 +948,16 @@ def test_gnss_that_is_sent_again_between_its_epochs_is_that_of_its_epochs():
 
 
 def test_covariances_of_any_size_break_nothing(flight):
-    sizes = (1e-12, 1e-4, 1.0, 1e12)            # after a start that nothing disturbs
+    sizes = (1e-12, 1e-4, 1.0, 1e12)
     aligner = Aligner(config_for(flight, use_position=True))
     for k, (kind, payload) in enumerate(flight.messages()):
         if kind == 'imu':
             aligner.add_imu(*payload)
             aligner.update()
         elif kind == 'fix':
-            aligner.add_fix(payload._replace(covariance=sizes[k % 4] * np.eye(3))
-                            if k > 500 else payload)
+            aligner.add_fix(payload._replace(covariance=sizes[k % 4] * np.eye(3)))
         else:
-            aligner.add_velocity(payload._replace(covariance=sizes[-k % 4] * np.eye(3))
-                                 if k > 500 else payload)
+            aligner.add_velocity(payload._replace(covariance=sizes[-k % 4] * np.eye(3)))
     aligner.flush()
     initial = aligner.status().initial
     assert np.all(np.isfinite(initial.quaternion_xyzw))
@@ -1189,9 +1189,7 @@ def test_whatever_is_declared_is_right(scenario, grade):
 
 
 @pytest.mark.parametrize('seed, delay', [
-    pytest.param(0, 0.1, marks=pytest.mark.xfail(
-        strict=True, reason='good positions are refused: it is never declared')),
-    (0, 0.0), (1, 0.1), (2, 0.0), (3, 0.1)])
+    (0, 0.1), (0, 0.0), (1, 0.1), (2, 0.0), (3, 0.1)])
 def test_sharp_positions_of_a_car_that_pulls_away_at_once(seed, delay):
     """While it gathers speed, any turn about the specific force fits, not about the vertical."""
     s = simulated('car', imu_grade='mems', seed=seed, duration=40.0, position_std=0.02,

@@ -93,6 +93,7 @@ class Bank:
         self._offered = 0
         self._rejected = [0, 0, 0]
         self._begin(epoch, imu, prior)
+        self._wait(epoch, imu)
 
     def _begin(self, epoch: AntennaEpoch, imu: Intervals, prior: Learnt | None = None) -> None:
         """Wait for a start, with nothing known but what was learnt before."""
@@ -123,7 +124,6 @@ class Bank:
         # n0 and the point of linearisation hold for so many epochs, of which so many are left.
         self._point: Array | None = None
         self._span = self._left = 1
-        self._wait(epoch, imu)
 
     def _remember(self, learnt: Learnt) -> None:
         """Start with what was learnt before, as old as it is."""
@@ -333,7 +333,7 @@ class Bank:
         """Return how well the data fit, and what the rivals say."""
         filters, receiver = self._filters, self._receiver
         if filters is None:
-            return Fit(self._offered, delay=self._config.gnss_delay)
+            return Fit(self._offered, delay=self._config.gnss_delay, doubt=self._start.lacks)
         velocity, position, either = self._rejected
         best = filters.best
         remarks = receiver.in_words() + self._not_used + level_in_words(

@@ -196,7 +196,8 @@ class Declaration:
     def update_without_attitude(self, silent_s: float, fit: Fit) -> Verdict:
         """Judge an epoch at which there is no attitude yet; parameters as above."""
         return Verdict(State.ALIGNING,
-                       self._too_few(fit) + (_silence(silent_s) if silent_s else ''))
+                       (fit.doubt or self._too_few(fit))
+                       + (_silence(silent_s) if silent_s else ''))
 
     def withdraw(self) -> None:
         """Withdraw all that is declared; what was good until now counts no more."""

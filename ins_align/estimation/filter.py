@@ -228,7 +228,10 @@ class Filters:
         missing = measured.s[k, kind] - (self.w if kind else self.u)
         innovation = (apply(C.swapaxes(1, 2), missing) + model.expected[k, kind][q]
                       - apply(H[q][..., FIRST:], self.x - model.point[q]))
-        test = self._test(H, stated, innovation, self._second_order(stated, innovation))
+        test = self._test(H, stated, innovation)
+        second_order = self._second_order(test, stated, innovation)
+        if second_order is not None:
+            test = self._test(H, stated, innovation, second_order)
         good = test.nis < GATE
         # By the means before the measurement, which an outlier must not choose.
         taken = self._by_most(good)
@@ -278,18 +281,18 @@ class Filters:
         self._reduce(test.HP[lead], test.inverse[lead], taken)
         self._move(test, good & taken[q], lead)
 
-    def _second_order(self, noise: Array, innovation: Array) -> Array | None:
+    def _second_order(self, test: _Test, noise: Array, innovation: Array) -> Array | None:
         """
         Return what derivatives to phi lack, shape (B, 3, 3); None where the noise hides it.
 
-        An innovation z is J of what is linear in the errors, which therefore is
-        ``J^-1 z ~ z - phi x z / 2``.
+        An innovation is ``J m`` and noise, with m linear in the errors; ``J m ~ m + phi x m / 2``.
         """
+        m = innovation - apply(noise, test.weighted)
         variance = np.trace(self.P[:, PHI, PHI], axis1=1, axis2=2)[self.place]
-        square = np.einsum('bi,bi->b', innovation, innovation)
-        if np.all(variance * square <= BENT ** 2 * np.trace(noise, axis1=1, axis2=2)):
+        if np.all(variance * np.einsum('bi,bi->b', m, m)
+                  <= BENT ** 2 * np.trace(noise, axis1=1, axis2=2)):
             return None
-        return -0.5 * skew(innovation)
+        return -0.5 * skew(m)
 
     def _test(self, H: Array, noise: Array, innovation: Array,
               second_order: Array | None = None) -> _Test:

@@ -28,6 +28,7 @@ from ins_align.estimation.receiver import LEAST_NOISE, LOUD
 from ins_align.estimation.states import FIRST, PHI, PHI0, RHO, XI
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.rotation import apply, Array, cross, cumulative_rotations, exp_so3, Index
+from ins_align.gnss.antenna import UNKNOWN_ALTITUDE_STD
 from ins_align.gnss.messages import AntennaEpoch, velocities_of
 from ins_align.imu.preintegration import Intervals
 import numpy as np
@@ -36,6 +37,8 @@ import numpy as np
 FIRST_EPOCHS, MAX_WAITING = 4, 64
 # The vector from which a bank starts is so many times its noise.
 START_RATIO = 20.0
+# Epochs whose sigma is so many times that of the best say nothing to a start.
+UNCERTAIN = 10.0
 # One epoch is an outlier if the residuals of the others are so many times smaller without it.
 OUTLYING = 10.0
 # Headings, every two degrees, and their sigma over the step between them: the sum of such normal
@@ -122,10 +125,11 @@ class Start:
         kind = 0 if sum(epoch.v_n is not None for epoch in epochs) >= FIRST_EPOCHS else 1
         use = np.array([epoch.position_measured if kind else epoch.v_n is not None
                         for epoch in epochs])
+        variance = self._variance(kind)
+        use &= variance <= UNCERTAIN ** 2 * np.min(variance[use], initial=np.inf)
         if np.count_nonzero(use) < FIRST_EPOCHS + kind or (kind and not use_position):
             return None
         time, s, a = self._pairs(kind)
-        variance = self._variance(kind)
         places = np.flatnonzero(use)
         while True:
             C, residual, moments = _solved(s, a, time, places, kind)
@@ -155,6 +159,15 @@ class Start:
             return self.solve(use_position)
         return RoughAttitude(C, vectors[:, -1], kind, noise if noise > LOUD or not stated else 1.0)
 
+    @property
+    def lacks(self) -> str:
+        """Return in words what these epochs do not have and a start needs, or ''."""
+        if not self.epochs or any(
+                epoch.v_n is not None or epoch.position_covariance[2, 2] < UNKNOWN_ALTITUDE_STD ** 2
+                for epoch in self.epochs):
+            return ''
+        return 'positions have no altitude, and there is no velocity: one of the two is needed'
+
     def _pairs(self, kind: int) -> tuple[Array, Array, Array]:
         """Return the times and the vectors of the formula, free start, for all epochs."""
         epochs, imu, first = self.epochs, self.imu, self.epochs[0]
@@ -170,11 +183,17 @@ class Start:
         return track.time, track.s_v(velocities_of(epochs)), v + apply(C[1:], swing)
 
     def _variance(self, kind: int) -> Array:
-        """Return what the receiver states; a vertical that is not measured is taken as steady."""
-        covariance = [epoch.position_covariance if kind else epoch.velocity_covariance
-                      for epoch in self.epochs]
-        return np.array([min(float(np.trace(matrix)) / 3, float(np.trace(matrix[:2, :2])))
-                         for matrix in covariance])
+        """
+        Return what the receiver states.
+
+        A vertical velocity that is not measured is taken as steady. Without an altitude nothing is
+        known of the vertical, and positions alone say nothing.
+        """
+        if kind:
+            return np.array([np.trace(epoch.position_covariance) / 3 for epoch in self.epochs])
+        covariance = np.array([epoch.velocity_covariance for epoch in self.epochs])
+        horizontal = np.trace(covariance[:, :2, :2], axis1=1, axis2=2)
+        return np.minimum(np.trace(covariance, axis1=1, axis2=2) / 3, horizontal)
 
     def covariance(self, rough: RoughAttitude, known: Array) -> Array:
         """

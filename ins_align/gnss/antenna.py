@@ -32,7 +32,7 @@ MAX_FIX_JUMP = 300.0
 FIX_JUMPS_BELIEVED = 5
 # A place this old (s) is not carried on with the velocity.
 MAX_CARRIED = 60.0
-_UNKNOWN_VERTICAL_STD, _UNKNOWN_ALTITUDE_STD = 1e3, 1e4
+_UNKNOWN_VERTICAL_STD, UNKNOWN_ALTITUDE_STD = 1e3, 1e4
 # A variance this many times smaller than what the receiver usually states, the median of so many
 # epochs, is not believed: a receiver that is ten times better than it was will say so again. One
 # that was worse than the configuration expects need not. In the first epoch any is believed that a
@@ -106,7 +106,7 @@ class Antenna:
             self._position_noise, fix.covariance if fix is not None and believed else None,
             'fix_covariance')
         if fix is not None and not fix.vertical:
-            position_covariance = _without_vertical(position_covariance, _UNKNOWN_ALTITUDE_STD)
+            position_covariance = _without_vertical(position_covariance, UNKNOWN_ALTITUDE_STD)
         if v_n is not None or believed:
             self._seen_ns = message.stamp_ns
         if v_n is not None:
