@@ -223,7 +223,7 @@ def _add_replay(commands: Any) -> None:
     group.add_argument('--csv', metavar='FILE', help='write a row for every GNSS epoch')
     group.add_argument('--plot', metavar='FILE',
                        help='draw attitude, sigma, innovations, biases, error and track '
-                            '(.png, .pdf, .svg; .html: a page to zoom, with the states)')
+                            '(.png, .pdf, .svg)')
     group.add_argument('--bag', metavar='OUT', dest='results',
                        help='write a recording (mcap) with the topics of the node, to play and to '
                             'plot beside the original; a directory to make')

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 import io
-from itertools import pairwise
+from itertools import groupby, pairwise
 import math
 from typing import Any, NamedTuple, TYPE_CHECKING
 
@@ -393,6 +393,13 @@ class Result:
                 cells += [repr(number) if math.isfinite(number) else '' for number in numbers]
             out.write(','.join(cells) + '\n')
         return out.getvalue()
+
+
+def spans_of(epochs: Iterable[Epoch], state: State) -> list[tuple[float, float]]:
+    """Return the first and the last epoch of each time in a state, s since the first t0."""
+    groups = [[epoch.t_s for epoch in group] for inside, group in groupby(
+        epochs, lambda epoch: epoch.state is state) if inside]
+    return [(times[0], times[-1]) for times in groups]
 
 
 def in_order_of_time(epochs: Iterable[Epoch]) -> tuple[Epoch, ...]:
