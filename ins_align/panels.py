@@ -22,7 +22,7 @@ from typing import Any, TYPE_CHECKING
 
 from ins_align.geometry.rotation import Array
 from ins_align.recordings import one_line
-from ins_align.report import new_figure, state_in_words
+from ins_align.report import new_figure
 from ins_align.results import Epoch, Result, spans_of, State
 import numpy as np
 
@@ -53,7 +53,7 @@ def plot(result: Result) -> Figure:
     """
     series = _Series(result)
     figure = new_figure(16.0, 11.0)
-    figure.suptitle(f'{one_line(Path(result.bag).name or result.bag)}: {state_in_words(result)}',
+    figure.suptitle(f'{one_line(Path(result.bag).name or result.bag)}: {result.state_in_words}',
                     fontsize=13, parse_math=False)
     left, right = map(figure.add_subfigure, figure.add_gridspec(1, 2, width_ratios=(3, 2)))
     tilt, yaw, sigmas, innovations = left.subplots(4, 1, sharex=True)

@@ -22,7 +22,7 @@ import shutil
 import textwrap
 from typing import Any, TYPE_CHECKING
 
-from ins_align.results import Result, State
+from ins_align.results import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,30 +60,10 @@ def _cell(value: Any) -> str:
     return str(value)
 
 
-def state_in_words(result: Result) -> str:
-    """Return the state at the end, and when ALIGNED was declared and withdrawn: s since t0."""
-    # The times of the first declaration, of its end, of the next declaration ...
-    times = [next(changes).t_s for _, changes in itertools.groupby(
-        itertools.dropwhile(lambda change: change.state is not State.ALIGNED, result.changes),
-        lambda change: change.state is State.ALIGNED)]
-    state, withdrawals = result.status.state, len(times) // 2
-    if not times:
-        return state.value
-    words = '' if state is State.ALIGNED else 'aligned '
-    words += f'after {times[0]:.1f} s'
-    if withdrawals:
-        words += '; withdrawn ' if state is State.ALIGNED else ', withdrawn '
-        words += f'{withdrawals} times, first ' if withdrawals > 1 else ''
-        words += f'at {times[1]:.1f} s'
-        if len(times) > 2 * withdrawals:
-            words += f', again after {times[-1]:.1f} s'
-    return f'{state.value} {words}' if state is State.ALIGNED else f'{state.value} ({words})'
-
-
 def summary(result: Result) -> str:
     """Return the table that ``ins_align replay`` prints of a recording."""
     status = result.status
-    lines = [result.bag, *_wrapped(f'{state_in_words(result)}: {status.reason}', '  '),
+    lines = [result.bag, *_wrapped(f'{result.state_in_words}: {status.reason}', '  '),
              *_list_of_changes(result)]
     declared = None if status.initial is None else result.declared
     rows = []

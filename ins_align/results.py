@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 import io
-from itertools import groupby, pairwise
+from itertools import dropwhile, groupby, pairwise
 import math
 from typing import Any, NamedTuple, TYPE_CHECKING
 
@@ -269,7 +269,7 @@ class Reference:
                 np.degrees(np.remainder(difference + np.pi, 2.0 * np.pi) - np.pi))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Result:
     """
     What came of an alignment of recorded data.
@@ -337,6 +337,33 @@ class Result:
                 changes.append(Change(epoch.stamp_ns, epoch.t_s, epoch.state, reason))
             before = epoch.state
         return changes
+
+    @property
+    def state_in_words(self) -> str:
+        """Return the state at the end, and when ALIGNED was declared and withdrawn: s since t0."""
+        # The times of the first declaration, of its end, of the next declaration ...
+        times = [next(changes).t_s for _, changes in groupby(
+            dropwhile(lambda change: change.state is not State.ALIGNED, self.changes),
+            lambda change: change.state is State.ALIGNED)]
+        if not times:
+            return self.status.state.value
+        words, withdrawals = f'after {times[0]:.1f} s', len(times) // 2
+        if withdrawals:
+            words += '; withdrawn ' if self.aligned else ', withdrawn '
+            words += f'{withdrawals} times, first ' if withdrawals > 1 else ''
+            words += f'at {times[1]:.1f} s'
+        if withdrawals and len(times) > 2 * withdrawals:
+            words += f', again after {times[-1]:.1f} s'
+        return f'ALIGNED {words}' if self.aligned else (
+            f'{self.status.state.value} (aligned {words})')
+
+    def __repr__(self) -> str:
+        now = self.current
+        attitude = 'no attitude' if now is None else (
+            f'roll {now.roll_deg:.2f}, pitch {now.pitch_deg:.2f}, '
+            f'heading {now.heading_deg:.2f} +- {now.sigma_deg[2]:.2f} deg '
+            f'(tilt +- {now.sigma_deg[:2].max():.2f} deg) at stamp {now.stamp_ns}')
+        return f'Result({self.state_in_words}, {attitude}, {len(self.epochs)} epochs)'
 
     @property
     def first_t0_ns(self) -> int | None:

@@ -25,7 +25,7 @@ from ins_align.outputs import process, Task, write_whole
 from ins_align.panels import plot, STATE_COLOURS
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import deserialize
-from ins_align.report import format_table, state_in_words, summary
+from ins_align.report import format_table, summary
 from ins_align.results import spans_of, State
 from ins_align.simulation.simulate import simulate, write_bag
 from matplotlib.colors import to_rgb
@@ -156,7 +156,7 @@ def test_headline_gives_the_first_declaration(result, states, words):
     told = with_states(result, *((names[state], '', '') for state in states))
     told = dataclasses.replace(told, status=dataclasses.replace(
         result.status, state=State(names[states[-1]])))
-    assert state_in_words(told) == words
+    assert told.state_in_words == words
     assert f'  {words}: ' in summary(told)
 
 

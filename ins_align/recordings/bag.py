@@ -47,6 +47,7 @@ DATABASE_PATH = re.compile(r'[\w/. ~+=@,-]*\.db3', re.ASCII)
 # What may mend a file that rosbags cannot open.
 COMMANDS = {'.bag': 'rosbag reindex {0}', '.mcap': 'mcap recover {0} -o mended.mcap',
             '.db3': 'sqlite3 {0} .recover | sqlite3 mended.db3'}
+LISTED = 20  # names of recordings in an error
 BLOCK = 4096  # messages yielded at a time
 PIECE_BYTES = 1 << 20  # of a file, unpacked at a time
 INDEX_ENTRY_BYTES = 12  # of a message in the index of a ROS 1 file
@@ -64,7 +65,7 @@ class Block(NamedTuple):
 
 class Bag:
     """
-    A recording: a rosbag2 directory, one of its files, a ROS 1 bag or a directory of these.
+    A recording: a rosbag2 directory, one of its files, a ROS 1 bag or a directory of its parts.
 
     Attributes
     ----------
@@ -197,11 +198,19 @@ class Bag:
             listed = [PurePath(os.fsdecode(name)).name
                       for name in LISTED_NAME.findall(file.read(MAX_METADATA_BYTES))]
         files = sorted(file for file in path.iterdir() if STORAGE_NAME.search(file.name))
-        if not files:
-            raise BagError(f'{path} holds no recording (.mcap, .db3 or .bag)')
         if missing := sorted(set(listed).difference(file.name for file in files)):
             self.warn(f'{", ".join(missing)} is missing from {path}')
-        return [file for file in files if file.name in listed] or files
+        files = [file for file in files if file.name in listed] or files
+        names = list({file.parent.name for file in path.glob('*/*')
+                        if STORAGE_NAME.search(file.name) and not listed})
+        if names or len({Path(file.name.removesuffix('.zstd')).suffix for file in files}) > 1:
+            names = sorted([*names, *(file.name for file in files)])
+            more = f' and {len(names) - LISTED} more' if len(names) > LISTED else ''
+            raise BagError(f'{path} is a folder of recordings ({", ".join(names[:LISTED])}{more}): '
+                           'name one of them, or several')
+        if not files:
+            raise BagError(f'{path} holds no recording (.mcap, .db3 or .bag)')
+        return files
 
     def _open_file(self, path: Path, stack: ExitStack) -> Any:
         """Open one storage file, its format told by its first bytes."""
