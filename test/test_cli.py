@@ -237,7 +237,7 @@ def test_one_spelling_of_the_lever_arm(standing, capsys):
 
 @pytest.mark.parametrize('arguments, message', [
     (['--csv', '-'], '--csv needs the name of a file'),
-    (['--set', 'lever_arm=[1,2]'], 'lever_arm must be three numbers'),
+    (['--set', 'lever_arm=[1,2]'], 'lever_arm must be 3 finite numbers in m from -1000'),
     (['--set', 'lever_arm=[1,2,.nan]'], 'finite'),
     (['--set', 'lever_arm=[1,2,.inf]'], 'finite'),
     (['--set', 'lever_am=[1,2,3]'], 'did you mean lever_arm'),

@@ -205,13 +205,14 @@ class Bag:
         if missing := sorted(set(listed).difference(file.name for file in files)):
             self.warn(f'{", ".join(missing)} is missing from {path}')
         files = [file for file in files if file.name in listed] or files
-        names = list({file.parent.name for file in path.glob('*/*')
-                        if STORAGE_NAME.search(file.name) and not listed})
-        if names or len({Path(file.name.removesuffix('.zstd')).suffix for file in files}) > 1:
-            names = sorted([*names, *(file.name for file in files)])
+        folders = {} if listed else {file.parent.name for file in path.glob('*/*')
+                                     if STORAGE_NAME.search(file.name)}
+        suffixes = {Path(file.name.removesuffix('.zstd')).suffix for file in files}
+        if folders or len(suffixes) > 1:
+            names = sorted([*folders, *(file.name for file in files)])
             more = f' and {len(names) - LISTED} more' if len(names) > LISTED else ''
-            raise BagError(f'{path} is a folder of recordings ({", ".join(names[:LISTED])}{more}): '
-                           'name one of them, or several')
+            raise BagError(f'{path} is a folder of recordings ({", ".join(names[:LISTED])}'
+                           f'{more}): name one of them, or several')
         if not files:
             raise BagError(f'{path} holds no recording (.mcap, .db3 or .bag)')
         return files
