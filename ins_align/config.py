@@ -31,8 +31,8 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
 MAX_PARAMS_BYTES = 1 << 20
 
 AUTO_OR_BOOL = ('auto', True, False)
-# Declared by rclpy itself on every node: legal in a parameter file, none of our business.
-_RCLPY_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
+# Declared by rclpy itself on every node, legal in a parameter file.
+RCLPY_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 
 
 class ConfigError(ValueError):
@@ -274,10 +274,19 @@ def config_from_mapping(values: Mapping[str, Any]) -> Config:
     return Config(**values)
 
 
-def no_effect(name: str) -> str:
-    """Say of a parameter of another node, or a slip of the pen, that it has no effect."""
-    hint = _did_you_mean(name)
-    return 'is not known and has no effect' + (hint and f': {hint}')
+def without_unknown(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """
+    Return the values whose names are known, and a warning of each of the others.
+
+    A file with parameters for many nodes is not wrong; a slip of the pen must not pass unseen.
+    """
+    known = {field.name for field in dataclasses.fields(Config)}
+    warnings = []
+    for name in sorted(map(str, values.keys() - known)):
+        hint = _did_you_mean(name)
+        warnings.append(f'parameter {name!r} is not known and has no effect'
+                        + (hint and f': {hint}'))
+    return {name: value for name, value in values.items() if name in known}, warnings
 
 
 def _did_you_mean(name: str) -> str:
@@ -317,7 +326,7 @@ def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
                               'to values')
         found = True
         values.update((name, value) for name, value in content.items()
-                      if str(name).split('.')[0] not in _RCLPY_PARAMETERS)
+                      if str(name).split('.')[0] not in RCLPY_PARAMETERS)
     if not found:
         raise ConfigError(f'{path} holds no parameters for this node: expected '
                           f'"{NODE_NAME}:" or "/**:" with "ros__parameters:" below')

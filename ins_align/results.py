@@ -23,6 +23,7 @@ from functools import cached_property
 import io
 from itertools import dropwhile, groupby, pairwise
 import math
+from operator import attrgetter
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from ins_align.config import Config
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 OK, WARN, ERROR = range(3)  # levels of diagnostic_msgs/DiagnosticStatus
 MAX_REFERENCE_GAP_NS = 1_500_000_000  # the reference is not interpolated over more
 
+# Estimates beside the attitude, with the unit as it stands in names.
+ESTIMATES = {'gyro_bias': 'rad_s', 'accel_bias': 'm_s2', 'lever_arm': 'm', 'gnss_delay': 's'}
 _ATTITUDE_COLUMNS = 'qx,qy,qz,qw,sigma_e_deg,sigma_n_deg,sigma_u_deg'
 CSV_HEADER = 'stamp_ns,t_s,state,' + ','.join(
     prefix + name for prefix in ('', 'current_') for name in _ATTITUDE_COLUMNS.split(','))
@@ -320,12 +323,9 @@ class Result:
     @property
     def declared(self) -> Attitude | None:
         """Return the initial attitude as the node publishes it at the last declaration."""
-        declared, before = None, None
-        for epoch in self.epochs:
-            if epoch.state is State.ALIGNED and before is not State.ALIGNED:
-                declared = epoch.initial
-            before = epoch.state
-        return declared
+        starts = [next(run) for state, run in groupby(self.epochs, attrgetter('state'))
+                  if state is State.ALIGNED]
+        return starts[-1].initial if starts else None
 
     @property
     def changes(self) -> list[Change]:
@@ -393,10 +393,8 @@ class Result:
             'initial_attitude': attitude_json(status.initial),
             'declared_attitude': attitude_json(self.declared, stamped=True),
             'final_attitude': attitude_json(status.current, stamped=True),
-            'gyro_bias_rad_s': _finite(status.gyro_bias),
-            'accel_bias_m_s2': _finite(status.accel_bias),
-            'lever_arm_m': _finite(status.lever_arm),
-            'gnss_delay_s': _finite([status.gnss_delay])[0],
+            **{f'{name}_{unit}': _finite(getattr(status, name))
+               for name, unit in ESTIMATES.items()},
             'counts': dict(status.counts),
         }
         if self.topics is not None and self.config.base_frame:
@@ -424,9 +422,9 @@ class Result:
 
 def spans_of(epochs: Iterable[Epoch], state: State) -> list[tuple[float, float]]:
     """Return the first and the last epoch of each time in a state, s since the first t0."""
-    groups = [[epoch.t_s for epoch in group] for inside, group in groupby(
-        epochs, lambda epoch: epoch.state is state) if inside]
-    return [(times[0], times[-1]) for times in groups]
+    runs = [list(run) for present, run in groupby(epochs, attrgetter('state'))
+            if present is state]
+    return [(run[0].t_s, run[-1].t_s) for run in runs]
 
 
 def in_order_of_time(epochs: Iterable[Epoch]) -> tuple[Epoch, ...]:
@@ -457,9 +455,11 @@ def attitude_json(attitude: Attitude | None, stamped: bool = False) -> dict[str,
             'pitch_deg': pitch, 'yaw_deg': yaw, 'sigma_deg': _finite(attitude.sigma_deg)}
 
 
-def _finite(values: Iterable[float]) -> list[float | None]:
-    """Return plain numbers as JSON has them: none that are not finite."""
-    return [float(value) if math.isfinite(value) else None for value in values]
+def _finite(value: Any) -> Any:
+    """Return a number or an array as JSON has it: None for what is not finite."""
+    if np.ndim(value):
+        return [_finite(each) for each in value]
+    return float(value) if math.isfinite(value) else None
 
 
 def level_of(state: State) -> int:
@@ -488,8 +488,7 @@ def status_values(status: Status, base_frame: str = '', base: Transform | None =
         yield f'{name}_roll_pitch_yaw_deg', angles(attitude)
         yield f'{name}_sigma_east_north_up_deg', text(attitude and attitude.sigma_deg)
     yield 'current_heading_deg', text(status.current and status.current.heading_deg)
-    for name, unit in (('gyro_bias', 'rad_s'), ('accel_bias', 'm_s2'), ('lever_arm', 'm'),
-                       ('gnss_delay', 's')):
+    for name, unit in ESTIMATES.items():
         yield f'{name}_{unit}', text(getattr(status, name))
         yield f'{name}_std_{unit}', text(getattr(status, f'{name}_std'))
     for name, count in status.counts.items():
