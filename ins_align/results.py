@@ -15,12 +15,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 import dataclasses
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-import io
 from itertools import dropwhile, groupby, pairwise
 import math
 from operator import attrgetter
@@ -406,18 +405,22 @@ class Result:
 
     def to_csv(self) -> str:
         """Return the table that ``--csv`` writes, a row per GNSS epoch."""
-        out = io.StringIO()
-        out.write(CSV_HEADER + '\n')
-        for epoch in self.epochs:
-            if epoch.dry:
-                continue
-            cells = [str(epoch.stamp_ns), f'{epoch.t_s:.9f}', epoch.state.value]
-            for attitude in (epoch.initial, epoch.current):
-                numbers = [math.nan] * 7 if attitude is None else [
-                    *attitude.quaternion_xyzw.tolist(), *attitude.sigma_deg.tolist()]
-                cells += [repr(number) if math.isfinite(number) else '' for number in numbers]
-            out.write(','.join(cells) + '\n')
-        return out.getvalue()
+        epochs = [epoch for epoch in self.epochs if not epoch.dry]
+        rows = zip([f'{epoch.stamp_ns},{epoch.t_s:.9f},{epoch.state.value}' for epoch in epochs],
+                   _attitude_cells([epoch.initial for epoch in epochs]),
+                   _attitude_cells([epoch.current for epoch in epochs]))
+        return '\n'.join([CSV_HEADER, *map(','.join, rows), ''])
+
+
+def _attitude_cells(attitudes: Sequence[Attitude | None]) -> Iterator[str]:
+    """Yield the columns of each attitude, all converted at a time; empty where there is none."""
+    known = [attitude for attitude in attitudes if attitude is not None]
+    quaternions = quaternion_from_matrix(np.array([each.C_nb for each in known]).reshape(-1, 3, 3))
+    variances = np.array([np.diagonal(each.covariance) for each in known]).reshape(-1, 3)
+    numbers = iter(np.hstack([quaternions, np.degrees(np.sqrt(variances))]).tolist())
+    for attitude in attitudes:
+        yield ','.join(repr(number) if math.isfinite(number) else '' for number in (
+            [math.nan] * 7 if attitude is None else next(numbers)))
 
 
 def spans_of(epochs: Iterable[Epoch], state: State) -> list[tuple[float, float]]:

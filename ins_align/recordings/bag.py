@@ -30,8 +30,8 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from ins_align.recordings import (
-    BagError, MAX_CHUNK_BYTES, MAX_HELD_BYTES, MAX_MESSAGE_BYTES, MAX_METADATA_BYTES, MAX_TOPICS,
-    max_unpacked_bytes, one_line, Topic, unpack, ZSTD_MAGIC, ZSTD_MODULE)
+    BagError, listed, MAX_CHUNK_BYTES, MAX_HELD_BYTES, MAX_MESSAGE_BYTES, MAX_METADATA_BYTES,
+    MAX_TOPICS, max_unpacked_bytes, one_line, Topic, unpack, ZSTD_MAGIC, ZSTD_MODULE)
 from ins_align.recordings.salvage import MAGIC as MCAP_MAGIC
 from ins_align.recordings.salvage import SalvagedMcap
 import numpy as np
@@ -47,7 +47,6 @@ DATABASE_PATH = re.compile(r'[\w/. ~+=@,-]*\.db3', re.ASCII)
 # What may mend a file that rosbags cannot open.
 COMMANDS = {'.bag': 'rosbag reindex {0}', '.mcap': 'mcap recover {0} -o mended.mcap',
             '.db3': 'sqlite3 {0} .recover | sqlite3 mended.db3'}
-LISTED = 20  # names of recordings in an error
 BLOCK = 4096  # messages yielded at a time
 PIECE_BYTES = 1 << 20  # of a file, unpacked at a time
 INDEX_ENTRY_BYTES = 12  # of a message in the index of a ROS 1 file
@@ -196,23 +195,22 @@ class Bag:
         if not path.is_dir():
             raise BagError(f'{path} is a pipe or a device, from which no recording can be read: '
                            'give a file')
-        listed = []
+        own = []  # files that the recording says it has
         with suppress(OSError), open(path / 'metadata.yaml', 'rb') as file:
             # The last part only: a recording names its own files, not others on this machine.
-            listed = [PurePath(os.fsdecode(name)).name
-                      for name in LISTED_NAME.findall(file.read(MAX_METADATA_BYTES))]
+            own = [PurePath(os.fsdecode(name)).name
+                   for name in LISTED_NAME.findall(file.read(MAX_METADATA_BYTES))]
         files = sorted(file for file in path.iterdir() if STORAGE_NAME.search(file.name))
-        if missing := sorted(set(listed).difference(file.name for file in files)):
+        if missing := sorted(set(own).difference(file.name for file in files)):
             self.warn(f'{", ".join(missing)} is missing from {path}')
-        files = [file for file in files if file.name in listed] or files
-        folders = {} if listed else {file.parent.name for file in path.glob('*/*')
-                                     if STORAGE_NAME.search(file.name)}
+        files = [file for file in files if file.name in own] or files
+        folders = {file.parent.name for file in path.glob('*/*')
+                   if STORAGE_NAME.search(file.name) and not own}
         suffixes = {Path(file.name.removesuffix('.zstd')).suffix for file in files}
         if folders or len(suffixes) > 1:
-            names = sorted([*folders, *(file.name for file in files)])
-            more = f' and {len(names) - LISTED} more' if len(names) > LISTED else ''
-            raise BagError(f'{path} is a folder of recordings ({", ".join(names[:LISTED])}'
-                           f'{more}): name one of them, or several')
+            names = listed([*folders, *(file.name for file in files)])
+            raise BagError(f'{path} is a folder of recordings ({names}): name one of them, or '
+                           'several')
         if not files:
             raise BagError(f'{path} holds no recording (.mcap, .db3 or .bag)')
         return files
