@@ -136,14 +136,9 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any])
 def labels(bags: Sequence[str]) -> list[str]:
     """Name the recordings, all differently, for the names of output files."""
     names = [Path(bag).resolve().name.split('.')[0] or 'bag' for bag in bags]
-    found: list[str] = []
-    for index, name in enumerate(names):
-        label = name
-        # A number may make it the name of another recording.
-        while names.count(label) > (label == name) or label in found:
-            label += f'_{index + 1}'
-        found.append(label)
-    return found
+    if len(set(names)) == len(names):
+        return names
+    return [f'{name}_{number}' for number, name in enumerate(names, 1)]
 
 
 def with_label(path: str, label: str) -> str:

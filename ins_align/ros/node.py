@@ -454,10 +454,8 @@ class AlignmentNode(Node):
         return config
 
     def _changed_config(self, changes: Iterable[Parameter]) -> Config:
-        own = {parameter.name for parameter in parameters()}
-        return dataclasses.replace(
-            self._config, **{change.name: change.value for change in changes
-                             if change.name in own})
+        own, _ = without_unknown({change.name: change.value for change in changes})
+        return dataclasses.replace(self._config, **own)
 
     def _check_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:
