@@ -15,15 +15,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 import math
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from ins_align.geometry.rotation import Array
 from ins_align.recordings import one_line
 from ins_align.report import new_figure
-from ins_align.results import Epoch, Result, spans_of, State
+from ins_align.results import Epoch, Result, State
 import numpy as np
 
 if TYPE_CHECKING:
@@ -82,6 +84,13 @@ def plot(result: Result) -> Figure:
         axes.grid(alpha=0.3)
         _add_legend(axes, columns=7 if axes.figure is left else 5)
     return figure
+
+
+def spans_of(epochs: Iterable[Epoch], state: State) -> list[tuple[float, float]]:
+    """Return the first and the last epoch of each time in a state, s since the first t0."""
+    runs = [list(run) for present, run in groupby(epochs, attrgetter('state'))
+            if present is state]
+    return [(run[0].t_s, run[-1].t_s) for run in runs]
 
 
 class _Series:

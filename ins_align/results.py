@@ -423,13 +423,6 @@ def _attitude_cells(attitudes: Sequence[Attitude | None]) -> Iterator[str]:
             [math.nan] * 7 if attitude is None else next(numbers)))
 
 
-def spans_of(epochs: Iterable[Epoch], state: State) -> list[tuple[float, float]]:
-    """Return the first and the last epoch of each time in a state, s since the first t0."""
-    runs = [list(run) for present, run in groupby(epochs, attrgetter('state'))
-            if present is state]
-    return [(run[0].t_s, run[-1].t_s) for run in runs]
-
-
 def in_order_of_time(epochs: Iterable[Epoch]) -> tuple[Epoch, ...]:
     """Let `Epoch.t_s` go on where it counts anew, since a clock was set back."""
     given = list(epochs)
