@@ -311,6 +311,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
                 'imu_topic', 'fix_topic', 'velocity_topic', 'start', 'duration')}},
         **{option: os.path.abspath(path) for option, path in of_bag.items()})
         for bag, of_bag in zip(arguments.bags, files)]
+    tqdm.monitor_interval = 0  # no thread of it while processes are forked
     with tqdm(total=len(tasks), leave=False,
               disable=None if sys.stderr else True,  # None: where that is no terminal
               bar_format='{percentage:3.0f}% |{bar}| {elapsed}, {remaining} left') as bar:
