@@ -24,7 +24,7 @@ simulation = ['python-ins>=1.0', 'rosbags>=0.11', 'scipy>=1.11']
 extras = {
     'replay': replay,
     'dask': ['distributed>=2024.1'],
-    'plot': ['matplotlib>=3.8', 'plotly>=5.15'],
+    'plot': ['matplotlib>=3.8'],
     'simulation': simulation,
     'experiments': [*replay, *simulation, 'matplotlib>=3.8', 'pillow'],
     'test': [

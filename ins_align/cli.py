@@ -223,7 +223,7 @@ def _add_replay(commands: Any) -> None:
     group.add_argument('--csv', metavar='FILE', help='write a row for every GNSS epoch')
     group.add_argument('--plot', metavar='FILE',
                        help='draw attitude, sigma, innovations, biases, error and track '
-                            '(.png, .pdf, .svg; .html: a page to zoom, with the states)')
+                            '(.png, .pdf, .svg)')
     group.add_argument('--bag', metavar='OUT', dest='results',
                        help='write a recording (mcap) with the topics of the node, to play and to '
                             'plot beside the original; a directory to make')
@@ -294,6 +294,8 @@ def run_info(arguments: argparse.Namespace) -> int:
 
 def run_replay(arguments: argparse.Namespace) -> int:
     """Run ``ins_align replay``."""
+    from tqdm import tqdm
+
     keep_to_one()
     gc.set_threshold(100_000)  # rows and results by the thousand, none of which is garbage
     names = labels(arguments.bags) if len(arguments.bags) > 1 else ['']
@@ -309,11 +311,11 @@ def run_replay(arguments: argparse.Namespace) -> int:
                 'imu_topic', 'fix_topic', 'velocity_topic', 'start', 'duration')}},
         **{option: os.path.abspath(path) for option, path in of_bag.items()})
         for bag, of_bag in zip(arguments.bags, files)]
-    bar = _progress_bar(len(tasks))
-    status = _tell(arguments, _outcomes(tasks, arguments, bar), bar.write if bar else print)
-    if bar:
-        bar.close()
-    return status
+    tqdm.monitor_interval = 0  # no thread of it while processes are forked
+    with tqdm(total=len(tasks), leave=False,
+              disable=None if sys.stderr else True,  # None: where that is no terminal
+              bar_format='{percentage:3.0f}% |{bar}| {elapsed}, {remaining} left') as bar:
+        return _tell(arguments, _outcomes(tasks, arguments, bar), bar.write)
 
 
 def _check_outputs(arguments: argparse.Namespace, files: Sequence[dict[str, str]]) -> None:
@@ -363,23 +365,12 @@ def _tell(arguments: argparse.Namespace, outcomes: Iterable[Outcome],
     return max(statuses)
 
 
-def _progress_bar(total: int) -> Any:
-    """Return a bar over so many recordings; None without a terminal or without tqdm."""
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        return None
-    return tqdm(total=total, leave=False, bar_format='{percentage:3.0f}% |{bar}| {elapsed}, '
-                '{remaining} left') if sys.stderr and sys.stderr.isatty() else None
-
-
 def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace, bar: Any,
               ) -> Iterator[Outcome]:
     """Process recordings where the arguments say."""
 
     def advance(position: float) -> None:
-        if bar is not None:
-            bar.update(position - bar.n)
+        bar.update(position - bar.n)
 
     found = (run_all(process, tasks, arguments.jobs or processors(), advance)
              if arguments.dask is None else
@@ -390,16 +381,14 @@ def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace, bar: Any,
 
 def _config(arguments: argparse.Namespace) -> Config:
     from ins_align.config import (
-        config_from_mapping, ConfigError, load_params, no_effect, parameters, parse_override)
+        config_from_mapping, ConfigError, load_params, parse_override, without_unknown)
 
-    known = {parameter.name for parameter in parameters()}
     try:
-        values = load_params(arguments.params) if arguments.params else {}
-        for name in values.keys() - known:
-            # As the node has it: a file for many nodes is not wrong, a slip must not pass unseen.
-            print(f'ins_align {arguments.command}: warning: parameter {name!r} of '
-                  f'{arguments.params} {no_effect(name)}', file=sys.stderr)
-            del values[name]
+        values, warnings = without_unknown(load_params(arguments.params)
+                                           if arguments.params else {})
+        for warning in warnings:
+            print(f'ins_align {arguments.command}: warning: {arguments.params}: {warning}',
+                  file=sys.stderr)
         values.update(parse_override(text) for text in arguments.overrides)
         if arguments.lever_arm is not None:
             values['lever_arm'] = arguments.lever_arm

@@ -31,8 +31,8 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
 MAX_PARAMS_BYTES = 1 << 20
 
 AUTO_OR_BOOL = ('auto', True, False)
-# Declared by rclpy itself on every node: legal in a parameter file, none of our business.
-_RCLPY_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
+# Declared by rclpy itself on every node, legal in a parameter file.
+RCLPY_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 
 
 class ConfigError(ValueError):
@@ -204,7 +204,7 @@ class Config:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            value = _checked(field, getattr(self, field.name))
+            value = checked(field, getattr(self, field.name))
             object.__setattr__(self, field.name, value)
         if self.use_velocity is False and self.use_position is False:
             raise ConfigError('use_velocity and use_position are both false: nothing is left to '
@@ -274,10 +274,19 @@ def config_from_mapping(values: Mapping[str, Any]) -> Config:
     return Config(**values)
 
 
-def no_effect(name: str) -> str:
-    """Say of a parameter of another node, or a slip of the pen, that it has no effect."""
-    hint = _did_you_mean(name)
-    return 'is not known and has no effect' + (hint and f': {hint}')
+def without_unknown(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """
+    Return the values whose names are known, and a warning of each of the others.
+
+    A file with parameters for many nodes is not wrong; a slip of the pen must not pass unseen.
+    """
+    known = {field.name for field in dataclasses.fields(Config)}
+    warnings = []
+    for name in sorted(map(str, values.keys() - known)):
+        hint = _did_you_mean(name)
+        warnings.append(f'parameter {name!r} is not known and has no effect'
+                        + (hint and f': {hint}'))
+    return {name: value for name, value in values.items() if name in known}, warnings
 
 
 def _did_you_mean(name: str) -> str:
@@ -317,7 +326,7 @@ def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
                               'to values')
         found = True
         values.update((name, value) for name, value in content.items()
-                      if str(name).split('.')[0] not in _RCLPY_PARAMETERS)
+                      if str(name).split('.')[0] not in RCLPY_PARAMETERS)
     if not found:
         raise ConfigError(f'{path} holds no parameters for this node: expected '
                           f'"{NODE_NAME}:" or "/**:" with "ros__parameters:" below')
@@ -375,64 +384,49 @@ def _is_this_node(name: str) -> bool:
     return name.rsplit('/', 1)[-1] in (NODE_NAME, '*', '**')
 
 
-def _checked(field: dataclasses.Field[Any], value: Any) -> Any:
-    """Return the value in the field's own type or raise ConfigError."""
-    choices = field.metadata['choices']
-    if choices:
-        return _checked_choice(field.name, value, choices)
-    if isinstance(field.default, str):
-        if value == field.default == '':
-            return value
-        if not isinstance(value, str) or not re.fullmatch(r'[^\s/][^\s]{0,255}', value):
-            raise ConfigError(f'{field.name} must be a name without spaces and without a leading '
-                              f'slash, got {reprlib.repr(value)}')
-        return value
-    if isinstance(field.default, tuple):
-        return _checked_vector(field, value)
-    return _checked_number(field.name, value, field)
+def checked(field: dataclasses.Field[Any], value: Any) -> Any:
+    """
+    Return a value in the type of a field's default.
 
-
-def _checked_choice(name: str, value: Any, choices: tuple[Any, ...]) -> Any:
-    # A parameter that may be a word or a truth value arrives as "true" where only words fit.
-    if isinstance(value, str) and value.lower() in ('true', 'false') and True in choices:
-        value = value.lower() == 'true'
-    for choice in choices:
+    A ConfigError says what the field takes: one of its ``choices``, a name, or a number or as many
+    as its default or its ``names`` has, in its ``unit`` from ``minimum`` to ``maximum``.
+    """
+    line, default = field.metadata, field.default
+    if choices := line['choices']:
+        # A parameter that may be a word or a truth value arrives as "true" where only words fit.
+        if isinstance(value, str) and value.lower() in ('true', 'false') and True in choices:
+            value = value.lower() == 'true'
         # 1 == True, but a number is neither a word nor a truth value.
-        if type(value) is type(choice) and value == choice:
-            return choice
-    words = ', '.join(str(choice).lower() if isinstance(choice, bool) else choice
-                      for choice in choices)
-    raise ConfigError(f'{name} must be one of {words}, got {reprlib.repr(value)}')
+        fits = any(type(value) is type(choice) and value == choice for choice in choices)
+        expected = 'one of ' + ', '.join(
+            str(choice).lower() if isinstance(choice, bool) else str(choice) or '""'
+            for choice in choices)
+    elif isinstance(default, str):
+        expected = 'a name without spaces and without a leading slash'
+        fits = value == default == '' or isinstance(value, str) and bool(
+            re.fullmatch(r'[^\s/][^\s]{0,255}', value))
+    else:
+        count = len(default if isinstance(default, tuple) else line.get('names', ()))
+        expected = (f'{count} finite numbers' if count else 'a finite number') + _range(line)
+        try:
+            numbers = list(value) if count and not isinstance(value, (str, Mapping)) else [value]
+            fits = len(numbers) == (count or 1) and all(
+                isinstance(number, Real) and not isinstance(number, bool)
+                and math.isfinite(number) and line['minimum'] <= number <= line['maximum']
+                for number in numbers)
+        except (TypeError, OverflowError):  # no list; an integer that is none of the floats
+            fits = False
+        if fits:
+            value = tuple(map(float, value)) if count else float(value)
+    if not fits:
+        got = ' '.join(reprlib.repr(value).split())
+        raise ConfigError(f'{field.name} must be {expected}, got {got}')
+    return value
 
 
-def _checked_vector(field: dataclasses.Field[Any], value: Any) -> tuple[float, float, float]:
-    try:
-        elements = None if isinstance(value, (str, bytes, Mapping)) else list(value)
-    except TypeError:
-        elements = None
-    if elements is None or len(elements) != 3:
-        got = reprlib.repr(value) if elements is None else f'{len(elements)} of them'
-        raise ConfigError(f'{field.name} must be three numbers '
-                          f'({field.metadata["unit"]}), got {got}')
-    x, y, z = (_checked_number(f'{field.name}[{index}]', element, field)
-               for index, element in enumerate(elements))
-    return x, y, z
-
-
-def _checked_number(name: str, value: Any, field: dataclasses.Field[Any]) -> float:
-    unit = field.metadata['unit']
-    unit = f' {unit}' if unit not in ('', '1') else ''
-    minimum, maximum = field.metadata['minimum'], field.metadata['maximum']
-    if isinstance(value, bool) or not isinstance(value, Real):
-        raise ConfigError(f'{name} must be a number{unit and f" ({unit.strip()})"}, '
-                          f'got {reprlib.repr(value)}')
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise ConfigError(f'{name} must be finite, got {reprlib.repr(value)}')
-    if not minimum <= number <= maximum:
-        raise ConfigError(f'{name} must lie between {minimum:g} and {maximum:g}{unit}, '
-                          f'got {number:g}')
-    return number
+def _range(line: Mapping[str, Any]) -> str:
+    """Say in which unit and between which limits a number is."""
+    unit = '' if line['unit'] in ('', '1') else f' in {line["unit"]}'
+    if line['maximum'] < math.inf:
+        return f'{unit} from {line["minimum"]:g} to {line["maximum"]:g}'
+    return unit + (f', {line["minimum"]:g} or above' if line['minimum'] > -math.inf else '')

@@ -191,7 +191,8 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     ConfigError
         If a parameter is not known or its value is wrong.
     ValueError
-        If an array has the wrong shape, or its stamps are no times or in another unit.
+        If an array has the wrong shape, or its stamps are no times, in another unit, out of order
+        by more than `gnss_lateness` or of another clock than those of the IMU.
 
     """
     settings = config_from_mapping(config)
@@ -202,9 +203,13 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
         if stamps_ns.ndim != 1 or array.shape != (stamps_ns.size, 3):
             raise ValueError(f'{name} has the shape {array.shape} and stamps {stamps_ns.shape}: '
                              'they must be (N, 3) and (N,)')
-    gnss = _messages('fixes', fixes, Fix, unit_ns)
-    if velocities is not None:
-        gnss += _messages('velocities', velocities, Velocity, unit_ns, settings)
+    _check_order(stamps_ns, settings.gnss_lateness)
+    gnss: list[Any] = []
+    for name, given, kind in (('fixes', fixes, Fix), ('velocities', velocities, Velocity)):
+        if given is not None:
+            found = _messages(name, given, kind, unit_ns, settings)
+            _check_clock(name, [message.stamp_ns for message in found], stamps_ns)
+            gnss += found
     gnss.sort(key=lambda message: message.stamp_ns)
     # Each message comes behind the IMU samples that have its stamp or an older one.
     before = np.searchsorted(np.maximum.accumulate(stamps_ns),
@@ -229,8 +234,29 @@ def _nanoseconds(name: str, stamps: np.ndarray, unit_ns: float) -> Index:
     return stamps.astype(np.int64)
 
 
-def _messages(name: str, given: Any, kind: type, unit_ns: float,
-              config: Config | None = None) -> list[Any]:
+def _check_order(stamps_ns: Index, lateness: float) -> None:
+    """Raise ValueError where a stamp of the IMU is further behind an earlier one than allowed."""
+    behind = np.maximum.accumulate(stamps_ns) - stamps_ns
+    if np.any(behind > lateness * 1e9):
+        row = int(np.argmax(behind > lateness * 1e9))
+        raise ValueError(f'the stamps of the IMU go back by {behind[row] * 1e-9:.6g} s at row '
+                         f'{row}: sort all its rows by stamp, or align the parts one by one '
+                         'if the clock was set back')
+
+
+def _check_clock(name: str, gnss_ns: list[int], imu_ns: Index) -> None:
+    """Raise ValueError where the times of a GNSS array have nothing in common with the IMU's."""
+    if not gnss_ns or not imu_ns.size:
+        return
+    first, last, imu_first, imu_last = (
+        bound * 1e-9 for bound in (min(gnss_ns), max(gnss_ns), imu_ns.min(), imu_ns.max()))
+    if first > imu_last or last < imu_first:
+        raise ValueError(f'the stamps of {name} ({first:.3f} to {last:.3f} s) and of the IMU '
+                         f'({imu_first:.3f} to {imu_last:.3f} s) have no time in common: give '
+                         'both by one clock, with the offset between the clocks taken off')
+
+
+def _messages(name: str, given: Any, kind: type, unit_ns: float, config: Config) -> list[Any]:
     """Return fixes or velocities, of a table if that is given."""
     if len(given) == 0 or all(isinstance(message, kind) for message in given):
         return list(given)
@@ -250,7 +276,7 @@ def _messages(name: str, given: Any, kind: type, unit_ns: float,
         covariances[:, [0, 1, 2], [0, 1, 2]] = np.square(table[:, 4:])
     elif known:
         covariances[:, :3, :3] = table[:, 4:].reshape(-1, 3, 3)
-    if config is not None:
+    if kind is Velocity:
         return messages.velocities(stamps_ns, '', table[:, 1:4],
                                    covariances if known else None, config)
     kinds = np.full(len(table), int(known))

@@ -23,17 +23,12 @@ import errno
 from functools import partial
 import os
 from pathlib import Path
-from typing import Any, IO, TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from ins_align.results import Result
+from typing import Any, IO
 
 # Everything else is imported where it is used: --help must not wait for numpy.
 
 STANDARD_OUTPUT = '-'
-PAGE_SUFFIX = '.html'
-PLOT_SUFFIXES = (PAGE_SUFFIX, '.png', '.pdf', '.svg', '.jpg', '.jpeg', '.webp', '.eps', '.tif',
-                 '.tiff')
+PLOT_SUFFIXES = ('.png', '.pdf', '.svg', '.jpg', '.jpeg', '.webp', '.eps', '.tif', '.tiff')
 
 
 class UsageError(Exception):
@@ -92,7 +87,9 @@ def process(task: Task, read_ahead: bool = False,
         if task.csv:
             write_whole(task.csv, lambda file: file.write(result.to_csv().encode()))
         if task.plot:
-            write_whole(task.plot, partial(_draw, result, Path(task.plot).suffix.lower()))
+            from ins_align.panels import plot
+            write_whole(task.plot, partial(
+                plot(result).savefig, format=Path(task.plot).suffix[1:].lower(), dpi=120))
     except BagError as error:
         return Outcome.failed(task.name, named(error))
     except BrokenProcessPool as error:
@@ -101,15 +98,6 @@ def process(task: Task, read_ahead: bool = False,
         return Outcome.failed(task.name, f'cannot write {error.filename}: {error.strerror}')
     warnings = tuple(about(task.name, named(text)) for text in result.warnings)
     return Outcome(result.to_json(), summary(result), warnings)
-
-
-def _draw(result: Result, suffix: str, file: IO[bytes]) -> None:
-    if suffix == PAGE_SUFFIX:
-        from ins_align.page import page
-        file.write(page(result).encode())
-    else:
-        from ins_align.report import plot, save_figure
-        save_figure(plot(result), file, suffix)
 
 
 def survey(bag: str) -> Outcome:
@@ -148,14 +136,9 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any])
 def labels(bags: Sequence[str]) -> list[str]:
     """Name the recordings, all differently, for the names of output files."""
     names = [Path(bag).resolve().name.split('.')[0] or 'bag' for bag in bags]
-    found: list[str] = []
-    for index, name in enumerate(names):
-        label = name
-        # A number may make it the name of another recording.
-        while names.count(label) > (label == name) or label in found:
-            label += f'_{index + 1}'
-        found.append(label)
-    return found
+    if len(set(names)) == len(names):
+        return names
+    return [f'{name}_{number}' for number, name in enumerate(names, 1)]
 
 
 def with_label(path: str, label: str) -> str:
@@ -214,7 +197,6 @@ def check_plot(path: str) -> None:
     if suffix not in PLOT_SUFFIXES:
         raise UsageError(f'cannot draw {path}: its name must end with one of '
                          f'{", ".join(PLOT_SUFFIXES)}')
-    library = 'plotly' if suffix == PAGE_SUFFIX else 'matplotlib'
-    if find_spec(library) is None:
-        raise UsageError(f'--plot {path} needs {library}, which is not installed: '
-                         f'pip install {library}')
+    if find_spec('matplotlib') is None:
+        raise UsageError(f'--plot {path} needs matplotlib, which is not installed: '
+                         'pip install matplotlib')

@@ -11,155 +11,86 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What a picture of a result shows: panels with curves, which `report` and `page` draw."""
+"""The picture of a replay: attitude, sigmas, innovations, biases, error and track."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 import math
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from ins_align.geometry.rotation import Array
 from ins_align.recordings import one_line
+from ins_align.report import new_figure
 from ins_align.results import Epoch, Result, State
 import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Okabe and Ito's palette, which the colour-blind can tell apart.
 STATE_COLOURS = {
     State.WAITING_FOR_IMU: '#999999', State.WAITING_FOR_GNSS: '#999999',
     State.ALIGNING: '#E69F00', State.LEVELLED: '#56B4E9', State.ALIGNED: '#009E73',
     State.FAULT: '#D55E00'}
-ROLL, PITCH, HEADING = '#0072B2', '#CC79A7', '#D55E00'
-ANGLES = (('roll', ROLL), ('pitch', PITCH), ('yaw', HEADING))
-AXES_OF_ENU = (('east', ROLL), ('north', PITCH), ('up', HEADING))
-AXES_OF_IMU = (('x', ROLL), ('y', PITCH), ('z', HEADING))
+COLOURS = '#0072B2', '#CC79A7', '#D55E00'  # roll, pitch, yaw; x, y, z; east, north, up
+TILT, _, HEADING = COLOURS
 INNOVATION_LIMIT = 5.0  # sigmas shown at least
 METRES_PER_DEGREE = 6_371_000.0 * math.pi / 180.0  # of latitude, mean sphere: good for a picture
 BREAK_INTERVALS = 5.0  # a line ends where epochs are further apart than so many usual distances
 LOST_SIGMA_DEG = 60.0  # above this a heading is not worth drawing
-OVER_TIME = 'time since t0 (s)'
+THIN = {'linewidth': 0.8, 'linestyle': ':'}  # of a limit
 
 
-@dataclass(frozen=True)
-class Curve:
+def plot(result: Result) -> Figure:
     """
-    A line or a row of marks.
-
-    Attributes
-    ----------
-    name : str
-        In the legend, once for all of a panel that have it; empty: not in it.
-    colour : str
-    x, y : ndarray, shape (N,)
-        A line ends at nan.
-    style : str
-        As matplotlib has it: the line ``-``, ``--`` or ``:``; the marks ``.``, ``D`` or ``^``;
-        empty: nothing but the sigma.
-    size : float
-        Width of the line or of the marks, points.
-    sigma : ndarray, shape (N,), optional
-        Drawn as a band along a line, as bars at marks.
-    notes : sequence of str
-        A sentence for each point, where there is a pointer to show it.
-
-    """
-
-    name: str
-    colour: str
-    x: Array
-    y: Array
-    style: str = '-'
-    size: float = 1.2
-    sigma: Array | None = None
-    notes: Sequence[str] = ()
-
-    @property
-    def is_line(self) -> bool:
-        """Whether the points are joined."""
-        return self.style in ('-', '--', ':')
-
-
-@dataclass(frozen=True)
-class Panel:
-    """Curves that have their axes in common; `note` says why there are none."""
-
-    label: str  # of the vertical axis, with the unit
-    curves: list[Curve]
-    limits: tuple[float, float] | None = None
-    log: bool = False
-    note: str = ''
-    x_label: str = OVER_TIME
-
-
-@dataclass(frozen=True)
-class Span:
-    """A time that is shaded in all panels over time, with a line where it starts."""
-
-    name: str
-    colour: str
-    start: float
-    end: float
-
-
-@dataclass(frozen=True)
-class Picture:
-    """Two columns of panels from top to bottom; the last one on the right is the track."""
-
-    title: str
-    left: list[Panel]
-    right: list[Panel]
-    spans: list[Span]
-
-
-def picture(result: Result) -> Picture:
-    """
-    Return what a picture of a recording shows.
+    Draw the picture of a recording.
 
     Attitude with its sigma, where it was declared, the sigmas against their thresholds, normalised
     innovations, biases, the error where there is a reference, and the track by state.
     """
-    series, status = _Series(result), result.status
-    name = one_line(Path(result.bag).name or result.bag)
-    right = [_biases('gyro bias (deg/s)', series.time, np.degrees(series.gyro_bias),
-                     np.degrees(status.gyro_bias_std)),
-             _biases('accelerometer\nbias (m/s\u00b2)', series.time, series.accel_bias,
-                     status.accel_bias_std)]
-    if series.errors is not None:
-        right.append(_errors(series, series.errors))
-    return Picture(
-        f'{name}: {state_in_words(result)}',
-        [_angles('roll, pitch (deg)', series, result, ((0, 'roll', ROLL), (1, 'pitch', PITCH))),
-         _angles('yaw (deg, counter-\nclockwise from east)', series, result,
-                 ((2, 'yaw', HEADING),)),
-         _sigmas(series, result), _innovations(series, result)],
-        [*right, _track(result)],
-        [Span(words, STATE_COLOURS[state], *span)
-         for words, state in (('roll and pitch declared', State.LEVELLED),
-                              ('declared aligned', State.ALIGNED))
-         for span in declared_spans(result.epochs, state)])
+    series = _Series(result)
+    figure = new_figure(16.0, 11.0)
+    figure.suptitle(f'{one_line(Path(result.bag).name or result.bag)}: {result.state_in_words}',
+                    fontsize=13, parse_math=False)
+    left, right = map(figure.add_subfigure, figure.add_gridspec(1, 2, width_ratios=(3, 2)))
+    tilt, yaw, sigmas, innovations = left.subplots(4, 1, sharex=True)
+    heights = [1.0] * (2 if series.errors is None else 3) + [2.2]
+    gyro, accel, *error, track = right.subplots(len(heights), 1, height_ratios=heights)
+    _angles(tilt, 'roll, pitch (deg)', series, result, {'roll': 0, 'pitch': 1})
+    _angles(yaw, 'yaw (deg, counter-\nclockwise from east)', series, result, {'yaw': 2})
+    _sigmas(sigmas, series, result)
+    _innovations(innovations, series, result)
+    _biases(gyro, 'gyro bias (deg/s)', series.time, np.degrees(series.gyro_bias),
+            np.degrees(result.status.gyro_bias_std))
+    _biases(accel, 'accelerometer\nbias (m/s\u00b2)', series.time, series.accel_bias,
+            result.status.accel_bias_std)
+    for axes in error:
+        _errors(axes, series)
+    _track(track, result)
+    upper = [gyro, accel, *error]
+    for axes in upper[:-1]:
+        axes.sharex(upper[-1])
+        axes.tick_params(labelbottom=False)
+    for axes in (innovations, upper[-1]):
+        axes.set_xlabel('time since t0 (s)')
+    for axes in (tilt, yaw, sigmas, innovations, *upper):
+        _shade(axes, result, named=axes is tilt)
+    for axes in (tilt, yaw, sigmas, innovations, *upper, track):
+        axes.grid(alpha=0.3)
+        _add_legend(axes, columns=7 if axes.figure is left else 5)
+    return figure
 
 
-def declared_spans(epochs: Sequence[Epoch], state: State = State.ALIGNED,
-                   ) -> list[tuple[float, float]]:
+def spans_of(epochs: Iterable[Epoch], state: State) -> list[tuple[float, float]]:
     """Return the first and the last epoch of each time in a state, s since the first t0."""
-    spans: list[tuple[float, float]] = []
-    inside = False
-    for epoch in epochs:
-        start = spans[-1][0] if inside else epoch.t_s
-        if epoch.state is state:
-            spans[len(spans) - inside:] = [(start, epoch.t_s)]
-        inside = epoch.state is state
-    return spans
-
-
-def state_in_words(result: Result) -> str:
-    """Return the state at the end, and when it was declared, s since the first t0."""
-    state = result.status.state
-    spans = declared_spans(result.epochs)
-    after = f' after {spans[-1][0]:.1f} s' if spans and state is State.ALIGNED else ''
-    return f'{state.value}{after}'
+    runs = [list(run) for present, run in groupby(epochs, attrgetter('state'))
+            if present is state]
+    return [(run[0].t_s, run[-1].t_s) for run in runs]
 
 
 class _Series:
@@ -182,11 +113,12 @@ class _Series:
 
         self.time = np.insert(time, breaks, np.nan)
         self.angles = rows([[now.roll_deg, now.pitch_deg, now.yaw_deg] for _, _, now in pairs])
-        self.sigma = rows([now.sigma_deg for _, _, now in pairs])
-        self.initial_sigma = rows([first.sigma_deg for _, first, _ in pairs])
         # Roll and pitch turn about axes in the plane of level: the larger sigma holds for both.
-        self.angle_sigma = np.stack([self.sigma[:, :2].max(axis=1, initial=0.0)] * 2
-                                    + [self.sigma[:, 2]], axis=-1)
+        self.sigma, self.initial_sigma = (
+            np.column_stack([*[rows(sigma)[:, :2].max(axis=1, initial=0.0)] * 2,
+                             rows(sigma)[:, 2]])
+            for sigma in ([now.sigma_deg for _, _, now in pairs],
+                          [first.sigma_deg for _, first, _ in pairs]))
         self.innovations, self.gyro_bias, self.accel_bias = (
             rows([getattr(epoch, name) for epoch, _, _ in pairs])
             for name in ('innovation', 'gyro_bias', 'accel_bias'))
@@ -216,116 +148,112 @@ def _broken_at_wraps(angle: Array, *arrays: Array) -> Iterator[Array]:
     return (np.insert(array, wraps, np.nan) for array in arrays)
 
 
-def _angles(label: str, series: _Series, result: Result,
-            lines: tuple[tuple[int, str, str], ...]) -> Panel:
-    """Return angles with the reference, and as they were declared: at their t0."""
-    if not len(series.time):
-        return Panel(label, [], note='no attitude')
-    curves = []
-    for column, name, colour in lines:
-        sigma = series.angle_sigma[:, column]
+def _angles(axes: Axes, label: str, series: _Series, result: Result,
+            columns: dict[str, int]) -> None:
+    """Draw angles with the reference, and as they were declared: at their t0."""
+    axes.set_ylabel(label)
+    if not series.time.size:
+        axes.text(0.5, 0.5, 'no attitude', transform=axes.transAxes, ha='center')
+        return
+    bands = []
+    for name, column in columns.items():
+        sigma = series.sigma[:, column]
         angle = np.where(sigma < LOST_SIGMA_DEG, series.angles[:, column], np.nan)
         time, angle, sigma = _broken_at_wraps(angle, series.time, angle, sigma)
-        curves.append(Curve(name, colour, time, angle, size=2.0, sigma=sigma))
+        axes.plot(time, angle, color=COLOURS[column], linewidth=2.0, label=name)
+        bands.append((name, column, time, angle - sigma, angle + sigma))
     if series.reference is not None:
-        for column, _, _ in lines:
-            angle = series.reference[:, column]
-            curves.append(Curve('reference', 'black', *_broken_at_wraps(angle, series.time, angle),
-                                '--', 0.8))
-    declared = result.declared
-    if declared is not None:
-        time = np.array([result.t_s(declared.stamp_ns)])
+        for angle in series.reference[:, [*columns.values()]].T:
+            axes.plot(*_broken_at_wraps(angle, series.time, angle), 'k--', linewidth=0.8,
+                      label='reference')
+    if (declared := result.declared) is not None:
         angles = declared.roll_deg, declared.pitch_deg, declared.yaw_deg
-        level, up = max(declared.sigma_deg[:2]), declared.sigma_deg[2]
-        for column, _, _ in lines:
-            curves.append(Curve('declared, at its t0', 'black', time, np.array([angles[column]]),
-                                'D', 4.0, np.array([up if column == 2 else level])))
-    # The first sigmas would make flat lines of the angles.
-    return Panel(label, curves, _around(np.concatenate([curve.y for curve in curves])))
+        level, up = declared.sigma_deg[:2].max(), declared.sigma_deg[2]
+        for column in columns.values():
+            axes.errorbar(result.t_s(declared.stamp_ns), angles[column],
+                          up if column == 2 else level, fmt='kD', markersize=4.0, capsize=3.0,
+                          label='declared, at its t0')
+    limits = axes.get_ylim()  # the first sigmas would make flat lines of the angles
+    for name, column, time, low, high in bands:
+        axes.fill_between(time, low, high, color=COLOURS[column], alpha=0.25, linewidth=0,
+                          label=f'{name}, 1 sigma')
+    axes.set_ylim(limits)
 
 
-def _around(values: Array) -> tuple[float, float] | None:
-    """Return limits with some space around values."""
-    values = values[np.isfinite(values)]
-    if not values.size:
-        return None
-    margin = 0.05 * np.ptp(values) or 1.0
-    return float(values.min() - margin), float(values.max() + margin)
+def _sigmas(axes: Axes, series: _Series, result: Result) -> None:
+    axes.set_ylabel('1 sigma (deg)')
+    axes.set_yscale('log')
+    for name, column, threshold in (('tilt', 0, result.config.tilt_std_threshold),
+                                    ('heading', 2, result.config.heading_std_threshold)):
+        colour = COLOURS[column]
+        axes.plot(series.time, series.sigma[:, column], color=colour, linewidth=1.2,
+                  label=f'{name}, current')
+        axes.plot(series.time, series.initial_sigma[:, column], ':', color=colour, linewidth=1.0,
+                  label=f'{name}, at t0')
+        axes.axhline(threshold, color=colour, linestyle='--', linewidth=0.8, label='threshold')
 
 
-def _level(name: str, colour: str, time: Array, value: float, style: str) -> Curve:
-    """Return a level as long as the time, of which some is finite."""
-    ends = np.array([np.nanmin(time), np.nanmax(time)])
-    return Curve(name, colour, ends, np.full(2, value), style, 0.8)
-
-
-def _sigmas(series: _Series, result: Result) -> Panel:
-    curves = []
-    config, first = result.config, series.initial_sigma
-    for column, name, colour, at_t0, threshold in (
-            (0, 'tilt', ROLL, first[:, :2].max(axis=1, initial=0.0), config.tilt_std_threshold),
-            (2, 'heading', HEADING, first[:, 2], config.heading_std_threshold)):
-        if len(series.time):
-            curves += [
-                Curve(f'{name}, current', colour, series.time, series.angle_sigma[:, column]),
-                Curve(f'{name}, at t0', colour, series.time, at_t0, ':', 1.0),
-                _level('threshold', colour, series.time, threshold, '--')]
-    return Panel('1 sigma (deg)', curves, log=True)
-
-
-def _innovations(series: _Series, result: Result) -> Panel:
+def _innovations(axes: Axes, series: _Series, result: Result) -> None:
     kind = 'velocity' if result.topics and result.topics.velocity else 'position'
-    label = f'innovation of the\n{kind} (sigma)'
+    axes.set_ylabel(f'innovation of the\n{kind} (sigma)')
     if not np.isfinite(series.innovations).any():
-        return Panel(label, [])
+        return
     # Outliers may be anything: they are drawn at the edge.
     limit = max(INNOVATION_LIMIT, 1.5 * float(np.nanquantile(np.abs(series.innovations), 0.99)))
-    values = series.innovations.clip(-limit, limit)
-    curves = [Curve(name, colour, series.time, values[:, column], '.', 3.0)
-              for column, (name, colour) in enumerate(AXES_OF_ENU)]
-    curves += [_level('3 sigma', 'black', series.time, level, ':') for level in (3.0, -3.0)]
-    return Panel(label, curves, (-1.05 * limit, 1.05 * limit))
+    for name, colour, values in zip(('east', 'north', 'up'), COLOURS, series.innovations.T):
+        axes.plot(series.time, values.clip(-limit, limit), '.', color=colour, markersize=3.0,
+                  label=name)
+    for level in (3.0, -3.0):
+        axes.axhline(level, color='black', label='3 sigma', **THIN)
+    axes.set_ylim(-1.05 * limit, 1.05 * limit)
 
 
-def _biases(label: str, time: Array, biases: Array, std: Array) -> Panel:
-    """Return three biases, and at the end how well they are known."""
-    if not len(time):
-        return Panel(label, [])
-    curves = [Curve(name, colour, time, biases[:, column])
-              for column, (name, colour) in enumerate(AXES_OF_IMU)]
-    curves += [Curve('1 sigma at the end', colour, time[-1:], biases[-1:, column], '',
-                     sigma=std[column:column + 1])
-               for column, (_, colour) in enumerate(AXES_OF_IMU)]
-    # The first seconds tell nothing yet.
-    settled = biases[len(biases) // 10:]
+def _biases(axes: Axes, label: str, time: Array, biases: Array, std: Array) -> None:
+    """Draw three biases, and at the end how well they are known."""
+    axes.set_ylabel(label)
+    if not time.size:
+        return
+    for name, colour, values in zip('xyz', COLOURS, biases.T):
+        axes.plot(time, values, color=colour, linewidth=1.2, label=name)
+    for colour, value, sigma in zip(COLOURS, biases[-1], std):
+        axes.errorbar(time[-1], value, sigma, fmt='none', ecolor=colour, capsize=3.0,
+                      label='1 sigma at the end')
+    settled = biases[len(biases) // 10:]  # the first seconds tell nothing yet
     low, high = np.nanmin(settled) - std.max(), np.nanmax(settled) + std.max()
     margin = 0.1 * (high - low) or 1.0
-    return Panel(label, curves, (float(low - margin), float(high + margin)))
+    axes.set_ylim(low - margin, high + margin)
 
 
-def _errors(series: _Series, errors: Array) -> Panel:
-    label = 'error against\nreference (deg)'
+def _errors(axes: Axes, series: _Series) -> None:
+    axes.set_ylabel('error against\nreference (deg)')
+    errors = series.errors
+    assert errors is not None
     finite = np.isfinite(errors).all(axis=1)
     if not finite.any():
-        return Panel(label, [], note='the reference does not cover these epochs')
-    curves = [Curve(name, colour, series.time, errors[:, column], size=1.0)
-              for column, (name, colour) in enumerate(ANGLES)]
-    curves += [Curve('heading, 3 sigma', HEADING, series.time, level * series.sigma[:, 2], ':',
-                     0.8) for level in (3.0, -3.0)]
+        axes.text(0.5, 0.5, 'the reference does not cover these epochs',
+                  transform=axes.transAxes, ha='center')
+        return
+    for name, colour, values in zip(('roll', 'pitch', 'yaw'), COLOURS, errors.T):
+        axes.plot(series.time, values, color=colour, linewidth=1.0, label=name)
+    for level in (3.0, -3.0):
+        axes.plot(series.time, level * series.sigma[:, 2], color=HEADING,
+                  label='heading, 3 sigma', **THIN)
     # What is seen of an error is its end: its first seconds, of every start, are as large as an
     # angle can be.
     settled = finite & (series.aligned if series.aligned.any()
                         else series.time >= np.median(series.time[finite]))
-    largest = np.abs(errors[settled if settled.any() else finite]).max()
-    limit = max(1.0, 2.0 * float(largest))
-    return Panel(label, curves, (-limit, limit))
+    limit = max(1.0, 2.0 * float(np.abs(errors[settled if settled.any() else finite]).max()))
+    axes.set_ylim(-limit, limit)
 
 
-def _track(result: Result) -> Panel:
-    """Return the fixes by the state at each."""
+def _track(axes: Axes, result: Result) -> None:
+    """Draw the fixes by the state at each."""
+    axes.set_xlabel('east (m)')
+    axes.set_ylabel('north (m)')
+    axes.set_aspect('equal', adjustable='datalim')
     track = result.track[np.isfinite(result.track).all(axis=1)]
     if not len(track):
-        return Panel('north (m)', [], x_label='east (m)')
+        return
     latitude, longitude = track[0, 1:]
     north = (track[:, 1] - latitude) * METRES_PER_DEGREE
     east = (np.remainder(track[:, 2] - longitude + 180.0, 360.0) - 180.0) \
@@ -333,13 +261,31 @@ def _track(result: Result) -> Panel:
     stamps = np.array([epoch.stamp_ns - result.first_fix_ns for epoch in result.epochs])
     index = np.searchsorted(stamps, track[:, 0], side='right') - 1
     states = [result.epochs[i].state if i >= 0 else State.WAITING_FOR_GNSS for i in index]
-    since = track[:, 0] + (result.first_fix_ns - (result.first_t0_ns or result.first_fix_ns))
-    times = [f'{seconds:.1f} s' for seconds in (since * 1e-9).tolist()]
-    curves = [Curve('', '#cccccc', east, north, size=0.8)]
+    axes.plot(east, north, color='#cccccc', linewidth=0.8)
     for state, colour in STATE_COLOURS.items():
         if state in states:
-            there = np.where([s is state for s in states], 1.0, np.nan)
-            curves.append(Curve(state.value, colour, there * east, there * north, '.', 5.0,
-                                notes=times))
-    curves.append(Curve('start', 'black', east[:1], north[:1], '^', 8.0))
-    return Panel('north (m)', curves, x_label='east (m)')
+            there = [one is state for one in states]
+            axes.plot(east[there], north[there], '.', color=colour, markersize=5.0,
+                      label=state.value)
+    axes.plot(east[0], north[0], 'k^', markersize=8.0, label='start')
+
+
+def _shade(axes: Axes, result: Result, named: bool) -> None:
+    """Shade the times that were declared; one legend with the names is enough."""
+    for words, state in (('roll and pitch declared', State.LEVELLED),
+                         ('declared aligned', State.ALIGNED)):
+        for start, end in spans_of(result.epochs, state):
+            axes.axvspan(start, end, color=STATE_COLOURS[state], alpha=0.1, linewidth=0)
+            axes.axvline(start, color=STATE_COLOURS[state], linewidth=1.2,
+                         label=words if named else None)
+
+
+def _add_legend(axes: Axes, columns: int) -> None:
+    """Put a legend above the axes, where nothing that is drawn can lie under it."""
+    handles: dict[str, Any] = {}
+    for handle, name in zip(*axes.get_legend_handles_labels()):
+        handles.setdefault(name, handle)
+    if handles:
+        axes.legend(handles.values(), handles.keys(), loc='lower left', bbox_to_anchor=(0.0, 1.0),
+                    fontsize=8, frameon=False, ncols=columns, borderpad=0.2, columnspacing=1.2,
+                    handletextpad=0.5)

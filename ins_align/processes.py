@@ -19,7 +19,6 @@ Tasks by the dozen, in order, and one that is some steps ahead; and the threads 
 
 from __future__ import annotations
 
-import asyncio
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -113,6 +112,8 @@ def run_on_cluster(function: Callable[..., T], tasks: Sequence[Any], address: st
     The workers read and write the files: they need the same folders as this machine. What a worker
     that dies had in hand, another one does again; files are replaced as a whole.
     """
+    import asyncio
+
     try:
         from distributed import Client
     except ImportError:

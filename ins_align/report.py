@@ -20,13 +20,11 @@ import itertools
 import math
 import shutil
 import textwrap
-from typing import Any, IO, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
-from ins_align.panels import Panel, picture, Span, state_in_words
 from ins_align.results import Result
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 CHANGES_AT_ENDS = 3  # of the state: the first and the last so many are in the table
@@ -65,7 +63,7 @@ def _cell(value: Any) -> str:
 def summary(result: Result) -> str:
     """Return the table that ``ins_align replay`` prints of a recording."""
     status = result.status
-    lines = [result.bag, *_wrapped(f'{state_in_words(result)}: {status.reason}', '  '),
+    lines = [result.bag, *_wrapped(f'{result.state_in_words}: {status.reason}', '  '),
              *_list_of_changes(result)]
     declared = None if status.initial is None else result.declared
     rows = []
@@ -132,11 +130,6 @@ def _sigma(value: float) -> str:
     return f'{value:.4f}' if value else '-'  # 0: given, not estimated
 
 
-def save_figure(figure: Figure, file: IO[bytes], suffix: str) -> None:
-    """Write a figure to an open file in the format that a suffix names."""
-    figure.savefig(file, format=suffix.lstrip('.').lower(), dpi=120)
-
-
 def new_figure(width: float, height: float) -> Figure:
     """Return an empty figure that needs no display, inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -145,70 +138,3 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), layout='constrained')
     FigureCanvasAgg(figure)
     return figure
-
-
-def plot(result: Result) -> Figure:
-    """Draw the picture of a recording."""
-    shown = picture(result)
-    figure = new_figure(16.0, 11.0)
-    figure.suptitle(shown.title, fontsize=13, parse_math=False)
-    columns = figure.add_gridspec(1, 2, width_ratios=(3, 2))
-    left, right = figure.add_subfigure(columns[0]), figure.add_subfigure(columns[1])
-    first, *others = left.subplots(len(shown.left), 1, sharex=True)
-    heights = [1.0] * (len(shown.right) - 1) + [2.2]
-    *upper, track = right.subplots(len(heights), 1, height_ratios=heights)
-    for axes in upper[:-1]:
-        axes.sharex(upper[-1])
-        axes.tick_params(labelbottom=False)
-    over_time = [first, *others, *upper]
-    for axes, panel in zip([*over_time, track], [*shown.left, *shown.right]):
-        _draw(axes, panel)
-    for axes in over_time:
-        _shade(axes, shown.spans, axes is first)
-    for axes, panel in ((others[-1], shown.left[-1]), (upper[-1], shown.right[-2]),
-                        (track, shown.right[-1])):
-        axes.set_xlabel(panel.x_label)
-    track.set_aspect('equal', adjustable='datalim')
-    for axes in (*over_time, track):
-        axes.grid(alpha=0.3)
-        if axes.get_legend_handles_labels()[0]:
-            # Above the axes: nothing that is drawn can lie under it.
-            axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), fontsize=8, frameon=False,
-                        ncols=7 if axes.figure is left else 5, borderpad=0.2,
-                        columnspacing=1.2, handletextpad=0.5)
-    return figure
-
-
-def _draw(axes: Axes, panel: Panel) -> None:
-    axes.set_ylabel(panel.label)
-    axes.text(0.5, 0.5, panel.note, transform=axes.transAxes, ha='center')
-    names = set()
-    for curve in panel.curves:
-        x, y, sigma, colour = curve.x, curve.y, curve.sigma, curve.colour
-        name = None if curve.name in names else curve.name or None
-        names.add(curve.name)
-        marks = {'marker': curve.style, 'markersize': curve.size, 'linestyle': 'none'}
-        if curve.is_line:
-            axes.plot(x, y, color=colour, linewidth=curve.size, linestyle=curve.style, label=name)
-            if sigma is not None:
-                axes.fill_between(x, y - sigma, y + sigma, color=colour, alpha=0.25, linewidth=0,
-                                  label=f'{name}, 1 sigma')
-        elif sigma is None:
-            axes.plot(x, y, color=colour, label=name, **marks)
-        else:
-            axes.errorbar(x, y, sigma, color=colour, label=name, capsize=3.0, elinewidth=1.2,
-                          **marks)
-    if panel.log and panel.curves:
-        axes.set_yscale('log')
-    if panel.limits is not None:
-        axes.set_ylim(panel.limits)
-
-
-def _shade(axes: Axes, spans: Sequence[Span], named: bool) -> None:
-    """Shade times; one legend with the names is enough."""
-    names = set()
-    for span in spans:
-        axes.axvspan(span.start, span.end, color=span.colour, alpha=0.1, linewidth=0)
-        axes.axvline(span.start, color=span.colour, linewidth=1.2,
-                     label=span.name if named and span.name not in names else None)
-        names.add(span.name)

@@ -15,14 +15,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 import dataclasses
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-import io
-from itertools import pairwise
+from itertools import dropwhile, groupby, pairwise
 import math
+from operator import attrgetter
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from ins_align.config import Config
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 OK, WARN, ERROR = range(3)  # levels of diagnostic_msgs/DiagnosticStatus
 MAX_REFERENCE_GAP_NS = 1_500_000_000  # the reference is not interpolated over more
 
+# Estimates beside the attitude, with the unit as it stands in names.
+ESTIMATES = {'gyro_bias': 'rad_s', 'accel_bias': 'm_s2', 'lever_arm': 'm', 'gnss_delay': 's'}
 _ATTITUDE_COLUMNS = 'qx,qy,qz,qw,sigma_e_deg,sigma_n_deg,sigma_u_deg'
 CSV_HEADER = 'stamp_ns,t_s,state,' + ','.join(
     prefix + name for prefix in ('', 'current_') for name in _ATTITUDE_COLUMNS.split(','))
@@ -269,7 +271,7 @@ class Reference:
                 np.degrees(np.remainder(difference + np.pi, 2.0 * np.pi) - np.pi))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Result:
     """
     What came of an alignment of recorded data.
@@ -320,12 +322,9 @@ class Result:
     @property
     def declared(self) -> Attitude | None:
         """Return the initial attitude as the node publishes it at the last declaration."""
-        declared, before = None, None
-        for epoch in self.epochs:
-            if epoch.state is State.ALIGNED and before is not State.ALIGNED:
-                declared = epoch.initial
-            before = epoch.state
-        return declared
+        starts = [next(run) for state, run in groupby(self.epochs, attrgetter('state'))
+                  if state is State.ALIGNED]
+        return starts[-1].initial if starts else None
 
     @property
     def changes(self) -> list[Change]:
@@ -337,6 +336,33 @@ class Result:
                 changes.append(Change(epoch.stamp_ns, epoch.t_s, epoch.state, reason))
             before = epoch.state
         return changes
+
+    @property
+    def state_in_words(self) -> str:
+        """Return the state at the end, and when ALIGNED was declared and withdrawn: s since t0."""
+        # The times of the first declaration, of its end, of the next declaration ...
+        times = [next(changes).t_s for _, changes in groupby(
+            dropwhile(lambda change: change.state is not State.ALIGNED, self.changes),
+            lambda change: change.state is State.ALIGNED)]
+        if not times:
+            return self.status.state.value
+        words, withdrawals = f'after {times[0]:.1f} s', len(times) // 2
+        if withdrawals:
+            words += '; withdrawn ' if self.aligned else ', withdrawn '
+            words += f'{withdrawals} times, first ' if withdrawals > 1 else ''
+            words += f'at {times[1]:.1f} s'
+        if withdrawals and len(times) > 2 * withdrawals:
+            words += f', again after {times[-1]:.1f} s'
+        return f'ALIGNED {words}' if self.aligned else (
+            f'{self.status.state.value} (aligned {words})')
+
+    def __repr__(self) -> str:
+        now = self.current
+        attitude = 'no attitude' if now is None else (
+            f'roll {now.roll_deg:.2f}, pitch {now.pitch_deg:.2f}, '
+            f'heading {now.heading_deg:.2f} +- {now.sigma_deg[2]:.2f} deg '
+            f'(tilt +- {now.sigma_deg[:2].max():.2f} deg) at stamp {now.stamp_ns}')
+        return f'Result({self.state_in_words}, {attitude}, {len(self.epochs)} epochs)'
 
     @property
     def first_t0_ns(self) -> int | None:
@@ -366,10 +392,8 @@ class Result:
             'initial_attitude': attitude_json(status.initial),
             'declared_attitude': attitude_json(self.declared, stamped=True),
             'final_attitude': attitude_json(status.current, stamped=True),
-            'gyro_bias_rad_s': _finite(status.gyro_bias),
-            'accel_bias_m_s2': _finite(status.accel_bias),
-            'lever_arm_m': _finite(status.lever_arm),
-            'gnss_delay_s': _finite([status.gnss_delay])[0],
+            **{f'{name}_{unit}': _finite(getattr(status, name))
+               for name, unit in ESTIMATES.items()},
             'counts': dict(status.counts),
         }
         if self.topics is not None and self.config.base_frame:
@@ -381,18 +405,22 @@ class Result:
 
     def to_csv(self) -> str:
         """Return the table that ``--csv`` writes, a row per GNSS epoch."""
-        out = io.StringIO()
-        out.write(CSV_HEADER + '\n')
-        for epoch in self.epochs:
-            if epoch.dry:
-                continue
-            cells = [str(epoch.stamp_ns), f'{epoch.t_s:.9f}', epoch.state.value]
-            for attitude in (epoch.initial, epoch.current):
-                numbers = [math.nan] * 7 if attitude is None else [
-                    *attitude.quaternion_xyzw.tolist(), *attitude.sigma_deg.tolist()]
-                cells += [repr(number) if math.isfinite(number) else '' for number in numbers]
-            out.write(','.join(cells) + '\n')
-        return out.getvalue()
+        epochs = [epoch for epoch in self.epochs if not epoch.dry]
+        rows = zip([f'{epoch.stamp_ns},{epoch.t_s:.9f},{epoch.state.value}' for epoch in epochs],
+                   _attitude_cells([epoch.initial for epoch in epochs]),
+                   _attitude_cells([epoch.current for epoch in epochs]))
+        return '\n'.join([CSV_HEADER, *map(','.join, rows), ''])
+
+
+def _attitude_cells(attitudes: Sequence[Attitude | None]) -> Iterator[str]:
+    """Yield the columns of each attitude, all converted at a time; empty where there is none."""
+    known = [attitude for attitude in attitudes if attitude is not None]
+    quaternions = quaternion_from_matrix(np.array([each.C_nb for each in known]).reshape(-1, 3, 3))
+    variances = np.array([np.diagonal(each.covariance) for each in known]).reshape(-1, 3)
+    numbers = iter(np.hstack([quaternions, np.degrees(np.sqrt(variances))]).tolist())
+    for attitude in attitudes:
+        yield ','.join(repr(number) if math.isfinite(number) else '' for number in (
+            [math.nan] * 7 if attitude is None else next(numbers)))
 
 
 def in_order_of_time(epochs: Iterable[Epoch]) -> tuple[Epoch, ...]:
@@ -423,9 +451,11 @@ def attitude_json(attitude: Attitude | None, stamped: bool = False) -> dict[str,
             'pitch_deg': pitch, 'yaw_deg': yaw, 'sigma_deg': _finite(attitude.sigma_deg)}
 
 
-def _finite(values: Iterable[float]) -> list[float | None]:
-    """Return plain numbers as JSON has them: none that are not finite."""
-    return [float(value) if math.isfinite(value) else None for value in values]
+def _finite(value: Any) -> Any:
+    """Return a number or an array as JSON has it: None for what is not finite."""
+    if np.ndim(value):
+        return [_finite(each) for each in value]
+    return float(value) if math.isfinite(value) else None
 
 
 def level_of(state: State) -> int:
@@ -454,8 +484,7 @@ def status_values(status: Status, base_frame: str = '', base: Transform | None =
         yield f'{name}_roll_pitch_yaw_deg', angles(attitude)
         yield f'{name}_sigma_east_north_up_deg', text(attitude and attitude.sigma_deg)
     yield 'current_heading_deg', text(status.current and status.current.heading_deg)
-    for name, unit in (('gyro_bias', 'rad_s'), ('accel_bias', 'm_s2'), ('lever_arm', 'm'),
-                       ('gnss_delay', 's')):
+    for name, unit in ESTIMATES.items():
         yield f'{name}_{unit}', text(getattr(status, name))
         yield f'{name}_std_{unit}', text(getattr(status, f'{name}_std'))
     for name, count in status.counts.items():

@@ -88,9 +88,9 @@ def test_value_refused_in_one_line(name, value):
 
 
 @pytest.mark.parametrize('name, value, sentence', [
-    ('gyro_scale_std', 0.7, 'gyro_scale_std must lie between 0 and 0.5, got 0.7'),
-    ('gyro_scale_std', 'x', "gyro_scale_std must be a number, got 'x'"),
-    ('hold_time', -1, 'hold_time must lie between 0 and 3600 s, got -1')])
+    ('gyro_scale_std', 0.7, 'gyro_scale_std must be a finite number from 0 to 0.5, got 0.7'),
+    ('gyro_scale_std', 'x', "gyro_scale_std must be a finite number from 0 to 0.5, got 'x'"),
+    ('hold_time', -1, 'hold_time must be a finite number in s from 0 to 3600, got -1')])
 def test_sentence_names_the_unit_where_there_is_one(name, value, sentence):
     with pytest.raises(ConfigError) as info:
         Config(**{name: value})

@@ -35,10 +35,10 @@ def double(value):
 
 
 WRONG = (
-    (['-p', 'lever_arm:=[1, 2]'], 'lever_arm must be three numbers'),
+    (['-p', 'lever_arm:=[1, 2]'], 'lever_arm must be 3 finite numbers'),
     (['-p', 'lever_arm:=[]'], 'an empty list: write its numbers, as lever_arm:=[0.0, 0.0, 0.0]'),
-    (['-p', 'lever_arm:=[1.0, .nan, 0.0]'], 'lever_arm[1] must be finite'),
-    (['-p', 'hold_time:=-1'], 'hold_time must lie between 0 and 3600 s'),
+    (['-p', 'lever_arm:=[1.0, .nan, 0.0]'], 'lever_arm must be 3 finite numbers'),
+    (['-p', 'hold_time:=-1'], 'hold_time must be a finite number in s from 0 to 3600'),
     (['-p', 'imu_grade:=golden'],
      'imu_grade must be one of navigation, tactical, mems, chip, custom'),
     (['-p', 'imu_grade:=custom'], 'missing: angle_random_walk'),

@@ -150,6 +150,27 @@ def test_an_outage_is_in_the_epochs():
     assert times == sorted(times)
 
 
+def test_samples_that_overtook_others_are_put_in_order(flight, result):
+    stamps, gyro, accel = (array.copy() for array in imu(flight))
+    for array in (stamps, gyro, accel):
+        array[1000:1050] = array[1000:1050][::-1].copy()
+    other = ins_align.align(stamps, gyro, accel, *tables(flight, 'std'), **LEVER)
+    assert other.status.counts['imu_out_of_order'] == 49
+    assert np.allclose(other.current.C_nb, result.current.C_nb, atol=1e-6)
+
+
+def test_result_is_told_in_some_words(flight, result):
+    text = repr(result)
+    assert text == str(result) and len(text) < 300 and '\n' not in text
+    now = result.current
+    assert text.startswith('Result(ALIGNED after ')
+    assert f'heading {now.heading_deg:.2f} +- {now.sigma_deg[2]:.2f} deg' in text
+    assert f'roll {now.roll_deg:.2f}' in text and '150 epochs' in text
+    assert f'stamp {now.stamp_ns}' in text
+    nothing = ins_align.align([], np.zeros((0, 3)), np.zeros((0, 3)), [])
+    assert repr(nothing) == 'Result(WAITING_FOR_IMU, no attitude, 0 epochs)'
+
+
 def test_units_that_are_wrong_are_named():
     car = simulated('car', duration=60.0, seed=2)
     stamps, gyro, accel = imu(car)
@@ -173,6 +194,12 @@ def test_no_data():
     ({'stamps': np.arange(3001.0) + 1.7e18}, 'stamps of the IMU must be seconds'),
     ({'velocities': np.outer(np.arange(30.0), [0.2, 0.1, 0.1, 0.0])},
      'stamps of velocities must be nanoseconds'),
+    ({'stamps': np.roll(np.arange(3001) * 10_000_000, 1200)},
+     'IMU go back by 30 s at row 1200: sort all its rows by stamp'),
+    ({'stamps': np.arange(3001) * 10_000_000},
+     r'fixes \(175\d+\.\d+ to .*\(0\.000 to 30\.000 s\) have no time in common: .* one clock'),
+    ({'fixes': [], 'stamps': 10 ** 18 + np.arange(3001) * 10_000_000},
+     'stamps of velocities .* have no time in common'),
 ])
 def test_wrong_arrays_end_in_a_sentence(flight, change, message):
     stamps, gyro, accel = imu(flight)
@@ -216,7 +243,8 @@ def test_the_example_of_the_readme_runs(flight, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     names = {}
     exec(compile(code, 'README.md', 'exec'), names)
-    assert capsys.readouterr().out.startswith('heading sigma')
+    told, reason = capsys.readouterr().out.splitlines()
+    assert told.startswith('Result(ALIGNED after') and reason.startswith('heading sigma')
     assert names['result'].aligned
 
 

@@ -27,7 +27,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 CORE = ('aligner', 'config', 'results', 'geometry.earth', 'imu.prediction', 'gnss.antenna',
         'estimation.bank', 'estimation.formula', 'estimation.declaration')
-OPTIONAL = ('rosbags', 'matplotlib', 'plotly', 'pyins', 'pandas', 'numba', 'scipy', 'tqdm')
+OPTIONAL = ('rosbags', 'matplotlib', 'pyins', 'pandas', 'numba', 'scipy', 'tqdm')
 
 
 def read(name):

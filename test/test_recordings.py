@@ -229,6 +229,20 @@ def test_what_cannot_be_read_gets_a_sentence(copy, kind, edit, message):
     assert str(info.value).isprintable() and str(path.name) in str(info.value)
 
 
+def test_a_folder_of_recordings_asks_for_a_choice(tmp_path):
+    for name, kind in (('b', 'mcap'), ('c', 'sqlite3'), ('a.bag', 'ros1')):
+        write_recording(tmp_path / name, kind, 1.0)
+    with pytest.raises(BagError, match=r'folder of recordings \(a.bag, b, c\): name one'):
+        Bag(tmp_path)
+    shutil.copy(next((tmp_path / 'b').glob('*.mcap')), tmp_path / 'd.mcap')
+    for name in ('b', 'c'):
+        shutil.rmtree(tmp_path / name)
+    with pytest.raises(BagError, match=r'folder of recordings \(a.bag, d.mcap\)'):
+        Bag(tmp_path)
+    (tmp_path / 'a.bag').unlink()
+    assert Bag(tmp_path).topics
+
+
 def test_nothing_there(tmp_path):
     with pytest.raises(BagError, match='does not exist'):
         Bag(tmp_path / 'none')

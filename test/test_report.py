@@ -21,11 +21,11 @@ from types import SimpleNamespace
 
 from ins_align.config import Config
 from ins_align.offline import replay
-from ins_align.outputs import write_whole
-from ins_align.panels import declared_spans, STATE_COLOURS
+from ins_align.outputs import process, Task, write_whole
+from ins_align.panels import plot, spans_of, STATE_COLOURS
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import deserialize
-from ins_align.report import format_table, plot, save_figure, summary
+from ins_align.report import format_table, summary
 from ins_align.results import State
 from ins_align.simulation.simulate import simulate, write_bag
 from matplotlib.colors import to_rgb
@@ -103,8 +103,9 @@ def test_times_that_were_declared(result):
     epochs = [dataclasses.replace(result.epochs[0], t_s=float(k), state=state)
               for k, state in enumerate(map(State, (
                   'ALIGNING', 'ALIGNED', 'ALIGNED', 'LEVELLED', 'ALIGNED', 'FAULT')))]
-    assert declared_spans(epochs) == [(1.0, 2.0), (4.0, 4.0)]
-    assert declared_spans(epochs[:1]) == [] and declared_spans(epochs[:3]) == [(1.0, 2.0)]
+    assert spans_of(epochs, State.ALIGNED) == [(1.0, 2.0), (4.0, 4.0)]
+    assert spans_of(epochs[:1], State.ALIGNED) == []
+    assert spans_of(epochs[:3], State.ALIGNED) == [(1.0, 2.0)]
 
 
 def with_states(result, *epochs):
@@ -142,6 +143,21 @@ def test_many_changes_are_cut_in_the_table_and_whole_in_json(result, count, left
     assert (lines[3] == f'... {left_out} more, all of them in --json') == bool(left_out)
     assert [change['reason'] for change in many.to_json()['changes']] == [
         f'reason {k}' for k in range(count)]
+
+
+@pytest.mark.parametrize('states, words', [
+    ('A', 'ALIGNING'), ('AD', 'ALIGNED after 1.0 s'), ('DD', 'ALIGNED after 0.0 s'),
+    ('ADDLD', 'ALIGNED after 1.0 s; withdrawn at 3.0 s, again after 4.0 s'),
+    ('DADADL', 'LEVELLED (aligned after 0.0 s, withdrawn 3 times, first at 1.0 s)'),
+    ('ADA', 'ALIGNING (aligned after 1.0 s, withdrawn at 2.0 s)'),
+    ('DADADAAAD', 'ALIGNED after 0.0 s; withdrawn 3 times, first at 1.0 s, again after 8.0 s')])
+def test_headline_gives_the_first_declaration(result, states, words):
+    names = {'A': 'ALIGNING', 'D': 'ALIGNED', 'L': 'LEVELLED'}
+    told = with_states(result, *((names[state], '', '') for state in states))
+    told = dataclasses.replace(told, status=dataclasses.replace(
+        result.status, state=State(names[states[-1]])))
+    assert told.state_in_words == words
+    assert f'  {words}: ' in summary(told)
 
 
 @pytest.mark.parametrize('columns', [60, 100])
@@ -208,9 +224,8 @@ def test_summary_without_an_attitude(result):
                                            ('.SVG', b'<?xml')])
 def test_figure_is_saved(result, tmp_path, suffix, magic):
     path = tmp_path / ('a' + suffix)
-    figure = plot(result)
-    write_whole(path, lambda file: save_figure(figure, file, suffix))
-    assert path.read_bytes().startswith(magic)
+    done = process(Task('flight', {'path': result.bag, 'duration': 5.0}, plot=str(path)))
+    assert not done.error and path.read_bytes().startswith(magic)
 
 
 def drawn(figure):
@@ -326,7 +341,7 @@ def dry(tmp_path_factory):
 
 
 def test_what_is_declared_lasts_into_an_outage(dry):
-    (start, end), = declared_spans(dry.epochs)
+    (start, end), = spans_of(dry.epochs, State.ALIGNED)
     assert start < 20.0 and 42.0 < end < 98.0 and dry.status.state is not State.ALIGNED
     told = changes_in(summary(dry))
     assert f'{start:.1f} s ALIGNED: ' in ' '.join(told)

@@ -19,6 +19,7 @@ chooses the topics that an alignment reads, `decode` makes arrays of them. The l
 all, so that a damaged or hostile recording takes little memory.
 """
 
+from collections.abc import Iterable
 import importlib
 import sys
 from typing import Any, NamedTuple
@@ -28,6 +29,7 @@ MAX_HELD_BYTES = 1 << 30  # of chunks, unpacked, that have messages of the same 
 MAX_MESSAGE_BYTES = 1 << 16  # of an IMU or GNSS message, which has some hundred bytes
 MAX_DEFINITION_BYTES = 1 << 24  # of the description of a topic
 MAX_TOPICS = 10_000
+LISTED = 20  # names in a sentence
 MAX_METADATA_BYTES = 1 << 24  # of metadata.yaml
 # A file may unpack to this much, or to more at no more than this ratio.
 UNPACKED_BYTES_FREE = 1 << 30
@@ -47,6 +49,13 @@ def printable(line: str) -> str:
 def one_line(text: str) -> str:
     """Make a text that may quote a recording a line that is not too long."""
     return printable(text[:1000])
+
+
+def listed(names: Iterable[str]) -> str:
+    """List names in the order of the alphabet, of many the first."""
+    found = sorted(names)
+    more = len(found) - LISTED
+    return ', '.join(found[:LISTED]) + (f' and {more} more' if more > 0 else '')
 
 
 class BagError(ValueError):

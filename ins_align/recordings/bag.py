@@ -15,7 +15,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, ExitStack, suppress
 from functools import partial
 import heapq
@@ -30,8 +30,8 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from ins_align.recordings import (
-    BagError, MAX_CHUNK_BYTES, MAX_HELD_BYTES, MAX_MESSAGE_BYTES, MAX_METADATA_BYTES, MAX_TOPICS,
-    max_unpacked_bytes, one_line, Topic, unpack, ZSTD_MAGIC, ZSTD_MODULE)
+    BagError, listed, MAX_CHUNK_BYTES, MAX_HELD_BYTES, MAX_MESSAGE_BYTES, MAX_METADATA_BYTES,
+    MAX_TOPICS, max_unpacked_bytes, one_line, Topic, unpack, ZSTD_MAGIC, ZSTD_MODULE)
 from ins_align.recordings.salvage import MAGIC as MCAP_MAGIC
 from ins_align.recordings.salvage import SalvagedMcap
 import numpy as np
@@ -64,7 +64,7 @@ class Block(NamedTuple):
 
 class Bag:
     """
-    A recording: a rosbag2 directory, one of its files, a ROS 1 bag or a directory of these.
+    A recording: a rosbag2 directory, one of its files, a ROS 1 bag or a directory of its parts.
 
     Attributes
     ----------
@@ -112,9 +112,9 @@ class Bag:
             self.warnings.append(one_line(text))
 
     def blocks(self, topics: Sequence[Topic], start_ns: int | None = None,
-               stop_ns: int | None = None) -> Iterator[Block]:
+               stop_ns: int | None = None, size: int = BLOCK) -> Iterator[Block]:
         """
-        Yield the messages of some topics in recorded order, many at a time.
+        Yield the messages of some topics in recorded order, so many at a time.
 
         They are recorded from one time on, to before another one.
         """
@@ -122,30 +122,34 @@ class Bag:
                    if topic in topics}
         with _bag_errors(self.path):
             records = self._records(numbers, start_ns, stop_ns)
-            while group := list(itertools.islice(records, BLOCK)):
+            while group := list(itertools.islice(records, size)):
                 messages: list[list[bytes]] = [[] for _ in topics]
-                for connection, _, data in group:
-                    messages[numbers[id(connection)]].append(data)
+                for number, _, data in group:
+                    messages[number].append(data)
                 yield Block(np.array([time_ns for _, time_ns, _ in group], np.int64),
-                            np.array([numbers[id(connection)] for connection, _, _ in group]),
+                            np.array([number for number, _, _ in group]),
                             [*map(_without_compression, messages)])
-
-    def _records(self, chosen: Container[int], start_ns: int | None, stop_ns: int | None,
-                 ) -> Iterator[tuple[Any, int, bytes]]:
-        """Return connections, times and messages of all files in the order of time."""
-        wanted = [(reader, [connection for connection in reader.connections
-                            if id(connection) in chosen]) for reader in self._readers]
-        return heapq.merge(*(_short(reader.messages(connections, start_ns, stop_ns))
-                             for reader, connections in wanted if connections),
-                           key=itemgetter(1))
 
     def first_message(self, topic: Topic) -> bytes | None:
         """Return the first message of a topic, where there is one."""
-        chosen = [key for key, other in self._topics.items() if other == topic]
-        with _bag_errors(self.path):
-            for _, _, data in self._records(chosen, None, None):
-                return _without_compression([data])[0]
+        for block in self.blocks([topic], size=1):
+            return block.messages[0][0]
         return None
+
+    def _records(self, numbers: Mapping[int, int], start_ns: int | None, stop_ns: int | None,
+                 ) -> Iterator[tuple[int, int, bytes]]:
+        """Yield number of the topic, time and message in the order of time; long ones end it."""
+        sources = [reader.messages(chosen, start_ns, stop_ns) for reader in self._readers
+                   if (chosen := [connection for connection in reader.connections
+                                  if id(connection) in numbers])]
+        for connection, time_ns, data in (
+                sources[0] if len(sources) == 1 else heapq.merge(*sources, key=itemgetter(1))):
+            if type(data) is not bytes:  # a database may hold what is no message
+                data = b''
+            elif len(data) > MAX_MESSAGE_BYTES:
+                raise BagError(f'has a message of {len(data)} bytes or more on '
+                               f'{connection.topic}, where {MAX_MESSAGE_BYTES} are allowed')
+            yield numbers[id(connection)], time_ns, data
 
     def _listed_topics(self) -> tuple[Topic, ...]:
         known: dict[tuple[str, str, str], list[Any]] = {}
@@ -191,17 +195,25 @@ class Bag:
         if not path.is_dir():
             raise BagError(f'{path} is a pipe or a device, from which no recording can be read: '
                            'give a file')
-        listed = []
+        own = []  # files that the recording says it has
         with suppress(OSError), open(path / 'metadata.yaml', 'rb') as file:
             # The last part only: a recording names its own files, not others on this machine.
-            listed = [PurePath(os.fsdecode(name)).name
-                      for name in LISTED_NAME.findall(file.read(MAX_METADATA_BYTES))]
+            own = [PurePath(os.fsdecode(name)).name
+                   for name in LISTED_NAME.findall(file.read(MAX_METADATA_BYTES))]
         files = sorted(file for file in path.iterdir() if STORAGE_NAME.search(file.name))
+        if missing := sorted(set(own).difference(file.name for file in files)):
+            self.warn(f'{", ".join(missing)} is missing from {path}')
+        files = [file for file in files if file.name in own] or files
+        folders = {file.parent.name for file in path.glob('*/*')
+                   if STORAGE_NAME.search(file.name) and not own}
+        suffixes = {Path(file.name.removesuffix('.zstd')).suffix for file in files}
+        if folders or len(suffixes) > 1:
+            names = listed([*folders, *(file.name for file in files)])
+            raise BagError(f'{path} is a folder of recordings ({names}): name one of them, or '
+                           'several')
         if not files:
             raise BagError(f'{path} holds no recording (.mcap, .db3 or .bag)')
-        if missing := sorted(set(listed).difference(file.name for file in files)):
-            self.warn(f'{", ".join(missing)} is missing from {path}')
-        return [file for file in files if file.name in listed] or files
+        return files
 
     def _open_file(self, path: Path, stack: ExitStack) -> Any:
         """Open one storage file, its format told by its first bytes."""
@@ -336,17 +348,6 @@ class _Rosbag1Reader(rosbag1.Reader):
         super().read_index_data(pos, indexes)
         if INDEX_ENTRY_BYTES * sum(map(len, indexes.values())) > self._size:
             raise ValueError('index larger than the file')
-
-
-def _short(records: Iterable[tuple[Any, int, Any]]) -> Iterator[tuple[Any, int, bytes]]:
-    """Let messages pass until one is too long; a database may hold what is none."""
-    for connection, time_ns, data in records:
-        if type(data) is not bytes:
-            data = b''
-        elif len(data) > MAX_MESSAGE_BYTES:
-            raise BagError(f'has a message of {len(data)} bytes or more on {connection.topic}, '
-                           f'where {MAX_MESSAGE_BYTES} are allowed')
-        yield connection, time_ns, data
 
 
 def _without_compression(messages: list[bytes]) -> list[bytes]:

@@ -31,7 +31,7 @@ from ins_align.gnss.drivers import (
     RECEIVERS, type_in_words)
 from ins_align.gnss.messages import MessageError, velocity_from_msg
 from ins_align.mounting import find_mounting, FixedFrames, Mounting
-from ins_align.recordings import BagError, Topic
+from ins_align.recordings import BagError, listed, Topic
 from ins_align.recordings.bag import Bag, Block
 from ins_align.recordings.decode import (
     decode_gnss, decode_imu, decode_orientations, deserialize, FIX_TYPE, Gnss, IMU_TYPE,
@@ -45,7 +45,6 @@ UNSTAMPED_TYPES = ['geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistWithCovari
 REFERENCE_NAMESPACE = '/reference/'
 REFERENCE_TOPIC = '/reference/imu'  # truth or the best that is known: to compare with, never input
 OPTIONS = {'IMU': '--imu-topic', 'position': '--fix-topic', 'velocity': '--velocity-topic'}
-LISTED_TOPICS = 20  # in an error
 
 
 class Topics(NamedTuple):
@@ -317,10 +316,7 @@ def _measures(bag: Bag, topic: Topic, config: Config = Config(), say: bool = Tru
 
 
 def _listing(bag: Bag) -> str:
-    names = sorted(topic.name for topic in bag.topics)
-    more = len(names) - LISTED_TOPICS
-    return ('it has no topics' if not names else
-            f'it has {", ".join(names[:LISTED_TOPICS])}{f" and {more} more" if more > 0 else ""}')
+    return 'it has ' + (listed(topic.name for topic in bag.topics) or 'no topics')
 
 
 def _in_words(types: Sequence[str]) -> str:

@@ -33,7 +33,8 @@ from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
 from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
 from ins_align.checks import InputChecks
 from ins_align.config import (
-    Config, config_from_mapping, ConfigError, no_effect, NODE_NAME, parameters)
+    Config, config_from_mapping, ConfigError, NODE_NAME, parameters, RCLPY_PARAMETERS,
+    without_unknown)
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
 from ins_align.mounting import Mounting
@@ -70,7 +71,6 @@ STATUS_PERIOD = 1.0  # s
 # so, and another one may take its place (s).
 IMU_SILENT = 1.0
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.5)
-RCLPY_PARAMETERS = {'use_sim_time', 'start_type_description_service'}  # it declares them itself
 
 
 class AlignmentNode(Node):
@@ -435,17 +435,18 @@ class AlignmentNode(Node):
 
     def _declare_parameters(self) -> Config:
         """Check the values given at start and declare all parameters with their description."""
-        known = parameters()
-        names = {own.name for own in known}
-        given = {name: parameter.value
-                 for name, parameter in self.get_parameters_by_prefix('').items()}
-        config = config_from_mapping({name: given[name] for name in names & given.keys()})
-        for name in given.keys() - RCLPY_PARAMETERS:
-            # A parameter file for many nodes is not wrong, a slip of the pen must not pass unseen.
-            if name not in names and not name.startswith('qos_overrides.'):
-                self.get_logger().warning(f'parameter {name!r} {no_effect(name)}')
-            self.undeclare_parameter(name)
-        for own in known:
+        declared = {name: parameter.value
+                    for name, parameter in self.get_parameters_by_prefix('').items()}
+        given, warnings = without_unknown({
+            name: value for name, value in declared.items()
+            if name.split('.')[0] not in RCLPY_PARAMETERS})
+        config = config_from_mapping(given)
+        for warning in warnings:
+            self.get_logger().warning(warning)
+        for name in declared:
+            if name not in RCLPY_PARAMETERS:
+                self.undeclare_parameter(name)
+        for own in parameters():
             self.declare_parameter(own.name, getattr(config, own.name), parameter_descriptor(own),
                                    ignore_override=True)
         self.add_on_set_parameters_callback(self._check_parameters)
@@ -453,10 +454,8 @@ class AlignmentNode(Node):
         return config
 
     def _changed_config(self, changes: Iterable[Parameter]) -> Config:
-        own = {parameter.name for parameter in parameters()}
-        return dataclasses.replace(
-            self._config, **{change.name: change.value for change in changes
-                             if change.name in own})
+        own, _ = without_unknown({change.name: change.value for change in changes})
+        return dataclasses.replace(self._config, **own)
 
     def _check_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:

@@ -24,7 +24,7 @@ from numbers import Real
 import reprlib
 from typing import Any
 
-from ins_align.config import ImuNoise, parameters, PRESETS
+from ins_align.config import checked, ConfigError, ImuNoise, parameters, PRESETS
 
 IMU_AXES = {'': (1.0, 1.0, 1.0), 'x': (-1.0, 1.0, 1.0), 'y': (1.0, -1.0, 1.0),
             'z': (1.0, 1.0, -1.0)}
@@ -167,8 +167,12 @@ class Arguments:
                  all(hasattr(pair, '__len__') and len(pair) == 2 and pair[0] < pair[1]
                      for pair in self.outages))
         for field in dataclasses.fields(self):
-            if field.metadata:
-                _check(field, getattr(self, field.name))
+            value = getattr(self, field.name)
+            if field.metadata and not (value is None and field.default is None):
+                try:
+                    checked(field, value)
+                except ConfigError as error:
+                    raise SimulationError(error) from None
         if self.duration is None:
             object.__setattr__(self, 'duration',
                                SCENARIOS[self.scenario].duration + self.stand_still)
@@ -199,26 +203,3 @@ def _is_number(value: Any) -> bool:
 def _require(name: str, value: Any, expected: str, fits: bool) -> None:
     if not fits:
         raise SimulationError(f'{name} must be {expected}, got {reprlib.repr(value)}')
-
-
-def _check(field: dataclasses.Field[Any], value: Any) -> None:
-    """Raise SimulationError for a value that does not fit its line of the table."""
-    line = field.metadata
-    if value is None and field.default is None:
-        return
-    if line['choices']:
-        _require(field.name, value, 'one of ' + ', '.join(
-            str(choice) or '""' for choice in line['choices']), value in line['choices'])
-        return
-    count = len(line['names'])
-    expected = f'{count} numbers' if count else 'a finite number'
-    if line['unit'] not in ('', '1'):
-        expected += f' in {line["unit"]}'
-    if line['maximum'] < math.inf:
-        expected += f' from {line["minimum"]:g} to {line["maximum"]:g}'
-    elif line['minimum'] > -math.inf:
-        expected += f', {line["minimum"]:g} or above'
-    numbers = value if count else [value]
-    fits = hasattr(numbers, '__len__') and len(numbers) == (count or 1) and all(
-        _is_number(number) and line['minimum'] <= number <= line['maximum'] for number in numbers)
-    _require(field.name, value, expected, fits)
