@@ -47,9 +47,9 @@ FITS = 3.0
 # are so close to it (rad) that rotations add up like vectors, or it moves no more (rad).
 NEGLIGIBLE, CLOSE, SETTLED = 1e-6, 0.01, 1e-8
 # Corrections so small (rad) leave the axes of the errors as they are.
-NO_TURN = 3e-3
+NO_TURN = 1e-3
 # What is beyond first order in an innovation counts from so much of the receiver's noise on.
-BENT = 0.1
+BENT = 0.03
 _EYE = np.eye(3)
 
 

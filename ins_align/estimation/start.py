@@ -163,7 +163,8 @@ class Start:
     def lacks(self) -> str:
         """Return in words what these epochs do not have and a start needs, or ''."""
         if not self.epochs or any(
-                epoch.v_n is not None or epoch.position_covariance[2, 2] < UNKNOWN_ALTITUDE_STD ** 2
+                epoch.v_n is not None
+                or epoch.position_covariance[2, 2] < UNKNOWN_ALTITUDE_STD ** 2
                 for epoch in self.epochs):
             return ''
         return 'positions have no altitude, and there is no velocity: one of the two is needed'
