@@ -49,7 +49,7 @@ NEGLIGIBLE, CLOSE, SETTLED = 1e-6, 0.01, 1e-8
 # Corrections so small (rad) leave the axes of the errors as they are.
 NO_TURN = 1e-3
 # What is beyond first order in an innovation counts from so much of the receiver's noise on.
-BENT = 0.03
+BENT = 0.05
 _EYE = np.eye(3)
 
 
