@@ -228,10 +228,7 @@ class Filters:
         missing = measured.s[k, kind] - (self.w if kind else self.u)
         innovation = (apply(C.swapaxes(1, 2), missing) + model.expected[k, kind][q]
                       - apply(H[q][..., FIRST:], self.x - model.point[q]))
-        test = self._test(H, stated, innovation)
-        second_order = self._second_order(test, stated, innovation)
-        if second_order is not None:
-            test = self._test(H, stated, innovation, second_order)
+        test = self._second_look(self._test(H, stated, innovation), H, stated, innovation)
         good = test.nis < GATE
         # By the means before the measurement, which an outlier must not choose.
         taken = self._by_most(good)
@@ -281,9 +278,9 @@ class Filters:
         self._reduce(test.HP[lead], test.inverse[lead], taken)
         self._move(test, good & taken[q], lead)
 
-    def _second_order(self, test: _Test, noise: Array, innovation: Array) -> Array | None:
+    def _second_look(self, test: _Test, H: Array, noise: Array, innovation: Array) -> _Test:
         """
-        Return what derivatives to phi lack, shape (B, 3, 3); None where the noise hides it.
+        Test an innovation again to second order, unless the noise hides it.
 
         An innovation is ``J m`` and noise, with m linear in the errors; ``J m ~ m + phi x m / 2``.
         """
@@ -291,20 +288,14 @@ class Filters:
         variance = np.trace(self.P[:, PHI, PHI], axis1=1, axis2=2)[self.place]
         if np.all(variance * np.einsum('bi,bi->b', m, m)
                   <= BENT ** 2 * np.trace(noise, axis1=1, axis2=2)):
-            return None
-        return -0.5 * skew(m)
+            return test
+        more = -0.5 * skew(m)
+        H = H[self.place].copy()
+        H[..., PHI] += more
+        return _tested(H, test.HP + more @ self.P[:, PHI][self.place], noise, innovation, True)
 
-    def _test(self, H: Array, noise: Array, innovation: Array,
-              second_order: Array | None = None) -> _Test:
-        HP, H = (H @ self.P)[self.place], H[self.place]
-        if second_order is not None:
-            HP, H = HP + second_order @ self.P[:, PHI][self.place], H.copy()
-            H[..., PHI] += second_order
-        S: Array = HP @ H.swapaxes(1, 2) + noise
-        inverse = np.asarray(np.linalg.inv(S), float)
-        weighted = apply(inverse, innovation)
-        return _Test(HP, S, inverse, weighted, np.einsum('ij,ij->i', innovation, weighted),
-                     second_order is not None)
+    def _test(self, H: Array, noise: Array, innovation: Array) -> _Test:
+        return _tested(H[self.place], (H @ self.P)[self.place], noise, innovation, False)
 
     def _reduce(self, HP: Array, inverse: Array, taken: np.ndarray) -> Array:
         """Take what was measured off the covariances; return the gains, shape (M, r, n)."""
@@ -443,6 +434,15 @@ class Filters:
                     break
             covariance = covariance + away[..., :, None] * away[..., None, :]
         return mean, (share @ covariance.reshape(2, -1, 9)).reshape(2, 3, 3)
+
+
+def _tested(H: Array, HP: Array, noise: Array, innovation: Array, second_order: bool) -> _Test:
+    """Test innovations with the derivatives of each mean, shape (B, r, n)."""
+    S: Array = HP @ H.swapaxes(1, 2) + noise
+    inverse = np.asarray(np.linalg.inv(S), float)
+    weighted = apply(inverse, innovation)
+    return _Test(HP, S, inverse, weighted, np.einsum('ij,ij->i', innovation, weighted),
+                 second_order)
 
 
 def log_sum(values: Array) -> float:
