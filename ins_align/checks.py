@@ -58,12 +58,14 @@ def degrees_fault(max_rate: float, times: Array, gyro: Array, accel: Array, velo
     turned as the rates say, is as long as the change of velocity and gravity make it, whatever
     the attitude and the axes are; turned 57 times as far it becomes shorter.
     """
-    sent, as_degrees = (_lengths(times, rates, accel, velocities)
-                        for rates in (gyro, np.radians(gyro)))
-    shorter = (sent.size >= MIN_LENGTHS and np.quantile(sent, 0.25) < SHORTER
-               and abs(np.median(as_degrees) - 1.0) < AS_LONG)
-    return 'the angular rates look like deg/s: they must be rad/s' * bool(
-        shorter or max_rate > ANY_GYRO_RATE)
+    if max_rate <= ANY_GYRO_RATE:
+        lengths = _lengths(times, gyro, accel, velocities)
+        if not (lengths.size >= MIN_LENGTHS and np.quantile(lengths, 0.25) < SHORTER):
+            return ''
+        in_degrees = _lengths(times, np.radians(gyro), accel, velocities)
+        if not abs(np.median(in_degrees) - 1.0) < AS_LONG:
+            return ''
+    return 'the angular rates look like deg/s: they must be rad/s'
 
 
 def _lengths(times: Array, gyro: Array, accel: Array, velocities: Series) -> Array:
