@@ -38,7 +38,7 @@ STATE_COLOURS = {
     State.ALIGNING: '#E69F00', State.LEVELLED: '#56B4E9', State.ALIGNED: '#009E73',
     State.FAULT: '#D55E00'}
 COLOURS = '#0072B2', '#CC79A7', '#D55E00'  # roll, pitch, yaw; x, y, z; east, north, up
-TILT, _, HEADING = COLOURS
+HEADING = COLOURS[2]
 INNOVATION_LIMIT = 5.0  # sigmas shown at least
 METRES_PER_DEGREE = 6_371_000.0 * math.pi / 180.0  # of latitude, mean sphere: good for a picture
 BREAK_INTERVALS = 5.0  # a line ends where epochs are further apart than so many usual distances

@@ -96,8 +96,7 @@ class Vehicle:
         q, lead, ids = filters.place, filters.lead, filters.ids
         along = self._along[ids]
         H_v, expected, back = (values[k] for values in model.base)
-        v_n0 = filters.u - measured.still[k]
-        v_b = (apply(filters.C.swapaxes(1, 2), v_n0) - expected[q]
+        v_b = (apply(filters.C.swapaxes(1, 2), filters.u - measured.still[k]) - expected[q]
                + apply(H_v[q][..., FIRST:], filters.x - model.point[q]))
         to_base = self._axes.T @ back.swapaxes(1, 2)
         v = apply(to_base[q], v_b)

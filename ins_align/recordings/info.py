@@ -49,7 +49,6 @@ MAX_AHEAD, MAX_BEHIND = MAX_AHEAD_NS * 1e-9, 10.0  # s: stamps further apart are
 MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s and so many sigmas beyond it: a delay to be set
 MIN_APART = 5.0  # s between manoeuvres that are listed
 MAX_LISTED = 8
-MAX_NO_FIX = 0.1  # share of positions without a fix that is worth a word
 FRAMES_THAT_FIT = ('enu', 'ned')
 FRAME_FAULTS = {
     'body': 'its speed fits the change of position and its direction does not: it is given in the '
