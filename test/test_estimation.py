@@ -452,6 +452,5 @@ def test_a_heading_that_nothing_shows_is_not_declared(headless):
     assert 'turn or change speed' in aligner.status().reason
 
 
-@pytest.mark.xfail(strict=True, reason='noise of the IMU passes for motion: sigma falls to 30 deg')
 def test_a_heading_that_nothing_shows_is_any(headless):
     assert min(epoch.current.sigma_deg[2] for epoch in headless[1] if epoch.current) > 100.0

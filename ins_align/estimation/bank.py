@@ -29,7 +29,8 @@ from ins_align.estimation.filter import Filters
 from ins_align.estimation.linearised import linearised, MAX_DELAY, MIN_DELAY
 from ins_align.estimation.receiver import ReceiverNoise
 from ins_align.estimation.rivals import level_in_words, Parameters, Rivals, SHARE
-from ins_align.estimation.start import all_headings, HEADINGS, OPEN_POSITION, RoughAttitude, Start
+from ins_align.estimation.start import (
+    all_headings, HEADINGS, OPEN_POSITION, RoughAttitude, Start, STEP_STD)
 from ins_align.estimation.states import (
     DELAY, FIRST, GYRO, Linearised, Measured, OF_VEHICLE, triads)
 from ins_align.estimation.track import InertialTrack
@@ -252,6 +253,7 @@ class Bank:
         if vehicle is not None and due:
             vehicle.look(filters, model, k, measured)
         self._rivals.select(filters)
+        filters.draw_anew(HEADINGS, STEP_STD)
 
     def _drop_vehicle(self, filters: Filters) -> bool:
         """Assume nothing of the vehicle any more where the motion contradicts it."""

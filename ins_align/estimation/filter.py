@@ -48,6 +48,12 @@ FITS = 3.0
 NEGLIGIBLE, CLOSE, SETTLED = 1e-6, 0.01, 1e-8
 # Corrections so small (rad) leave the axes of the errors as they are.
 NO_TURN = 1e-3
+# An epoch speaks of the heading alone where the tilt's sigma is so many times smaller. Less
+# information on it (1/rad^2) than the second is none.
+TILT_KNOWN, NO_NEWS = 0.35, 1e-9
+# Headings all round whose log weights differ by less than the first are as likely; they are drawn
+# anew when each has become as uncertain as the second (rad).
+EVEN, BLURRED = 1.0, 0.2
 # What is beyond first order in an innovation counts from so much of the receiver's noise on.
 BENT = 0.05
 _EYE = np.eye(3)
@@ -107,13 +113,11 @@ class Filters:
         The place in `ids` of each mean's rival; all of them where each rival has one mean.
     lead : ndarray of int, shape (M,)
         The likeliest mean of each.
-    feigned : ndarray, shape (M, 3, 3)
-        Covariance of what the IMU's noise has made of u and no measurement has taken back.
 
     """
 
     _OF_MEANS = 'C', 'u', 'w', 'x', 'C0', 'rival', 'weight'
-    _OF_RIVALS = 'P', 'walk', 'evidence', 'counts', 'ids', 'feigned'
+    _OF_RIVALS = 'P', 'walk', 'evidence', 'counts', 'ids'
 
     def __init__(self, C: Array, u: Array, x: Array, rival: Index, P: Array, walk: Array,
                  prior: Array, counts: np.ndarray) -> None:
@@ -125,7 +129,6 @@ class Filters:
         self.weight = -np.log(np.bincount(rival))[rival]
         self.evidence, self.counts = prior, counts
         self.P, self.walk = P, walk
-        self.feigned = np.zeros((M, 3, 3))
         self._find_places()
 
     # Which mean is whose, and how likely
@@ -161,16 +164,31 @@ class Filters:
                 setattr(self, name, getattr(self, name)[left])
         self._find_places()
 
-    def _weigh(self, log_likelihood: Array) -> Array:
-        """Weigh means within rivals; return the log likelihood of these, shape (M,)."""
-        weight = self.weight + log_likelihood
+    def _weigh(self, log_likelihood: Array, real: 'Array | float' = 1.0) -> Array:
+        """
+        Weigh means within rivals; return the log likelihood of these, shape (M,).
+
+        Parameters
+        ----------
+        log_likelihood : ndarray, shape (B,)
+            Of the means.
+        real : ndarray, shape (B,), or float
+            The share of it that counts within rivals.
+
+        """
         if self.single:
-            return weight
+            return self.weight + log_likelihood
+        likelihood = self._summed(self.weight + log_likelihood)
+        weight = self.weight + real * log_likelihood
+        self.weight = weight - self._summed(weight)[self.place]
+        self._find_leads()
+        return likelihood
+
+    def _summed(self, weight: Array) -> Array:
+        """Return the log of the sum of the weights of each rival, shape (M,)."""
         largest = np.maximum.reduceat(weight, self.first)
         total: Array = largest + np.log(
             np.add.reduceat(np.exp(weight - largest[self.place]), self.first))
-        self.weight = weight - total[self.place]
-        self._find_leads()
         return total
 
     def _by_most(self, good: np.ndarray) -> np.ndarray:
@@ -199,8 +217,6 @@ class Filters:
         P[:, :9, :9] = 0.5 * (block + block.swapaxes(1, 2))     # or rounding grows
         M, n = self.walk.shape
         P.reshape(M, -1)[:, ::n + 1] += duration * self.walk
-        T = F[:, PHI, PHI]
-        self.feigned = T @ self.feigned @ T.swapaxes(1, 2) + Q[:, XI, XI]
 
     def update(self, model: Linearised, k: int, kind: int, measured: Measured,
                noise: Array) -> Innovation:
@@ -232,12 +248,10 @@ class Filters:
         good = test.nis < GATE
         # By the means before the measurement, which an outlier must not choose.
         taken = self._by_most(good)
+        feigned, with_heading = self._learn(test, stated, taken)
         self.evidence = self.evidence + self._weigh(
-            -0.5 * (np.minimum(test.nis, GATE) + np.log(np.linalg.det(test.S))))
-        gain = self._reduce(test.HP[lead], test.inverse[lead], taken)
-        if kind == 0:
-            self._forget_feigned(gain, test.inverse[lead], C[lead][:, 2], taken)
-        self._move(test, good & taken[q], lead)
+            -0.5 * (np.minimum(test.nis, GATE) + np.log(np.linalg.det(test.S))), 1 - feigned[q])
+        self._move(test, good & taken[q], lead, feigned[:, None] * with_heading)
         best = self.best
         i = lead[best]
         sigmas = np.sqrt((C[i] @ test.S[i] @ C[i].T).diagonal())
@@ -275,7 +289,7 @@ class Filters:
         self.evidence = self.evidence + held * (FITS - 0.5 * nis[self.lead])
         good = nis < GATE
         taken = held & self._by_most(good)
-        self._reduce(test.HP[lead], test.inverse[lead], taken)
+        self._reduce(test, taken)
         self._move(test, good & taken[q], lead)
 
     def _second_look(self, test: _Test, H: Array, noise: Array, innovation: Array) -> _Test:
@@ -297,40 +311,58 @@ class Filters:
     def _test(self, H: Array, noise: Array, innovation: Array) -> _Test:
         return _tested(H[self.place], (H @ self.P)[self.place], noise, innovation, False)
 
-    def _reduce(self, HP: Array, inverse: Array, taken: np.ndarray) -> Array:
-        """Take what was measured off the covariances; return the gains, shape (M, r, n)."""
-        gain: Array = (inverse * taken[:, None, None]) @ HP
-        self.P = self.P - HP.swapaxes(1, 2) @ gain
-        return gain
+    def _reduce(self, test: _Test, taken: np.ndarray) -> None:
+        """Take what was measured off the covariances."""
+        HP, inverse = test.HP[self.lead], test.inverse[self.lead]
+        self.P = self.P - HP.swapaxes(1, 2) @ (inverse * taken[:, None, None]) @ HP
 
-    def _forget_feigned(self, gain: Array, inverse: Array, up: Array, taken: np.ndarray) -> None:
+    def _learn(self, test: _Test, noise: Array, taken: np.ndarray) -> tuple[Array, Array]:
         """
-        Take off again the information on the heading that the noise of the IMU feigns.
+        Reduce the covariances, but not by what noise may have said of the heading.
 
-        What the accelerometers' noise adds to u looks like motion, and motion that the GNSS does
-        not see in this direction speaks against the heading: in expectation by the trace of
-        ``S^-1 V`` over horizontal axes, V the covariance of that noise (errors in variables).
+        Noise looks like motion, and motion that the GNSS does not see in this direction speaks
+        against the heading (errors in variables). By chance an epoch says up to ``tr(W - W^2)``,
+        W being the receiver's share of an innovation (docs, "Theory").
+
+        Returns
+        -------
+        feigned : ndarray, shape (M,)
+            Share of what was said of the heading that may be chance.
+        with_heading : ndarray, shape (M, n)
+            What errors change by with the heading, per radian.
+
         """
-        V = self.feigned
-        weighted = inverse @ V
-        feigned = taken * (np.einsum('ijj', weighted)
-                           - np.einsum('ij,ij->i', up, apply(weighted, up)))
-        to_heading = apply(self.P[:, :, PHI], up)
-        variance = np.einsum('ij,ij->i', up, to_heading[:, PHI])
-        feigned = np.minimum(feigned, 0.5 / variance)
-        factor = feigned / (1 - feigned * variance)
-        self.P += (factor[:, None] * to_heading)[:, :, None] * to_heading[:, None]
-        left = 1 - np.clip(np.einsum('ijj', gain[:, :, XI]) / 3, 0.0, 1.0)
-        self.feigned = (left ** 2)[:, None, None] * V
-        if not self.single:
-            # Which mean is the likeliest stays, even where nothing is left to tell them apart.
-            self.weight *= (1 - np.minimum(feigned, 1.0))[self.place]
-            total = np.add.reduceat(np.exp(self.weight), self.first)
-            self.weight -= np.log(total)[self.place]
+        lead = self.lead
+        up = self.C[lead][:, 2]
+        before, _ = self._of_heading(up)
+        self._reduce(test, taken)
+        after, column = self._of_heading(up)
+        tilt = np.trace(self.P[:, PHI, PHI], axis1=1, axis2=2) - after
+        W = test.inverse[lead] @ noise[lead]
+        chance = np.trace(W - W @ W, axis1=1, axis2=2)
+        chance *= taken & (tilt < TILT_KNOWN ** 2 * after)
+        said = np.maximum(1 / after - 1 / before, NO_NEWS)
+        back = np.clip(chance, 0.0, said)
+        self.P += (back / (1 - back * after))[:, None, None] * (
+            column[:, :, None] * column[:, None])
+        return back / said, column / after[:, None]
 
-    def _move(self, test: _Test, use: np.ndarray, lead: Index) -> None:
-        """Correct the means, and take the covariances to where those that lead have gone."""
+    def _of_heading(self, up: Array) -> tuple[Array, Array]:
+        """Return its variance, shape (M,), and its covariance with all errors, (M, n)."""
+        column = apply(self.P[:, :, PHI], up)
+        return np.einsum('ij,ij->i', up, column[:, PHI]), column
+
+    def _move(self, test: _Test, use: np.ndarray, lead: Index,
+              feigned: Array | None = None) -> None:
+        """
+        Correct the means, and take the covariances to where those that lead have gone.
+
+        `feigned`, shape (M, n), is what goes back again for each radian of a heading's correction.
+        """
         d = ((test.weighted * use[:, None])[:, None] @ test.HP)[:, 0]
+        if feigned is not None:
+            heading = np.einsum('bi,bi->b', d[:, PHI], self.C[:, 2])
+            d = d - heading[:, None] * feigned[self.place]
         self._shift(d)
         d = d[lead]
         turn = np.stack([d[:, PHI], d[:, PHI0]])
@@ -374,6 +406,35 @@ class Filters:
         self.w[:] = 0.0
         self.P[:, RHO] = self.P[:, :, RHO] = 0.0
         self.P[:, RHO, RHO] = std ** 2 * _EYE
+
+    def draw_anew(self, headings: int, std: float) -> None:
+        """
+        Draw the headings of rivals anew that have so many all round, none likelier than another.
+
+        Where it turns to is not known, each becomes blurred. As all are as likely, a heading then
+        says nothing of the rest, and one mean is as good as another.
+        """
+        if self.single:
+            return
+        lead = self.lead
+        up, up0 = self.C[lead][:, 2], self.C0[lead][:, 2]
+        variance, column = self._of_heading(up)
+        fresh = ((np.bincount(self.rival)[self.ids] == headings) & (variance > BLURRED ** 2)
+                 & (self.weight[lead] - np.minimum.reduceat(self.weight, self.first) < EVEN))
+        if not fresh.any():
+            return
+        turn = np.zeros(column.shape)
+        turn[:, PHI], turn[:, PHI0] = up, up0
+        turn, column, variance = turn[fresh], column[fresh], variance[fresh]
+        shared = turn[:, :, None] * column[:, None]
+        self.P[fresh] += ((variance + std ** 2)[:, None, None] * (turn[:, :, None] * turn[:, None])
+                          - shared - shared.swapaxes(1, 2))
+        round_about = exp_so3(2 * math.pi / headings * np.arange(headings)[:, None] * _EYE[2])
+        for first, i in zip(self.first[fresh], lead[fresh]):
+            means = slice(first, first + headings)
+            self.C[means], self.C0[means] = round_about @ self.C[i], round_about @ self.C0[i]
+            self.u[means], self.w[means], self.x[means] = self.u[i], self.w[i], self.x[i]
+            self.weight[means] = -math.log(headings)
 
     def merge(self, alike: float) -> None:
         """Merge the means of each rival that are all within so many sigmas of the likeliest."""

@@ -41,9 +41,10 @@ START_RATIO = 20.0
 UNCERTAIN = 10.0
 # One epoch is an outlier if the residuals of the others are so many times smaller without it.
 OUTLYING = 10.0
-# Headings, every two degrees, and their sigma over the step between them: the sum of such normal
-# densities is flat to 2e-6.
-HEADINGS, STEP_STD = 180, 0.6
+# Headings, every five degrees, and their sigma (rad): the sum of such normal densities is flat to
+# 2e-6.
+HEADINGS = 72
+STEP_STD = 0.6 * 2 * math.pi / HEADINGS
 TILT_STD = math.radians(10.0)
 # What is not known of velocity and position at first (m/s, m); of a velocity whose horizontal
 # part is measured, the vertical is known better.
@@ -213,8 +214,7 @@ class Start:
 
         """
         along = np.outer(rough.axis, rough.axis)
-        step = STEP_STD * 2 * math.pi / HEADINGS
-        attitude = TILT_STD ** 2 * (np.eye(3) - along) + step ** 2 * along
+        attitude = TILT_STD ** 2 * (np.eye(3) - along) + STEP_STD ** 2 * along
         M, m = known.shape[:2]
         P = np.zeros((M, FIRST + m, FIRST + m))
         for rows in (PHI, PHI0):
