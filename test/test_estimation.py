@@ -17,15 +17,16 @@ from collections import Counter
 from dataclasses import replace
 
 from alignment import (
-    aligned, config_for, cut_at, integrate, nanoseconds, normalised_error, simulated)
+    aligned, config_for, cut_at, feed, integrate, nanoseconds, normalised_error, simulated)
 from dense_solution import dense_solution
-from ins_align.aligner import State
+from ins_align.aligner import Aligner, State
 from ins_align.config import Config
 from ins_align.estimation.bank import Bank, RESOLVED_STD
 from ins_align.estimation.filter import Filters
 from ins_align.estimation.linearised import linearised
 from ins_align.estimation.rivals import SIGNS
 from ins_align.estimation.states import DELAY, FIRST, GYRO, PHI, PHI0
+from ins_align.experiments.common import error_of
 from ins_align.experiments.dense import bound
 from ins_align.geometry.rotation import exp_so3, log_so3, skew
 from ins_align.gnss.antenna import Antenna
@@ -454,3 +455,15 @@ def test_a_heading_that_nothing_shows_is_not_declared(headless):
 
 def test_a_heading_that_nothing_shows_is_any(headless):
     assert min(epoch.current.sigma_deg[2] for epoch in headless[1] if epoch.current) > 100.0
+
+
+@pytest.mark.parametrize('seed', (1, pytest.param(3, marks=pytest.mark.campaign)))
+def test_five_minutes_at_rest_do_not_spoil_the_drive_after_them(seed):
+    """What noise seems to say of heading and biases at rest must not be believed for good."""
+    s = simulated('car', imu_grade='mems', duration=330.0, stand_still=300.0, seed=seed,
+                  gnss_rate=2.0, imu_rate=50.0)
+    epochs = feed(Aligner(Config(lever_arm=tuple(s.lever_arm), gnss_lateness=1.0)), s)
+    declared = [epoch for epoch in epochs if epoch.state is State.ALIGNED]
+    errors = [error_of(epoch.current, s.attitude_at(epoch.stamp_ns)) for epoch in declared]
+    assert 300.0 < declared[0].t_s < 320.0
+    assert max(max(error['tilt_sigmas'], error['heading_sigmas']) for error in errors) < 4.0

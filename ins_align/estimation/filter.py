@@ -411,8 +411,8 @@ class Filters:
         """
         Draw the headings of rivals anew that have so many all round, none likelier than another.
 
-        Where it turns to is not known, each becomes blurred. As all are as likely, a heading then
-        says nothing of the rest, and one mean is as good as another.
+        Where the vehicle turns to is not known, each mean becomes blurred. As all are as likely,
+        this says nothing of the rest: they are sharp again, and evenly spaced.
         """
         if self.single:
             return
@@ -429,11 +429,13 @@ class Filters:
         shared = turn[:, :, None] * column[:, None]
         self.P[fresh] += ((variance + std ** 2)[:, None, None] * (turn[:, :, None] * turn[:, None])
                           - shared - shared.swapaxes(1, 2))
-        round_about = exp_so3(2 * math.pi / headings * np.arange(headings)[:, None] * _EYE[2])
         for first, i in zip(self.first[fresh], lead[fresh]):
             means = slice(first, first + headings)
-            self.C[means], self.C0[means] = round_about @ self.C[i], round_about @ self.C0[i]
-            self.u[means], self.w[means], self.x[means] = self.u[i], self.w[i], self.x[i]
+            away = log_so3(self.C[means] @ self.C[i].T)[:, 2]
+            even = 2 * math.pi / headings * (np.arange(headings) + first - i)
+            more = exp_so3((np.remainder(even - away + math.pi, 2 * math.pi) - math.pi)[:, None]
+                           * _EYE[2])
+            self.C[means], self.C0[means] = more @ self.C[means], more @ self.C0[means]
             self.weight[means] = -math.log(headings)
 
     def merge(self, alike: float) -> None:
