@@ -31,7 +31,8 @@ attitude, so all means that differ in their heading share one covariance (docs, 
 import math
 from typing import NamedTuple
 
-from ins_align.estimation.states import FIRST, GYRO, Linearised, Measured, PHI, PHI0, RHO, XI
+from ins_align.estimation.states import (
+    FIRST, GYRO, Linearised, Measured, PHI, PHI0, RHO, triads, XI)
 from ins_align.geometry.rotation import apply, Array, exp_so3, Index, log_so3, skew
 import numpy as np
 
@@ -48,6 +49,9 @@ FITS = 3.0
 NEGLIGIBLE, CLOSE, SETTLED = 1e-6, 0.01, 1e-8
 # Corrections so small (rad) leave the axes of the errors as they are.
 NO_TURN = 1e-3
+# While the biases of the gyros are not known, it is not known how those of the accelerometers turn
+# against the tilt, which looks the same at rest: beyond first order. For so long (s) it adds up.
+TURNING = 30.0
 # An epoch speaks of the heading alone where the tilt's sigma is so many times smaller. Less
 # information on it (1/rad^2) than the second is none.
 TILT_KNOWN, NO_NEWS = 0.35, 1e-9
@@ -109,6 +113,8 @@ class Filters:
         Log of how likely each rival is after the data, but for a constant.
     ids : ndarray of int, shape (M,)
         The rivals that are left.
+    most : ndarray, shape (M, n)
+        The variances at the start.
     place : ndarray of int, shape (B,), or slice
         The place in `ids` of each mean's rival; all of them where each rival has one mean.
     lead : ndarray of int, shape (M,)
@@ -117,7 +123,7 @@ class Filters:
     """
 
     _OF_MEANS = 'C', 'u', 'w', 'x', 'C0', 'rival', 'weight'
-    _OF_RIVALS = 'P', 'walk', 'evidence', 'counts', 'ids'
+    _OF_RIVALS = 'P', 'walk', 'most', 'evidence', 'counts', 'ids'
 
     def __init__(self, C: Array, u: Array, x: Array, rival: Index, P: Array, walk: Array,
                  prior: Array, counts: np.ndarray) -> None:
@@ -129,6 +135,7 @@ class Filters:
         self.weight = -np.log(np.bincount(rival))[rival]
         self.evidence, self.counts = prior, counts
         self.P, self.walk = P, walk
+        self.most = np.diagonal(P, axis1=1, axis2=2)
         self._find_places()
 
     # Which mean is whose, and how likely
@@ -216,7 +223,13 @@ class Filters:
         block = rows @ F.swapaxes(1, 2) + Q
         P[:, :9, :9] = 0.5 * (block + block.swapaxes(1, 2))     # or rounding grows
         M, n = self.walk.shape
-        P.reshape(M, -1)[:, ::n + 1] += duration * self.walk
+        gyro, accel = (slice(FIRST + triad.start, FIRST + triad.start + 3)
+                       for triad in triads(n - FIRST))
+        variance = P.reshape(M, -1)[:, ::n + 1]
+        unknown = variance[:, gyro].sum(axis=1)[:, None]
+        lost = np.maximum(self.most[:, accel] - variance[:, accel], 0.0)
+        variance += duration * self.walk
+        variance[:, accel] += duration * TURNING * unknown * lost
 
     def update(self, model: Linearised, k: int, kind: int, measured: Measured,
                noise: Array) -> Innovation:
