@@ -20,7 +20,7 @@ from alignment import (
     aligned, config_for, cut_at, feed, integrate, nanoseconds, normalised_error, simulated)
 from dense_solution import dense_solution
 from ins_align.aligner import Aligner, State
-from ins_align.config import Config
+from ins_align.config import Config, PRESETS, STANDARD_GRAVITY
 from ins_align.estimation.bank import Bank, RESOLVED_STD
 from ins_align.estimation.filter import Filters
 from ins_align.estimation.linearised import linearised
@@ -455,6 +455,14 @@ def test_a_heading_that_nothing_shows_is_not_declared(headless):
 
 def test_a_heading_that_nothing_shows_is_any(headless):
     assert min(epoch.current.sigma_deg[2] for epoch in headless[1] if epoch.current) > 100.0
+
+
+def test_a_chip_at_rest_is_no_surer_of_its_tilt_than_of_its_accelerometers():
+    """A bias across gravity looks like a tilt: at rest nothing can tell the two apart."""
+    s = simulated('static', imu_grade='chip', duration=60.0, seed=3, gnss_rate=2.0, imu_rate=50.0)
+    epochs = feed(Aligner(Config(imu_grade='chip', gnss_lateness=1.0)), s)
+    least = min(min(epoch.current.sigma_deg[:2]) for epoch in epochs if epoch.current)
+    assert least > 0.8 * np.degrees(PRESETS['chip'].accel_bias_std / STANDARD_GRAVITY)
 
 
 @pytest.mark.parametrize('seed', (1, pytest.param(3, marks=pytest.mark.campaign)))

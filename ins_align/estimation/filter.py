@@ -49,8 +49,8 @@ FITS = 3.0
 NEGLIGIBLE, CLOSE, SETTLED = 1e-6, 0.01, 1e-8
 # Corrections so small (rad) leave the axes of the errors as they are.
 NO_TURN = 1e-3
-# While the biases of the gyros are not known, it is not known how those of the accelerometers turn
-# against the tilt, which looks the same at rest: beyond first order. For so long (s) it adds up.
+# A rate that is not known turns biases of the accelerometers against the tilt that they look like:
+# an error of second order. What is known of them is lost at the rate's variance times this (s).
 TURNING = 30.0
 # An epoch speaks of the heading alone where the tilt's sigma is so many times smaller. Less
 # information on it (1/rad^2) than the second is none.
@@ -135,7 +135,9 @@ class Filters:
         self.weight = -np.log(np.bincount(rival))[rival]
         self.evidence, self.counts = prior, counts
         self.P, self.walk = P, walk
-        self.most = np.diagonal(P, axis1=1, axis2=2)
+        self.most = np.diagonal(P, axis1=1, axis2=2).copy()
+        self._biases = tuple(slice(FIRST + triad.start, FIRST + triad.start + 3)
+                             for triad in triads(x.size))
         self._find_places()
 
     # Which mean is whose, and how likely
@@ -223,13 +225,12 @@ class Filters:
         block = rows @ F.swapaxes(1, 2) + Q
         P[:, :9, :9] = 0.5 * (block + block.swapaxes(1, 2))     # or rounding grows
         M, n = self.walk.shape
-        gyro, accel = (slice(FIRST + triad.start, FIRST + triad.start + 3)
-                       for triad in triads(n - FIRST))
+        gyro, accel = self._biases
         variance = P.reshape(M, -1)[:, ::n + 1]
-        unknown = variance[:, gyro].sum(axis=1)[:, None]
-        lost = np.maximum(self.most[:, accel] - variance[:, accel], 0.0)
+        turning = TURNING * variance[:, gyro].sum(axis=1)[:, None]
+        known = np.maximum(self.most[:, accel] - variance[:, accel], 0.0)
         variance += duration * self.walk
-        variance[:, accel] += duration * TURNING * unknown * lost
+        variance[:, accel] += duration * turning * known
 
     def update(self, model: Linearised, k: int, kind: int, measured: Measured,
                noise: Array) -> Innovation:
