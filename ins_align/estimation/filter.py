@@ -262,10 +262,10 @@ class Filters:
         good = test.nis < GATE
         # By the means before the measurement, which an outlier must not choose.
         taken = self._by_most(good)
-        feigned, with_heading = self._learn(test, stated, taken)
+        feigned, back = self._learn(test, stated, taken)
         self.evidence = self.evidence + self._weigh(
             -0.5 * (np.minimum(test.nis, GATE) + np.log(np.linalg.det(test.S))), 1 - feigned[q])
-        self._move(test, good & taken[q], lead, feigned[:, None] * with_heading)
+        self._move(test, good & taken[q], lead, back)
         best = self.best
         i = lead[best]
         sigmas = np.sqrt((C[i] @ test.S[i] @ C[i].T).diagonal())
@@ -330,7 +330,8 @@ class Filters:
         HP, inverse = test.HP[self.lead], test.inverse[self.lead]
         self.P = self.P - HP.swapaxes(1, 2) @ (inverse * taken[:, None, None]) @ HP
 
-    def _learn(self, test: _Test, noise: Array, taken: np.ndarray) -> tuple[Array, Array]:
+    def _learn(self, test: _Test, noise: Array,
+               taken: np.ndarray) -> 'tuple[Array, Array | None]':
         """
         Reduce the covariances, but not by what noise may have said of the heading.
 
@@ -342,41 +343,38 @@ class Filters:
         -------
         feigned : ndarray, shape (M,)
             Share of what was said of the heading that may be chance.
-        with_heading : ndarray, shape (M, n)
-            What errors change by with the heading, per radian.
+        back : ndarray, shape (M, n), or None
+            What of a correction goes back again for each radian that it turns the heading.
 
         """
-        lead = self.lead
+        lead, before = self.lead, self.P
         up = self.C[lead][:, 2]
-        before, _ = self._of_heading(up)
         self._reduce(test, taken)
-        after, column = self._of_heading(up)
-        tilt = np.trace(self.P[:, PHI, PHI], axis1=1, axis2=2) - after
+        column, variance = _of_heading(self.P, up)
+        tilt = np.trace(self.P[:, PHI, PHI], axis1=1, axis2=2) - variance
+        heard = taken & (tilt < TILT_KNOWN ** 2 * variance)
+        if not heard.any():
+            return np.zeros(len(lead)), None
         W = test.inverse[lead] @ noise[lead]
-        chance = np.trace(W - W @ W, axis1=1, axis2=2)
-        chance *= taken & (tilt < TILT_KNOWN ** 2 * after)
-        said = np.maximum(1 / after - 1 / before, NO_NEWS)
-        back = np.clip(chance, 0.0, said)
-        self.P += (back / (1 - back * after))[:, None, None] * (
+        chance = heard * np.trace(W - W @ W, axis1=1, axis2=2)
+        said = np.maximum(1 / variance - 1 / _of_heading(before, up)[1], NO_NEWS)
+        gone = np.clip(chance, 0.0, said)
+        self.P += (gone / (1 - gone * variance))[:, None, None] * (
             column[:, :, None] * column[:, None])
-        return back / said, column / after[:, None]
-
-    def _of_heading(self, up: Array) -> tuple[Array, Array]:
-        """Return its variance, shape (M,), and its covariance with all errors, (M, n)."""
-        column = apply(self.P[:, :, PHI], up)
-        return np.einsum('ij,ij->i', up, column[:, PHI]), column
+        feigned = gone / said
+        return feigned, (feigned / variance)[:, None] * column
 
     def _move(self, test: _Test, use: np.ndarray, lead: Index,
-              feigned: Array | None = None) -> None:
+              back: Array | None = None) -> None:
         """
         Correct the means, and take the covariances to where those that lead have gone.
 
-        `feigned`, shape (M, n), is what goes back again for each radian of a heading's correction.
+        `back` is as `_learn` returns it.
         """
         d = ((test.weighted * use[:, None])[:, None] @ test.HP)[:, 0]
-        if feigned is not None:
+        if back is not None:
             heading = np.einsum('bi,bi->b', d[:, PHI], self.C[:, 2])
-            d = d - heading[:, None] * feigned[self.place]
+            d = d - heading[:, None] * back[self.place]
         self._shift(d)
         d = d[lead]
         turn = np.stack([d[:, PHI], d[:, PHI0]])
@@ -432,7 +430,7 @@ class Filters:
             return
         lead = self.lead
         up, up0 = self.C[lead][:, 2], self.C0[lead][:, 2]
-        variance, column = self._of_heading(up)
+        column, variance = _of_heading(self.P, up)
         fresh = ((np.bincount(self.rival)[self.ids] == headings) & (variance > BLURRED ** 2)
                  & (self.weight[lead] - np.minimum.reduceat(self.weight, self.first) < EVEN))
         if not fresh.any():
@@ -511,6 +509,12 @@ class Filters:
                     break
             covariance = covariance + away[..., :, None] * away[..., None, :]
         return mean, (share @ covariance.reshape(2, -1, 9)).reshape(2, 3, 3)
+
+
+def _of_heading(P: Array, up: Array) -> tuple[Array, Array]:
+    """Return its covariance with all errors, shape (M, n), and its variance, (M,)."""
+    column = apply(P[:, :, PHI], up)
+    return column, np.einsum('ij,ij->i', up, column[:, PHI])
 
 
 def _tested(H: Array, HP: Array, noise: Array, innovation: Array, second_order: bool) -> _Test:
