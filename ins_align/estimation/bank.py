@@ -32,7 +32,7 @@ from ins_align.estimation.rivals import level_in_words, Parameters, Rivals, SHAR
 from ins_align.estimation.start import (
     all_headings, HEADINGS, OPEN_POSITION, RoughAttitude, Start, STEP_STD)
 from ins_align.estimation.states import (
-    DELAY, FIRST, GYRO, Linearised, Measured, OF_VEHICLE, triads)
+    biases, DELAY, FIRST, GYRO, Linearised, Measured, OF_VEHICLE, triads)
 from ins_align.estimation.track import InertialTrack
 from ins_align.estimation.vehicle import NOT_USED, Vehicle
 from ins_align.geometry.rotation import Array, Transform
@@ -368,7 +368,7 @@ class Bank:
         """Return biases, lever arm and delay."""
         x, P = self._body()
         std = np.sqrt(np.diag(P))
-        gyro, accel = (slice(triad.start, triad.start + 3) for triad in triads(x.size))
+        gyro, accel = biases(x.size)
         return Nuisance(x[gyro], std[gyro], x[accel], std[accel], x[:3], std[:3],
                         float(self._config.gnss_delay + x[DELAY]), float(std[DELAY]))
 

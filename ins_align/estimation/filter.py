@@ -32,7 +32,7 @@ import math
 from typing import NamedTuple
 
 from ins_align.estimation.states import (
-    FIRST, GYRO, Linearised, Measured, PHI, PHI0, RHO, triads, XI)
+    biases, FIRST, GYRO, Linearised, Measured, PHI, PHI0, RHO, XI)
 from ins_align.geometry.rotation import apply, Array, exp_so3, Index, log_so3, skew
 import numpy as np
 
@@ -113,8 +113,8 @@ class Filters:
         Log of how likely each rival is after the data, but for a constant.
     ids : ndarray of int, shape (M,)
         The rivals that are left.
-    most : ndarray, shape (M, n)
-        The variances at the start.
+    at_start : ndarray, shape (M, 3)
+        The variances of the accelerometers' biases, (m/s^2)^2, as they were at the start.
     place : ndarray of int, shape (B,), or slice
         The place in `ids` of each mean's rival; all of them where each rival has one mean.
     lead : ndarray of int, shape (M,)
@@ -123,7 +123,7 @@ class Filters:
     """
 
     _OF_MEANS = 'C', 'u', 'w', 'x', 'C0', 'rival', 'weight'
-    _OF_RIVALS = 'P', 'walk', 'most', 'evidence', 'counts', 'ids'
+    _OF_RIVALS = 'P', 'walk', 'at_start', 'evidence', 'counts', 'ids'
 
     def __init__(self, C: Array, u: Array, x: Array, rival: Index, P: Array, walk: Array,
                  prior: Array, counts: np.ndarray) -> None:
@@ -135,9 +135,7 @@ class Filters:
         self.weight = -np.log(np.bincount(rival))[rival]
         self.evidence, self.counts = prior, counts
         self.P, self.walk = P, walk
-        self.most = np.diagonal(P, axis1=1, axis2=2).copy()
-        self._biases = tuple(slice(FIRST + triad.start, FIRST + triad.start + 3)
-                             for triad in triads(x.size))
+        self.at_start = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, biases(x.size)[1]].copy()
         self._find_places()
 
     # Which mean is whose, and how likely
@@ -225,12 +223,11 @@ class Filters:
         block = rows @ F.swapaxes(1, 2) + Q
         P[:, :9, :9] = 0.5 * (block + block.swapaxes(1, 2))     # or rounding grows
         M, n = self.walk.shape
-        gyro, accel = self._biases
         variance = P.reshape(M, -1)[:, ::n + 1]
-        turning = TURNING * variance[:, gyro].sum(axis=1)[:, None]
-        known = np.maximum(self.most[:, accel] - variance[:, accel], 0.0)
+        gyro, accel = (variance[:, FIRST:][:, places] for places in biases(n - FIRST))
+        turning = TURNING * gyro.sum(axis=1)[:, None] * np.maximum(self.at_start - accel, 0.0)
         variance += duration * self.walk
-        variance[:, accel] += duration * turning * known
+        accel += duration * turning
 
     def update(self, model: Linearised, k: int, kind: int, measured: Measured,
                noise: Array) -> Innovation:
@@ -303,7 +300,7 @@ class Filters:
         self.evidence = self.evidence + held * (FITS - 0.5 * nis[self.lead])
         good = nis < GATE
         taken = held & self._by_most(good)
-        self._reduce(test, taken)
+        self._reduce(test, taken, lead)
         self._move(test, good & taken[q], lead)
 
     def _second_look(self, test: _Test, H: Array, noise: Array, innovation: Array) -> _Test:
@@ -325,9 +322,9 @@ class Filters:
     def _test(self, H: Array, noise: Array, innovation: Array) -> _Test:
         return _tested(H[self.place], (H @ self.P)[self.place], noise, innovation, False)
 
-    def _reduce(self, test: _Test, taken: np.ndarray) -> None:
-        """Take what was measured off the covariances."""
-        HP, inverse = test.HP[self.lead], test.inverse[self.lead]
+    def _reduce(self, test: _Test, taken: np.ndarray, lead: Index) -> None:
+        """Take off the covariances what was measured of the means that lead."""
+        HP, inverse = test.HP[lead], test.inverse[lead]
         self.P = self.P - HP.swapaxes(1, 2) @ (inverse * taken[:, None, None]) @ HP
 
     def _learn(self, test: _Test, noise: Array,
@@ -349,7 +346,7 @@ class Filters:
         """
         lead, before = self.lead, self.P
         up = self.C[lead][:, 2]
-        self._reduce(test, taken)
+        self._reduce(test, taken, lead)
         column, variance = _of_heading(self.P, up)
         tilt = np.trace(self.P[:, PHI, PHI], axis1=1, axis2=2) - variance
         heard = taken & (tilt < TILT_KNOWN ** 2 * variance)
@@ -445,9 +442,8 @@ class Filters:
             means = slice(first, first + headings)
             away = log_so3(self.C[means] @ self.C[i].T)[:, 2]
             even = 2 * math.pi / headings * (np.arange(headings) + first - i)
-            more = exp_so3((np.remainder(even - away + math.pi, 2 * math.pi) - math.pi)[:, None]
-                           * _EYE[2])
-            self.C[means], self.C0[means] = more @ self.C[means], more @ self.C0[means]
+            turned = exp_so3((even - away)[:, None] * _EYE[2])
+            self.C[means], self.C0[means] = turned @ self.C[means], turned @ self.C0[means]
             self.weight[means] = -math.log(headings)
 
     def merge(self, alike: float) -> None:

@@ -25,7 +25,7 @@ import math
 from ins_align.config import Config, ImuNoise, PRESETS
 from ins_align.estimation.filter import Filters, log_sum
 from ins_align.estimation.states import (
-    DELAY, DRIFT, FIRST, GYRO, LEVER_ARM, MARGIN, MOUNT, OF_VEHICLE, triads)
+    biases, DELAY, DRIFT, FIRST, GYRO, LEVER_ARM, MARGIN, MOUNT, OF_VEHICLE, triads)
 from ins_align.geometry.rotation import Array, log_so3
 import numpy as np
 
@@ -305,15 +305,15 @@ class Parameters:
 
 def in_words(rival: Rival, x: Array, gnss_delay: float) -> str:
     """Return a sentence on a rival that the data fit better, with its parameters x."""
-    gyro, accel = triads(x.size)
+    gyro, accel = biases(x.size)
 
     def listed(vector: Array, digits: str) -> str:
         return ', '.join(format(number, digits) for number in vector.tolist())
 
     better = rival.better.format(
         lever=listed(x[LEVER_ARM], '.2f'), delay=gnss_delay + float(x[DELAY]),
-        gyro=listed(np.degrees(x[gyro][:3]), '.2g'),
-        accel=listed(x[accel][:3], '.2g'))
+        gyro=listed(np.degrees(x[gyro]), '.2g'),
+        accel=listed(x[accel], '.2g'))
     return f'the data fit better with {better}: {rival.advice}'
 
 

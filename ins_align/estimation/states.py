@@ -38,6 +38,12 @@ def triads(m: int) -> tuple[slice, slice]:
     return slice(GYRO, GYRO + size), slice(GYRO + size, GYRO + 2 * size)
 
 
+def biases(m: int) -> tuple[slice, slice]:
+    """Return the places of the biases of gyros and accelerometers among m parameters."""
+    gyro, accel = (slice(triad.start, triad.start + 3) for triad in triads(m))
+    return gyro, accel
+
+
 @dataclass
 class Linearised:
     """
