@@ -44,9 +44,10 @@ GATE = 25.0
 # Log likelihood ratio of a motion that fits a vehicle, to one whose slips are so much larger that
 # a normalised innovation squared of twice this, of two rows, is as likely.
 FITS = 3.0
-# What is less likely than the first is no part of a mixture. Its mean is found when all attitudes
-# are so close to it (rad) that rotations add up like vectors, or it moves no more (rad).
-NEGLIGIBLE, CLOSE, SETTLED = 1e-6, 0.01, 1e-8
+# A rival that is less likely than the best by this (log) is no part of a mixture. Its mean is found
+# when all attitudes are so close to it (rad) that rotations add up like vectors, or it moves no
+# more (rad).
+NEGLIGIBLE, CLOSE, SETTLED = 12.0, 0.01, 1e-8
 # Corrections so small (rad) leave the axes of the errors as they are.
 NO_TURN = 1e-3
 # A rate that is not known turns biases of the accelerometers against the tilt that they look like:
@@ -372,14 +373,14 @@ class Filters:
         if back is not None:
             heading = np.einsum('bi,bi->b', d[:, PHI], self.C[:, 2])
             d = d - heading[:, None] * back[self.place]
-        self._shift(d)
+        half = self._shift(d)[:, lead]
         d = d[lead]
-        turn = np.stack([d[:, PHI], d[:, PHI0]])
-        if not test.second_order and np.abs(turn).max() < NO_TURN:
+        if not test.second_order and max(np.abs(d[:, PHI]).max(),
+                                         np.abs(d[:, PHI0]).max()) < NO_TURN:
             return
         # exp(d)^-1 exp(d + e) ~ exp(G e)
         G = np.zeros((len(d), FIRST, FIRST))
-        G[:, PHI, PHI], G[:, PHI0, PHI0] = exp_so3(-0.5 * turn)
+        G[:, PHI, PHI], G[:, PHI0, PHI0] = half.swapaxes(2, 3)
         G[:, XI, XI] = G[:, RHO, RHO] = G[:, PHI, PHI]
         G[:, XI, PHI], G[:, RHO, PHI] = -0.5 * skew(d[:, XI]), -0.5 * skew(d[:, RHO])
         rows = G @ self.P[:, :FIRST]
@@ -387,14 +388,15 @@ class Filters:
         self.P[:, FIRST:, :FIRST] = rows[:, :, FIRST:].swapaxes(1, 2)
         self.P[:, :FIRST, :FIRST] = rows[:, :, :FIRST] @ G.swapaxes(1, 2)
 
-    def _shift(self, d: Array) -> None:
-        """Correct the means by errors, shape (B, n)."""
-        phi = d[:, PHI]
-        turn, turn0, J = exp_so3(np.stack([phi, d[:, PHI0], 0.5 * phi]))    # J but for phi^2 / 24
-        moved = d[:, 3:9].reshape(-1, 2, 3) @ (self.C @ J).swapaxes(1, 2)
+    def _shift(self, d: Array) -> Array:
+        """Correct the means by errors, shape (B, n); return half of their turns, now and at t0."""
+        half = exp_so3(0.5 * np.stack([d[:, PHI], d[:, PHI0]]))
+        turn, turn0 = half @ half
+        moved = d[:, 3:9].reshape(-1, 2, 3) @ (self.C @ half[0]).swapaxes(1, 2)     # half[0] ~ J
         self.u, self.w = self.u + moved[:, 0], self.w + moved[:, 1]
         self.x = self.x + d[:, FIRST:]
         self.C, self.C0 = self.C @ turn, self.C0 @ turn0
+        return half
 
     # What does not depend on a measurement
 
@@ -484,16 +486,14 @@ class Filters:
         Both are of shape (2, 3, 3), and of all means of the rivals that count.
         """
         level = np.where(self.counts, self.evidence, -np.inf)
-        share = np.exp(level - level.max())
-        share = (share / share.sum())[self.place] * np.exp(self.weight)
-        use: 'Index | slice' = slice(None)
-        blocks = np.stack([self.P[:, PHI0, PHI0], self.P[:, PHI, PHI]])[:, self.place]
-        if share.min() <= NEGLIGIBLE:
-            use = np.flatnonzero(share > NEGLIGIBLE)
-            share, blocks = share[use], blocks[:, use]
+        likely = level > level.max() - NEGLIGIBLE
+        use = np.flatnonzero(likely[self.place])
+        of = use if self.single else self.place[use]
+        share = np.exp(level[of] - level.max() + self.weight[use])
         share = share / share.sum()
         C = np.stack([self.C0[use], self.C[use]])
-        covariance = C @ blocks @ C.swapaxes(-1, -2)
+        covariance = C @ np.stack([self.P[of, PHI0, PHI0],
+                                   self.P[of, PHI, PHI]]) @ C.swapaxes(-1, -2)
         mean = C[:, share.argmax()]
         if len(share) > 1:
             for _ in range(3):
