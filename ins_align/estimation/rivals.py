@@ -66,9 +66,9 @@ class Rival:
     signs : tuple of float
         Of the gyros x, y, z and of the accelerometers.
     gyro : float
-        Factor on the gyros' bias and rate random walk.
+        Factor on the gyros' errors, and on their rate random walk.
     accel : float
-        Factor on the accelerometers' bias.
+        Factor on the accelerometers' errors.
     lever_arm_std, gnss_delay_std, gyro_bias_std, accel_bias_std : float
         At least so much (SI).
     along : int
@@ -97,9 +97,11 @@ class Rival:
 
 
 # An IMU may be so many times worse than configured, in the biases of its gyros and of its
-# accelerometers, at such a log prior; the first level is the configuration.
+# accelerometers, at such a log prior; the first level is the configuration. Scale factors and
+# misalignment are at most so many times larger.
 WORSE_GYROS = (1.0, 0.0), (3.0, -5.5), (10.0, -11.0)
 WORSE_ACCELS = (1.0, 0.0), (3.0, -3.0), (10.0, -5.0)
+WORSE_SCALE = 3.0
 LEVELS = tuple(Rival(gyro=gyro, accel=accel, prior=for_gyro + for_accel)
                for accel, for_accel in WORSE_ACCELS for gyro, for_gyro in WORSE_GYROS)
 SIGNS = (
@@ -293,9 +295,9 @@ class Parameters:
         P = np.diag(std ** 2)
         if matrices:
             P[GYRO + 3:accel, GYRO + 3:accel] = np.diag(
-                gyro_matrix_std(noise.gyro_scale_std).ravel() ** 2)
+                gyro_matrix_std(min(rival.gyro, WORSE_SCALE) * noise.gyro_scale_std).ravel() ** 2)
             # A force f makes b + M f of bias and matrix, which has the sigma of the bias.
-            scale = ACCEL_ERRORS * noise.gyro_scale_std
+            scale = ACCEL_ERRORS * min(rival.accel, WORSE_SCALE) * noise.gyro_scale_std
             told = np.eye(12)
             told[:3, 3:] = -np.kron(np.eye(3), force)
             sigmas = np.repeat([accel_std, scale], [3, 9])
