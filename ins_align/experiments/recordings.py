@@ -20,7 +20,6 @@ compared with the recording's reference.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 import itertools
 from pathlib import Path
@@ -28,12 +27,11 @@ from typing import Any, NamedTuple
 
 from ins_align.experiments import ExperimentError
 from ins_align.experiments.common import (
-    beyond, BINS, Column, count, error_of, JsonDict, median, moment, most, over, parallel, Report,
-    WHICH, while_aligned, worst)
+    beyond, BINS, errors_of, JsonDict, median, moment, most, parallel, Report, rounded,
+    while_aligned, worst)
 from ins_align.experiments.spoilt import SECOND
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.messages import Fix, Velocity
-from ins_align.gnss.motion import series_of, track
 from ins_align.offline import align
 from ins_align.recordings import BagError
 from ins_align.recordings.decode import ImuSamples, Orientations
@@ -120,77 +118,48 @@ def load(path: Path) -> Recording:
         Reference(orientations.known()), np.maximum(stated, [tilt, tilt, heading]))
 
 
-def run_window(task: tuple[Path, float, float, JsonDict, float]) -> JsonDict:
+def run_window(task: tuple[Path, float, float, JsonDict]) -> JsonDict:
     """
     Align a window of a recording.
 
-    The task: its path, from when on and how long, s, parameters of `Config`, the sign of gyro z.
+    The task: its path, from when on and how long, s, parameters of `Config`.
     """
-    path, start_s, duration, config, z_sign = task
+    path, start_s, duration, config = task
     recording = load(path)
     part = recording.part(start_s, duration)
-    part['gyro'] = part['gyro'] * [1.0, 1.0, z_sign]
     result = align(**part, **{**recording.lever_arm, **config})
     epochs = [epoch for epoch in result.epochs if not epoch.dry]
-    stamps, velocities = _velocities(**part)
-    minute = velocities[stamps <= stamps[:1] + round(MOTION_TIME * SECOND)]
     return {'start_s': start_s, 'state': result.status.state.value,
-            'moves': _change(minute) >= MOTION_SPEED,
+            'moves': moves(part['velocities']),
             'covers_minute': min(recording.duration - start_s, duration) >= MOTION_TIME,
-            'at': at_times(recording, epochs, stamps, velocities),
+            'at': at_times(recording, epochs),
             **while_aligned(epochs, int(part['stamps'][0]), recording.attitudes_at,
                             recording.reference_std_deg)}
 
 
-def at_times(recording: Recording, epochs: list[Epoch], stamps: np.ndarray,
-             velocities: Array) -> dict[str, list[JsonDict]]:
-    """Judge the last epochs up to `TIMES`, declared or not, and the course over ground there."""
-    known = [(epoch, C_true) for epoch in epochs if epoch.current is not None
-             for C_true in recording.attitudes_at([epoch.current.stamp_ns]) if C_true is not None]
+def moves(measured: list[Velocity]) -> bool:
+    """Whether horizontal velocities differ by `MOTION_SPEED` in the first minute, to 1 %."""
+    known = [each for each in measured if np.isfinite(each.velocity).all()]
+    minute = [each.velocity[:2] for each in known
+              if each.stamp_ns <= known[0].stamp_ns + round(MOTION_TIME * SECOND)]
+    angles = np.radians(np.arange(0.0, 180.0, 15.0))
+    along = np.reshape(minute, (-1, 2)) @ [np.cos(angles), np.sin(angles)]
+    return len(along) > 0 and bool(np.max(np.ptp(along, axis=0)) >= MOTION_SPEED)
+
+
+def at_times(recording: Recording, epochs: list[Epoch]) -> dict[str, JsonDict]:
+    """Judge the last epochs up to `TIMES`, declared or not, of what lasts as long."""
+    shown = [epoch for epoch in epochs if epoch.current is not None]
+    errors = errors_of([epoch.current for epoch in shown], recording.attitudes_at,
+                       recording.reference_std_deg)
+    known = [moment(epoch.t_s, [error]) for epoch, error in zip(shown, errors)
+             if error is not None]
     found = {}
     for time in TIMES:
-        before = [each for each in known if each[0].t_s <= time + 1e-6] or known[:1]
-        # A window that ends before has nothing to show.
-        for epoch, C_true in before[-1:] if known and known[-1][0].t_s >= time - 1.5 else ():
-            error = error_of(epoch.current, C_true, recording.reference_std_deg)
-            found[f'{time:g}'] = [{**moment(epoch.t_s, [error]), 'course_deg': _course_error(
-                C_true, velocities[np.searchsorted(stamps, epoch.stamp_ns):][:1])}]
+        before = [each for each in known if each['t_s'] <= time + 1e-6]
+        if before and known[-1]['t_s'] >= time - 1.5:
+            found[f'{time:g}'] = before[-1]
     return found
-
-
-def _velocities(stamps: np.ndarray, fixes: list[Fix], velocities: list[Velocity], **imu: Array,
-                ) -> tuple[np.ndarray, Array]:
-    """Horizontal velocities of a window, stamps and ENU; from positions where there are none."""
-    measured = [m for m in velocities if np.isfinite(m.velocity).all()]
-    if measured:
-        return (np.array([m.stamp_ns for m in measured]),
-                np.array([m.velocity[:2] for m in measured]))
-    rows = np.array([[m.stamp_ns - stamps[0], m.latitude_deg, m.longitude_deg, m.altitude_m]
-                     for m in fixes]).reshape(-1, 4)
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    if len(rows) < 3:
-        return np.zeros(0, np.int64), np.zeros((0, 2))
-    time, places = track(series_of(rows[:, 0] / SECOND, rows[:, 1:]))
-    # Over half a second, against the noise of a fix.
-    step = max(1, int(round(0.25 / np.median(np.diff(time)))))
-    moved = (places[2 * step:] - places[:-2 * step])[:, :2]
-    return (stamps[0] + np.rint(time[step:-step] * SECOND).astype(np.int64),
-            moved / (time[2 * step:] - time[:-2 * step])[:, None])
-
-
-def _change(velocities: Any) -> float:
-    """Largest difference of two velocities, shape (N, 2), m/s, to 1 %."""
-    angles = np.radians(np.arange(0.0, 180.0, 15.0))
-    extents = np.asarray(velocities).reshape(-1, 2) @ [np.cos(angles), np.sin(angles)]
-    return float(np.max(np.ptp(extents, axis=0))) if len(extents) else 0.0
-
-
-def _course_error(C_true: Array, v: Array) -> float | None:
-    """Error of a velocity (1, 2) as heading, degrees; None if there is none above 1 m/s."""
-    if not len(v) or np.hypot(*v[0]) < 1.0:
-        return None
-    error = np.arctan2(C_true[1, 0], C_true[0, 0]) - np.arctan2(v[0, 1], v[0, 0])
-    return float(abs(np.degrees((error + np.pi) % (2 * np.pi) - np.pi)))
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
@@ -203,9 +172,9 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     for path in paths:
         name, duration = load(path).name, load(path).duration
         starts = np.arange(0.0, max(duration - SHORTEST, 0.0) + 1e-6, STEP).tolist()
-        tasks |= {f'{name}, {method}': [(path, start, LENGTH, config, 1.0) for start in starts]
+        tasks |= {f'{name}, {method}': [(path, start, LENGTH, config) for start in starts]
                   for method, config in methods_of(path).items()}
-        tasks[f'{name}, bank, all of it'] = [(path, 0.0, duration, {}, 1.0)]
+        tasks[f'{name}, bank, all of it'] = [(path, 0.0, duration, {})]
     groups = dict(zip(tasks, parallel(run_window, list(tasks.values()), jobs, 'windows')))
     every = [each for name, group in groups.items() for each in group if name.endswith('bank')]
     report.text(
@@ -218,18 +187,15 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         f'{MOTION_TIME:g} s.')
     report.table(
         f'At the declaration: median / worst. in {MOTION_TIME:g} s: windows with real motion '
-        f'(by {MOTION_SPEED:g} m/s in that time) that declare. Then all epochs while ALIGNED',
-        [*groups.items(), ('all windows, bank', every)], DECLARED_COLUMNS)
+        f'(velocities change by {MOTION_SPEED:g} m/s in that time) that declare. Then all epochs '
+        'while ALIGNED',
+        [declared_row(name, group)
+         for name, group in (*groups.items(), ('all windows, bank', every))])
     report.table(
-        'Errors in deg: median / worst, declared or not; sigmas: of the heading; course: that '
-        'over ground, above 1 m/s, taken for it. Windows with real motion; all if none has', [
-            (name, [each for each in group if each['moves']] or group)
-            for name, group in groups.items()],
-        [*WHICH, *(
-            (f'{title} at {time:g} s', '', _both(lambda run, time=time: run['at'].get(
-                f'{time:g}', ()), name)) for time in TIMES for title, name in (
-                    ('heading', 'heading_deg'), ('tilt', 'tilt_deg'), ('sigmas', 'heading_sigmas'),
-                    ('course', 'course_deg')))])
+        'Errors in deg: median / worst, declared or not; sigmas: of the heading. Windows with '
+        'real motion; all if none has', [
+            times_row(name, [each for each in group if each['moves']] or group)
+            for name, group in groups.items()])
     return groups
 
 
@@ -240,43 +206,41 @@ def methods_of(path: Path) -> dict[str, JsonDict]:
     return {'note': {**note, 'free_start': False}, 'centred': note, 'bank': {'method': 'bank'}}
 
 
-# Columns of tables, whose rows are a name and the runs of its windows
+# Rows of tables, of a name and the runs of its windows
 
-def _both(moments_of: Callable[[JsonDict], list[JsonDict]], name: str) -> Callable[[Any], Any]:
+def _both(moments: list[JsonDict], name: str) -> str | None:
     """Return the median and the largest value of moments."""
-    def cell(group: tuple[str, list[JsonDict]]) -> str | None:
-        values = [moment[name] for run in group[1] for moment in moments_of(run)
-                  if moment[name] is not None]
-        return f'{np.median(values):.2g} / {np.max(values):.2g}' if values else None
-
-    return cell
+    values = [moment[name] for moment in moments]
+    return f'{np.median(values):.2g} / {np.max(values):.2g}' if values else None
 
 
-def _soon(group: tuple[str, list[JsonDict]]) -> str:
-    """Count the windows with real motion that declare within a minute, and all of them."""
-    times = [[first['t_s'] for first in run['first']] for run in group[1]
-             if run['moves'] and run['covers_minute']]
-    return f'{sum(each[0] <= MOTION_TIME for each in times if each)}/{len(times)}'
+def declared_row(name: str, runs: list[JsonDict]) -> JsonDict:
+    """Return when windows declare, how wrong they are then, and in all epochs while ALIGNED."""
+    first = [run['first'][0] for run in runs if run['first']]
+    moving = [run['first'] for run in runs if run['moves'] and run['covers_minute']]
+    soon = sum(each[0]['t_s'] <= MOTION_TIME for each in moving if each)
+    epochs = sum(run['epochs'] for run in runs)
+    row = {'case': name, 'runs': len(runs), 'declared': len(first),
+           'after, s': rounded(median([each['t_s'] for each in first]), '.0f'),
+           'in 60 s': f'{soon}/{len(moving)}'}
+    for title, key in (('heading, deg', 'heading_deg'), ('heading, sigma', 'heading_sigmas'),
+                       ('tilt, deg', 'tilt_deg'), ('tilt, sigma', 'tilt_sigmas')):
+        row[title] = _both(first, key)
+    row |= {f'> {limit:g}': beyond((worst([each]) for each in first), limit) for limit in BINS}
+    row |= {'at the end': sum(run['state'] == 'ALIGNED' for run in runs), 'epochs': epochs}
+    for place, limit in enumerate(BINS):
+        row[f'> {limit:g} sigma, %'] = (
+            f"{100 * sum(run['beyond'][place] for run in runs) / epochs:.1f}" if epochs else None)
+    sigmas = [run['worst_sigmas'] for run in runs if run['first']]
+    return row | {'worst, sigma': rounded(most(sigmas), '.1f')}
 
 
-def _share(group: tuple[str, list[JsonDict]], place: int) -> float | None:
-    """Return the part of epochs while ALIGNED that are beyond one of `BINS`, %."""
-    epochs = sum(run['epochs'] for run in group[1])
-    return 100 * sum(run['beyond'][place] for run in group[1]) / epochs if epochs else None
-
-
-DECLARED_COLUMNS: list[Column] = [
-    *WHICH, over('declared', 'first', count),
-    over('after, s', 'first', lambda found: median([
-        each[0]['t_s'] for each in found if each]), '.0f'),
-    ('in 60 s', '', _soon),
-    *((title, '', _both(lambda run: run['first'], name)) for title, name in (
-        ('heading, deg', 'heading_deg'), ('heading, sigma', 'heading_sigmas'),
-        ('tilt, deg', 'tilt_deg'), ('tilt, sigma', 'tilt_sigmas'))),
-    *(over(f'> {limit:g}', 'first', lambda found, limit=limit: beyond(map(worst, found), limit))
-      for limit in BINS),
-    over('at the end', 'state', lambda states: states.count('ALIGNED')),
-    over('epochs', 'epochs', sum),
-    *((f'> {limit:g} sigma, %', '.1f', lambda group, place=place: _share(group, place))
-      for place, limit in enumerate(BINS)),
-    over('worst, sigma', 'worst_sigmas', most, '.1f')]
+def times_row(name: str, runs: list[JsonDict]) -> JsonDict:
+    """Return how wrong windows are at each of `TIMES`."""
+    row = {'case': name, 'runs': len(runs)}
+    for time in map('{:g}'.format, TIMES):
+        found = [run['at'][time] for run in runs if time in run['at']]
+        for title, key in (('heading', 'heading_deg'), ('tilt', 'tilt_deg'),
+                           ('sigmas', 'heading_sigmas')):
+            row[f'{title} at {time} s'] = _both(found, key)
+    return row
