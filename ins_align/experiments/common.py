@@ -37,7 +37,7 @@ from ins_align.geometry.rotation import Array, log_so3
 from ins_align.outputs import write_whole
 from ins_align.processes import pool, processors
 from ins_align.report import format_table
-from ins_align.simulation.simulate import give, simulate, Simulation
+from ins_align.simulation.simulate import give, noise_parameters, simulate, Simulation
 import numpy as np
 
 # Of simulated data nothing comes late, but an unknown delay wants IMU samples beyond the stamp.
@@ -160,14 +160,9 @@ def config_for(simulation: Simulation, **changes: Any) -> Config:
 
 def exact_config_for(simulation: Simulation, **changes: Any) -> Config:
     """Return the very model of a simulation; lever arm and delay are known."""
-    noise = simulation.imu_noise
     return config_for(simulation, **{
-        'imu_grade': 'custom', 'angle_random_walk': 60 * math.degrees(noise.angle_random_walk),
-        'velocity_random_walk': 60 * noise.velocity_random_walk,
-        'gyro_bias_std': math.degrees(noise.gyro_bias_std),
-        'accel_bias_std': noise.accel_bias_std, 'gyro_scale_std': noise.gyro_scale_std,
-        'rate_random_walk': 60 * math.degrees(noise.rate_random_walk),
-        'lever_arm_std': 0.0, 'gnss_delay_std': 0.0, **changes})
+        'imu_grade': 'custom', **noise_parameters(simulation.imu_noise), 'lever_arm_std': 0.0,
+        'gnss_delay_std': 0.0, **changes})
 
 
 # How they are judged
@@ -266,14 +261,10 @@ def most(values: Iterable[float]) -> float | None:
     return max(values, default=None)
 
 
-def median(values: Any) -> float | None:
-    """Return the median, None if there is nothing."""
-    return float(np.median(values)) if len(values) else None
-
-
-def rounded(value: float | None, digits: str) -> str | None:
-    """Return a number as text, None if there is none."""
-    return None if value is None else format(value, digits)
+def cell(statistic: Callable[[Any], Any], values: Iterable[float], digits: str) -> str | None:
+    """Return a statistic as text, None of no values."""
+    values = [*values]
+    return format(statistic(values), digits) if values else None
 
 
 def groups_of(runs: list[JsonDict], names: Iterable[str]) -> Groups:
@@ -282,44 +273,45 @@ def groups_of(runs: list[JsonDict], names: Iterable[str]) -> Groups:
             ('all', runs)]
 
 
-def worst(moments: Iterable[JsonDict], *angles: str) -> float | None:
-    """Return the largest error of judged moments in sigmas, of some of `ANGLES` or all."""
-    return most(moment[f'{angle}_sigmas'] for moment in moments for angle in angles or ANGLES)
+def worst(moments: Iterable[JsonDict]) -> float | None:
+    """Return the largest error of judged moments in sigmas, of tilt and heading."""
+    return most(moment[f'{angle}_sigmas'] for moment in moments for angle in ANGLES)
 
 
-def beyond(values: Iterable[float | None], limit: float) -> int:
+def beyond(values: Iterable[Any], limit: float) -> int:
     """Count values above a limit."""
-    return sum(value is not None and value > limit for value in values)
+    return sum(value > limit for value in values)
 
 
 def moment_row(name: str, runs: list[JsonDict], kind: str) -> JsonDict:
     """Return how many runs came to a moment, when, and how wrong each angle was."""
     found = [run[kind][0] for run in runs if run[kind]]
     row = {'case': name, 'runs': len(runs), 'declared': len(found),
-           'median, s': rounded(median([moment['t_s'] for moment in found]), '.1f')}
+           'median, s': cell(np.median, (moment['t_s'] for moment in found), '.1f')}
     for angle in ANGLES:
+        sigmas = [moment[f'{angle}_sigmas'] for moment in found]
         for limit in BINS:
-            wrong = beyond((moment[f'{angle}_sigmas'] for moment in found), limit)
+            wrong = beyond(sigmas, limit)
             row[f'{angle} beyond {limit:g}'] = (
                 f'{wrong} ({100 * wrong / len(found):.1f} %)' if found else None)
-        row[f'worst {angle}, sigma'] = rounded(worst(found, angle), '.1f')
-        row[f'{angle}, deg'] = rounded(most(moment[f'{angle}_deg'] for moment in found), '.2g')
+        row[f'worst {angle}, sigma'] = cell(max, sigmas, '.1f')
+        row[f'{angle}, deg'] = cell(max, (moment[f'{angle}_deg'] for moment in found), '.2g')
     return row
 
 
 def aligned_row(name: str, runs: list[JsonDict]) -> JsonDict:
     """Return how many runs were called aligned, when, for how long, and how wrong they were."""
     declared = [run for run in runs if run['first']]
+    sigmas = [run['worst_sigmas'] for run in declared]
     return {'case': name, 'runs': len(runs), 'declared': len(declared),
             'at the end': sum(run['state'] == State.ALIGNED.value for run in runs),
             'declared beyond 3': beyond((worst(run['first']) for run in declared), BINS[0]),
-            **{f'beyond {limit:g}': beyond((run['worst_sigmas'] for run in declared), limit)
-               for limit in BINS},
-            'beyond 5, s': rounded(most(run['beyond_s'] for run in declared), '.1f'),
-            'worst, sigma': rounded(most(run['worst_sigmas'] for run in declared), '.1f'),
-            'heading, deg': rounded(most(run['worst_heading_deg'] for run in declared), '.2g'),
-            'aligned, %': f'{100 * np.mean([run["aligned_part"] for run in runs]):.0f}',
-            'after, s': rounded(median([run['declared_s'] for run in declared]), '.1f')}
+            **{f'beyond {limit:g}': beyond(sigmas, limit) for limit in BINS},
+            'beyond 5, s': cell(max, (run['beyond_s'] for run in declared), '.1f'),
+            'worst, sigma': cell(max, sigmas, '.1f'),
+            'heading, deg': cell(max, (run['worst_heading_deg'] for run in declared), '.2g'),
+            'aligned, %': cell(np.mean, (100 * run['aligned_part'] for run in runs), '.0f'),
+            'after, s': cell(np.median, (run['declared_s'] for run in declared), '.1f')}
 
 
 class Report:

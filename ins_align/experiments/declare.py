@@ -31,8 +31,8 @@ from typing import Any
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config, PRESETS
 from ins_align.experiments.common import (
-    BINS, Case, combination, config_for, exact_config_for, GRADES, groups_of, JsonDict, moment_row,
-    parallel, Report, rounded, run_case, setup)
+    BINS, Case, cell, combination, config_for, exact_config_for, GRADES, groups_of, JsonDict,
+    moment_row, parallel, Report, run_case, setup)
 from ins_align.experiments.dense import bound
 from ins_align.simulation.simulate import epochs_of, SCENARIOS, simulate
 import numpy as np
@@ -76,8 +76,8 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         f'MEMS for {SILENT_DURATION:g} s without a change of velocity: LEVELLED, and ALIGNED',
         [{**moment_row(name, group, 'levelled'),
           'ALIGNED': sum(bool(each['declared']) for each in group),
-          'least heading sigma, deg': rounded(
-              min(each['least_heading_sigma_deg'] for each in group), '.1f')}
+          'least heading sigma, deg': cell(
+              min, (each['least_heading_sigma_deg'] for each in group), '.1f')}
          for name, group in groups_of(silent, SILENT)[:-1]])
     time_table(report, waits)
     return {'runs': found, 'silent': silent, 'time_to_heading': waits}

@@ -30,8 +30,8 @@ import warnings
 from ins_align.aligner import Aligner, Epoch
 from ins_align.config import Config
 from ins_align.experiments.common import (
-    beyond, BINS, Case, combination, follow, GRADES, groups_of, JsonDict, most, outcome, parallel,
-    prepare, Report, rounded, setup, worst)
+    beyond, BINS, Case, cell, combination, follow, GRADES, groups_of, JsonDict, outcome, parallel,
+    prepare, Report, setup, worst)
 from ins_align.experiments.spoilt import FAULTS, Random, SECOND, SENSORS, Stream
 from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
@@ -195,6 +195,6 @@ def row_of(name: str, runs: list[JsonDict]) -> JsonDict:
         row[title] = sum(bool(run[what]) for run in runs)
     return {**row, 'declared': len(errors),
             **{f'beyond {limit:g}': beyond(errors, limit) for limit in BINS},
-            'worst, sigma': rounded(most(errors), '.1f'),
-            'aligned beyond 5, s': f"{max(run['beyond_s'] for run in runs):.1f}",
-            'held, MB': f"{max(run['held'] for run in runs) * 1e-6:.2f}"}
+            'worst, sigma': cell(max, errors, '.1f'),
+            'aligned beyond 5, s': cell(max, (run['beyond_s'] for run in runs), '.1f'),
+            'held, MB': cell(max, (run['held'] * 1e-6 for run in runs), '.2f')}

@@ -27,8 +27,7 @@ from typing import Any, NamedTuple
 
 from ins_align.experiments import ExperimentError
 from ins_align.experiments.common import (
-    beyond, BINS, errors_of, JsonDict, median, moment, most, parallel, Report, rounded,
-    while_aligned, worst)
+    beyond, BINS, cell, errors_of, JsonDict, moment, parallel, Report, while_aligned, worst)
 from ins_align.experiments.spoilt import SECOND
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.messages import Fix, Velocity
@@ -221,7 +220,7 @@ def declared_row(name: str, runs: list[JsonDict]) -> JsonDict:
     soon = sum(each[0]['t_s'] <= MOTION_TIME for each in moving if each)
     epochs = sum(run['epochs'] for run in runs)
     row = {'case': name, 'runs': len(runs), 'declared': len(first),
-           'after, s': rounded(median([each['t_s'] for each in first]), '.0f'),
+           'after, s': cell(np.median, (each['t_s'] for each in first), '.0f'),
            'in 60 s': f'{soon}/{len(moving)}'}
     for title, key in (('heading, deg', 'heading_deg'), ('heading, sigma', 'heading_sigmas'),
                        ('tilt, deg', 'tilt_deg'), ('tilt, sigma', 'tilt_sigmas')):
@@ -231,8 +230,8 @@ def declared_row(name: str, runs: list[JsonDict]) -> JsonDict:
     for place, limit in enumerate(BINS):
         row[f'> {limit:g} sigma, %'] = (
             f"{100 * sum(run['beyond'][place] for run in runs) / epochs:.1f}" if epochs else None)
-    sigmas = [run['worst_sigmas'] for run in runs if run['first']]
-    return row | {'worst, sigma': rounded(most(sigmas), '.1f')}
+    return row | {'worst, sigma': cell(
+        max, (run['worst_sigmas'] for run in runs if run['first']), '.1f')}
 
 
 def times_row(name: str, runs: list[JsonDict]) -> JsonDict:

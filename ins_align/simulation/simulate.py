@@ -381,26 +381,29 @@ def _gnss_messages(simulation: Simulation, ros: SimpleNamespace) -> _Messages:
                 covariance.ravel()))
 
 
+def noise_parameters(noise: ImuNoise) -> dict[str, float]:
+    """Return the noise of an IMU as parameters of `Config`."""
+    return {'angle_random_walk': 60 * math.degrees(noise.angle_random_walk),
+            'velocity_random_walk': 60 * noise.velocity_random_walk,
+            'gyro_bias_std': math.degrees(noise.gyro_bias_std),
+            'accel_bias_std': float(noise.accel_bias_std),
+            'gyro_scale_std': float(noise.gyro_scale_std),
+            'rate_random_walk': 60 * math.degrees(noise.rate_random_walk)}
+
+
 def _parameter_file(simulation: Simulation) -> str:
     """Return the node's YAML with what is known of the recording."""
-    meta, noise = simulation.meta, simulation.imu_noise
+    meta = simulation.meta
     values = {'lever_arm': simulation.lever_arm.tolist(), 'gnss_delay': float(meta['gnss_delay']),
               'velocity_frame': meta['velocity_frame']}
     lateness = float(meta['gnss_latency']) + LATENESS_MARGIN
     if lateness > Config.gnss_lateness:
         values['gnss_lateness'] = lateness
-    preset = PRESETS.get(meta['imu_grade'])
-    values['imu_grade'] = meta['imu_grade'] if preset else 'custom'
-    if preset is None:
-        values['angle_random_walk'] = math.degrees(noise.angle_random_walk) * 60
-        values['velocity_random_walk'] = noise.velocity_random_walk * 60
-        preset = ImuNoise(0.0, 0.0, 0.0, 0.0)
-    if noise[:4] != preset[:4]:
-        values['gyro_bias_std'] = math.degrees(noise.gyro_bias_std)
-        values['accel_bias_std'] = float(noise.accel_bias_std)
-    if noise.gyro_scale_std > preset.gyro_scale_std and not meta['ideal']:
-        values['gyro_scale_std'] = float(noise.gyro_scale_std)
-    if noise.rate_random_walk > preset.rate_random_walk and not meta['ideal']:
-        values['rate_random_walk'] = math.degrees(noise.rate_random_walk) * 60
+    grade = meta['imu_grade']
+    values['imu_grade'] = grade if grade in PRESETS else 'custom'
+    # Noise that is less than a preset's is covered by it.
+    covered = noise_parameters(PRESETS.get(grade, ImuNoise(0.0, 0.0, 0.0, 0.0)))
+    values |= {name: value for name, value in noise_parameters(simulation.imu_noise).items()
+               if value > covered[name]}
     return ''.join(['ins_align:\n  ros__parameters:\n',
                     *(f'    {name}: {value}\n' for name, value in values.items())])
