@@ -38,12 +38,12 @@ from ins_align.recordings.reader import read, REFERENCE_TOPIC, Request
 from ins_align.results import Epoch, Reference
 import numpy as np
 
-# What is known beside the recording, by the beginning of its name: the lever arm, and how well
-# its reference is known (tilt, heading; degrees), where its stated sigma is too good to be true:
-# the UAV's differs from the on-board filter by 0.6 and 1.4 deg rms, the quadrotor's has a compass.
-KNOWN_LEVER_ARMS = {'car_drive0708': (0.0, 0.05, 0.0)}
-REFERENCE_STD_DEG = {'uav_thor75': (0.6, 1.0), 'car_drive0708': (0.2, 0.5),
-                     'quad_dot08': (1.0, 2.0)}
+# What is known beside the recording, by the beginning of its name: parameters, and how well its
+# reference is known (tilt, heading; degrees), where its stated sigma is too good to be true: the
+# UAV's differs from the on-board filter by 0.6 and 1.4 deg rms, the quadrotor's has a compass.
+KNOWN: dict[str, tuple[JsonDict, float, float]] = {
+    'uav_thor75': ({}, 0.6, 1.0), 'car_drive0708': ({'lever_arm': (0.0, 0.05, 0.0)}, 0.2, 0.5),
+    'quad_dot08': ({}, 1.0, 2.0)}
 MOTION_SPEED, MOTION_TIME = 5.0, 60.0       # m/s of change within so many s is real motion
 STEP, LENGTH = 10.0, 120.0      # s
 SHORTEST = 10.0                 # s of data that a window has to have
@@ -54,6 +54,7 @@ class Recording(NamedTuple):
     """Messages of a recording, and its reference."""
 
     name: str
+    config: JsonDict                            # what is known of it
     imu: ImuSamples
     gnss: list[tuple[int, Fix | Velocity]]      # each with how many IMU samples came before it
     reference: Reference
@@ -63,12 +64,6 @@ class Recording(NamedTuple):
     def duration(self) -> float:
         """Seconds."""
         return float(self.imu.stamps_ns[-1] - self.imu.stamps_ns[0]) * 1e-9
-
-    @property
-    def lever_arm(self) -> JsonDict:
-        """Return the lever arm as a parameter, where it is known."""
-        known = KNOWN_LEVER_ARMS.get(self.name)
-        return {} if known is None else {'lever_arm': known}
 
     def attitudes_at(self, stamps_ns: list[int]) -> list[Array | None]:
         """Return the reference's ``C_nb`` at stamps, None where there is none."""
@@ -110,9 +105,9 @@ def load(path: Path) -> Recording:
     earlier = itertools.accumulate((part.imu.stamps_ns.size for part in parts), initial=0)
     name = path.name.split('.')[0]
     stated = np.degrees(np.sqrt(np.median(np.abs(orientations.covariances[:, [0, 4, 8]]), axis=0)))
-    tilt, heading = REFERENCE_STD_DEG.get(name, (0.0, 0.0))
+    config, tilt, heading = KNOWN.get(name, ({}, 0.0, 0.0))
     return Recording(
-        name, imu, [(start + before, message) for start, part in zip(earlier, parts)
+        name, config, imu, [(start + before, message) for start, part in zip(earlier, parts)
                     for before, message in part.gnss if isinstance(message, (Fix, Velocity))],
         Reference(orientations.known()), np.maximum(stated, [tilt, tilt, heading]))
 
@@ -126,7 +121,7 @@ def run_window(task: tuple[Path, float, float, JsonDict]) -> JsonDict:
     path, start_s, duration, config = task
     recording = load(path)
     part = recording.part(start_s, duration)
-    result = align(**part, **{**recording.lever_arm, **config})
+    result = align(**part, **{**recording.config, **config})
     epochs = [epoch for epoch in result.epochs if not epoch.dry]
     return {'start_s': start_s, 'state': result.status.state.value,
             'moves': moves(part['velocities']),

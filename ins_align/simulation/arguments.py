@@ -136,8 +136,8 @@ class Arguments:
     velocity_std: float = _gnss(0.1, 'white noise of the velocity, 1 sigma, horizontal', 'm/s')
     velocity_std_vertical: float | None = _gnss(
         None, 'and vertical; default: the same', 'm/s')
-    position_std: float = _gnss(2.5, 'white noise of the position, 1 sigma, horizontal', 'm')
-    position_std_vertical: float | None = _gnss(None, 'and vertical; default: twice that', 'm')
+    position_std: float = _gnss(2.5, 'white noise of the position, 1 sigma, horizontal; vertical '
+                                'twice that', 'm')
     velocity_drift_std: float = _gnss(
         0.0, 'errors of the velocity that last (first-order Gauss-Markov), 1 sigma per axis; not '
         'in the stated covariance', 'm/s')

@@ -220,11 +220,10 @@ def _gnss(asked: Arguments, trajectory: Trajectory, C_vb: Array, lever_b: Array,
     scale = 0.0 if asked.ideal else 1.0
     stamps, time = _gnss_epochs(asked)
     lla, velocity = trajectory.antenna(time, C_vb, lever_b)
-    velocity_sigma, position_sigma = (
-        np.array([level, level, ratio * level if vertical is None else vertical])
-        for level, vertical, ratio in (
-            (asked.velocity_std, asked.velocity_std_vertical, 1.0),
-            (asked.position_std, asked.position_std_vertical, 2.0)))
+    vertical = asked.velocity_std_vertical
+    velocity_sigma = np.array([asked.velocity_std, asked.velocity_std,
+                               asked.velocity_std if vertical is None else vertical])
+    position_sigma = asked.position_std * np.array([1.0, 1.0, 2.0])
     outlier = streams[4].random(len(time)) < asked.outlier_rate
     direction = streams[4].standard_normal((len(time), 3))
     direction *= (outlier / np.linalg.norm(direction, axis=1))[:, None]
