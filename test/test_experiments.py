@@ -255,7 +255,7 @@ def test_weak_spots_and_their_files(tmp_path, monkeypatch):
 def test_vehicle_and_the_recorded_car(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(weak_spots, 'VEHICLE_SPOTS', weak_spots.VEHICLE_SPOTS[:1])
     monkeypatch.setattr(weak_spots, 'RECORDING', 'driven')
-    monkeypatch.setattr(weak_spots, 'EVERY', 30.0)
+    monkeypatch.setattr(recordings, 'STEP', 30.0)
     experiments.run('vehicle', tmp_path, folder, runs=1, jobs=1)
     text = (tmp_path / 'vehicle.md').read_text('utf-8')
     assert 'vehicle --out DIR --runs 1 --data DIR' in text and 'started anew every 30 s' in text

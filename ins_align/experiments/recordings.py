@@ -106,10 +106,16 @@ def load(path: Path) -> Recording:
     name = path.name.split('.')[0]
     stated = np.degrees(np.sqrt(np.median(np.abs(orientations.covariances[:, [0, 4, 8]]), axis=0)))
     config, tilt, heading = KNOWN.get(name, ({}, 0.0, 0.0))
+    gnss = [(start + before, message) for start, part in zip(earlier, parts)
+            for before, message in part.gnss if isinstance(message, (Fix, Velocity))]
     return Recording(
-        name, config, imu, [(start + before, message) for start, part in zip(earlier, parts)
-                    for before, message in part.gnss if isinstance(message, (Fix, Velocity))],
-        Reference(orientations.known()), np.maximum(stated, [tilt, tilt, heading]))
+        name, config, imu, gnss, Reference(orientations.known()), np.maximum(stated, [tilt, tilt, heading]))
+
+
+def windows_of(path: Path, config: JsonDict) -> list[Any]:
+    """Return tasks for `run_window`, one every `STEP`."""
+    starts = np.arange(0.0, max(load(path).duration - SHORTEST, 0.0) + 1e-6, STEP)
+    return [(path, start, LENGTH, config) for start in starts.tolist()]
 
 
 def run_window(task: tuple[Path, float, float, JsonDict]) -> JsonDict:
@@ -164,11 +170,10 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         raise ExperimentError(f'no recording with {REFERENCE_TOPIC} in {data}')
     tasks: dict[str, list[Any]] = {}
     for path in paths:
-        name, duration = load(path).name, load(path).duration
-        starts = np.arange(0.0, max(duration - SHORTEST, 0.0) + 1e-6, STEP).tolist()
-        tasks |= {f'{name}, {method}': [(path, start, LENGTH, config) for start in starts]
+        name = load(path).name
+        tasks |= {f'{name}, {method}': windows_of(path, config)
                   for method, config in methods_of(path).items()}
-        tasks[f'{name}, bank, all of it'] = [(path, 0.0, duration, {})]
+        tasks[f'{name}, bank, all of it'] = [(path, 0.0, load(path).duration, {})]
     groups = dict(zip(tasks, parallel(run_window, list(tasks.values()), jobs, 'windows')))
     every = [each for name, group in groups.items() for each in group if name.endswith('bank')]
     report.text(

@@ -37,7 +37,6 @@ import numpy as np
 
 DURATION = 90.0         # s, unless a case says otherwise
 RECORDING = 'car_drive0708'
-WINDOW, EVERY = 120.0, 10.0     # s of the recorded car in `vehicle`, from start to start
 MOUNT_STD_DEG = 1.0
 
 
@@ -358,16 +357,6 @@ def run_spots(spots: Sequence[Spot], runs: int, jobs: int | None) -> Groups:
         for spot in spots], jobs, 'spots')))
 
 
-def run_recorded(path: Path, jobs: int | None) -> Groups:
-    """Align windows of the recorded car with each of `RECORDED`."""
-    from ins_align.experiments.recordings import load, run_window
-
-    starts = np.arange(0.0, max(load(path).duration - EVERY, 1.0), EVERY).tolist()
-    return list(zip(RECORDED, parallel(run_window, [
-        [(path, start, WINDOW, config) for start in starts] for config in RECORDED.values()],
-        jobs, 'recorded car')))
-
-
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``weak-spots``."""
     found = run_spots(SPOTS, runs, jobs)
@@ -386,7 +375,7 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
 
 def run_vehicle(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``vehicle``, and the recorded car if it is there."""
-    from ins_align.experiments.recordings import declared_row
+    from ins_align.experiments.recordings import declared_row, run_window, STEP, windows_of
 
     found = run_spots(VEHICLE_SPOTS, runs, jobs)
     report.text(
@@ -397,9 +386,11 @@ def run_vehicle(report: Report, runs: int, jobs: int | None, data: Path | None) 
         'contradicts `vehicle`.')
     report.table('Simulated', [{**aligned_row(name, group), 'not used': sum(
         'contradicts vehicle' in each['reason'] for each in group)} for name, group in found])
-    recorded = [each for path in sorted(data.glob(f'{RECORDING}*'))[:1]
-                for each in run_recorded(path, jobs)] if data else []
-    if recorded:
-        report.table(f'The recorded car, started anew every {EVERY:g} s',
+    recorded: Groups = []
+    for path in sorted(data.glob(f'{RECORDING}*'))[:1] if data else ():
+        recorded = list(zip(RECORDED, parallel(
+            run_window, [windows_of(path, config) for config in RECORDED.values()], jobs,
+            'recorded car')))
+        report.table(f'The recorded car, started anew every {STEP:g} s',
                      [declared_row(*each) for each in recorded])
     return {'runs': runs, 'cases': dict(found), 'recorded': dict(recorded)}
