@@ -108,8 +108,8 @@ def load(path: Path) -> Recording:
     config, tilt, heading = KNOWN.get(name, ({}, 0.0, 0.0))
     gnss = [(start + before, message) for start, part in zip(earlier, parts)
             for before, message in part.gnss if isinstance(message, (Fix, Velocity))]
-    return Recording(
-        name, config, imu, gnss, Reference(orientations.known()), np.maximum(stated, [tilt, tilt, heading]))
+    return Recording(name, config, imu, gnss, Reference(orientations.known()),
+                     np.maximum(stated, [tilt, tilt, heading]))
 
 
 def windows_of(path: Path, config: JsonDict) -> list[Any]:

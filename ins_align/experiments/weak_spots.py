@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import pairwise, product
+from itertools import product
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,6 +33,7 @@ from ins_align.experiments.common import (
     aligned_row, BINS, Case, Groups, JsonDict, parallel, Report, run_case)
 from ins_align.experiments.spoilt import directions, GNSS, Random, SECOND, Stream
 from ins_align.geometry.rotation import Array
+from ins_align.simulation.simulate import gauss_markov
 import numpy as np
 
 DURATION = 90.0         # s, unless a case says otherwise
@@ -61,15 +62,10 @@ def _states(stream: Stream, random: Random, std: float) -> None:
     stream.velocity['covariance'] = std ** 2 * np.eye(3)
 
 
-def _lasting(stream: Stream, random: Random, time_s: float, std: float = 0.1) -> None:
+def _lasting(stream: Stream, random: Random, time_s: float) -> None:
     """Add to velocities without noise one of first order, and state its size."""
-    _states(stream, random, std)
-    errors = std * random.standard_normal((len(stream.velocity), 3))
-    rho = math.exp(-0.2 / time_s)
-    for before, error in pairwise(errors):
-        error *= math.sqrt(1.0 - rho ** 2)
-        error += rho * before
-    stream.velocity['velocity'] += errors
+    _states(stream, random, 0.1)
+    stream.velocity['velocity'] += gauss_markov(stream.seconds('velocity'), 0.1, time_s, random)
 
 
 def _stepping(stream: Stream, random: Random) -> None:

@@ -235,7 +235,7 @@ def _gnss(asked: Arguments, trajectory: Trajectory, C_vb: Array, lever_b: Array,
         # The last draws of a stream each, so that they change nothing else.
         for error, std, stream in ((offset, asked.position_drift_std, streams[3]),
                                    (velocity, asked.velocity_drift_std, streams[5])):
-            error += _gauss_markov(stamps * 1e-9, std, asked.gnss_correlation, stream)
+            error += gauss_markov(stamps * 1e-9, std, asked.gnss_correlation, stream)
     lla = wrapped(displaced(lla, offset))
     velocity_covariance = np.diag(velocity_sigma ** 2)
     if asked.velocity_frame == 'ned':
@@ -260,7 +260,7 @@ def _gnss_epochs(asked: Arguments) -> tuple[np.ndarray, Array]:
     return stamps[received], seconds[received] - asked.gnss_delay
 
 
-def _gauss_markov(time: Array, std: float, correlation_time: float,
+def gauss_markov(time: Array, std: float, correlation_time: float,
                   random: np.random.Generator) -> Array:
     """First-order Gauss-Markov process (n, 3) of constant variance."""
     decay = np.exp(-np.diff(time, prepend=-np.inf) / correlation_time)
