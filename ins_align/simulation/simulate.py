@@ -257,7 +257,7 @@ def _gnss_epochs(asked: Arguments) -> tuple[np.ndarray, Array]:
 
 
 def gauss_markov(time: Array, std: float, correlation_time: float,
-                  random: np.random.Generator) -> Array:
+                 random: np.random.Generator) -> Array:
     """First-order Gauss-Markov process (n, 3) of constant variance."""
     decay = np.exp(-np.diff(time, prepend=-np.inf) / correlation_time)
     drive = std * np.sqrt(1 - decay ** 2)[:, None] * random.standard_normal((len(time), 3))
