@@ -15,8 +15,7 @@
 
 from ins_align.experiments import dense
 from ins_align.experiments.dense import (
-    ACCEL_BIAS, ACCEL_MATRIX, ATTITUDE, cumulative, DELAY, GYRO_BIAS, GYRO_MATRIX, LEVER_ARM, SIZE,
-    START_VELOCITY)
+    ACCEL_BIAS, ATTITUDE, cumulative, DELAY, GYRO_BIAS, LEVER_ARM, SIZE, START_VELOCITY)
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -29,8 +28,7 @@ def dense_solution(simulation, lever_arm_std=0.0, delay_std=0.0, iterations=6):
     are the attitude's.
     """
     noise = simulation.imu_noise
-    rows = dense.used_rows(len(simulation.gnss_stamps_ns), True, False)
-    columns, prior = dense.prior_of(simulation, noise, False, lever_arm_std, delay_std)
+    columns, prior = dense.prior_of(noise, False, lever_arm_std, delay_std)
     mean = np.zeros(SIZE)
     mean[LEVER_ARM] = simulation.lever_arm
     x = mean.copy()
@@ -40,12 +38,11 @@ def dense_solution(simulation, lever_arm_std=0.0, delay_std=0.0, iterations=6):
     known[:3, :3] = 0.0
     for _ in range(iterations):
         path = measured_path(simulation, C, x)
-        V = dense.noise_covariance(path, noise, dense.bias_walk(path, noise, x[LEVER_ARM]),
-                                   dense.measurement_covariance(simulation, path))
-        H = dense.design_of(path, x[LEVER_ARM])[rows][:, columns]
+        V = dense.noise_covariance(path, noise, simulation.velocity_covariance)
+        H = dense.design_of(path, x[LEVER_ARM])[:, columns]
         y = (measured_velocities(simulation, path) - path.U
-             - dense.lever_terms(path, x[LEVER_ARM])[0] - x[START_VELOCITY])
-        both = dense.whiten(V[np.ix_(rows, rows)], np.column_stack([y.ravel(), H]))
+             - dense.lever_velocity(path, x[LEVER_ARM]) - x[START_VELOCITY])
+        both = dense.whiten(V, np.column_stack([y.ravel(), H]))
         whitened_y, whitened_H = both[:, 0], both[:, 1:]
         P = dense.inverse_of(whitened_H.T @ whitened_H + prior)
         dx = np.zeros(SIZE)
@@ -61,10 +58,8 @@ def measured_path(simulation, C, x):
     epochs_ns = simulation.gnss_stamps_ns - round(x[DELAY][0] * 1e9)
     grid, at = dense.grid_of(simulation.imu_stamps_ns, epochs_ns)
     time = (grid - grid[0]) * 1e-9
-    omega = dense.interpolated(simulation.imu_stamps_ns, simulation.gyro, grid)
-    omega = omega - omega @ x[GYRO_MATRIX].reshape(3, 3).T - x[GYRO_BIAS]
-    f = dense.interpolated(simulation.imu_stamps_ns, simulation.accel, grid)
-    f = f - f @ x[ACCEL_MATRIX].reshape(3, 3).T - x[ACCEL_BIAS]
+    omega = dense.interpolated(simulation.imu_stamps_ns, simulation.gyro, grid) - x[GYRO_BIAS]
+    f = dense.interpolated(simulation.imu_stamps_ns, simulation.accel, grid) - x[ACCEL_BIAS]
     # Angle of each step with the coning term of a rate that is linear in time.
     h = np.diff(time)[:, None]
     steps = Rotation.from_rotvec(h / 2 * (omega[1:] + omega[:-1])

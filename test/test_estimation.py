@@ -264,7 +264,7 @@ def test_errors_are_as_large_as_stated_and_sigmas_those_of_the_bound(options):
             (bank.t0_ns, bank.initial()), (epochs[-1].stamp_ns, bank.current()))]
         first = int(np.searchsorted(s.gnss_stamps_ns, bank.t0_ns))
         since = replace(s, gnss_stamps_ns=s.gnss_stamps_ns[first:])
-        least = bound(since, use_velocity=velocity, use_position=not velocity).covariance[-1]
+        least = bound(since, positions=not velocity).covariance[-1]
         ratios.append(sigmas(bank.initial())[2] / np.sqrt(least[2, 2]))
     low, high = chi2.ppf([0.001, 0.999], 3 * len(seeds))
     assert np.all(low < squares) and np.all(squares < high)

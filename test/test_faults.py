@@ -91,7 +91,7 @@ def test_an_exception_is_seen(short, monkeypatch):
     spoil(monkeypatch, 'update', update)
     result = faults.run_watched(index_of('none'))
     assert 'ZeroDivisionError: seen' in result['exception']
-    row = {title: value(('x', [result])) for title, _, value in faults.COLUMNS}
+    row = faults.row_of('x', [result])
     assert row['runs'] == row['exceptions'] == 1 and row['declared'] == 0
 
 

@@ -18,9 +18,9 @@ from functools import lru_cache
 from alignment import cut_at, integrate
 from ins_align.estimation import formula, moments as q_method
 from ins_align.estimation.track import InertialTrack
-from ins_align.experiments.bound import exact_lever_remainder
-from ins_align.experiments.dense import bound
+from ins_align.experiments.dense import bound, cumulative
 from ins_align.geometry.earth import EARTH_RATE, earth_rate_n
+from ins_align.geometry.rotation import skew
 from ins_align.simulation.simulate import simulate
 import numpy as np
 import pytest
@@ -137,6 +137,16 @@ def turning_flight(duration=1000.0, rate=50.0):
     earth = Rotation.from_rotvec(EARTH_RATE * time[:, None] * [0.0, 0.0, 1.0]).as_matrix()
     C_ib = earth @ C_en @ C_nb
     return time, C_ib[0].T @ C_ib, simulation.truth_gyro, omega_ie_b
+
+
+def exact_lever_remainder(time, C_b0b, omega_eb_b, omega_ie_b0, lever_b):
+    """Difference of the exact form of (9) from the short one, shape (N, 3), m/s."""
+    rate = skew(omega_eb_b)
+    omega_ie_b = C_b0b.transpose(0, 2, 1) @ omega_ie_b0
+    exact = C_b0b @ rate - rate[0] + skew(omega_ie_b0) @ cumulative(time, C_b0b @ rate)
+    omega_ib_b = omega_eb_b + omega_ie_b
+    short = C_b0b @ skew(omega_ib_b) - skew(omega_ib_b[0])
+    return (exact - short) @ lever_b
 
 
 def test_short_form_stays_within_its_bound_for_a_thousand_seconds():

@@ -32,7 +32,7 @@ NAMES = {
     'weak-spots': ('Where it is wrong and sure of itself', 'weak_spots.run', 24),
     'vehicle': ('What a vehicle knows of its motion', 'weak_spots.run_vehicle', 24),
     'recordings': ('Real recordings', 'recordings.run', 0)}
-NEED_DATA, TAKE_DATA = ('recordings',), ('weak-spots', 'vehicle', 'recordings')
+NEED_DATA, TAKE_DATA = ('recordings',), ('vehicle', 'recordings')
 # Only by name: it measures the machine too, and needs ROS. Its runs are minutes of data.
 MEASUREMENTS = {'bench': ('Speed', 'bench.run', 60)}
 

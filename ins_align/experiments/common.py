@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from functools import partial
 import io
 import itertools
 import json
@@ -37,8 +36,8 @@ from ins_align.experiments.spoilt import LOT, Message, SECOND, SENSORS, Stream, 
 from ins_align.geometry.rotation import Array, log_so3
 from ins_align.outputs import write_whole
 from ins_align.processes import pool, processors
-from ins_align.report import format_table, new_figure
-from ins_align.simulation.simulate import give, simulate, Simulation
+from ins_align.report import format_table
+from ins_align.simulation.simulate import give, noise_parameters, simulate, Simulation
 import numpy as np
 
 # Of simulated data nothing comes late, but an unknown delay wants IMU samples beyond the stamp.
@@ -52,7 +51,6 @@ BETWEEN_LOT = 7         # IMU samples given at once where attitudes between epoc
 ANGLES = ('tilt', 'heading')
 
 JsonDict = dict[str, Any]
-Column = tuple[str, str, Callable[[Any], Any]]  # title, format, and the value of a row's object
 Truth = Callable[[list[int]], Sequence[Any]]    # ``C_nb`` at stamps, None where it is not known
 Groups = list[tuple[str, list[JsonDict]]]       # names and their runs
 
@@ -162,14 +160,9 @@ def config_for(simulation: Simulation, **changes: Any) -> Config:
 
 def exact_config_for(simulation: Simulation, **changes: Any) -> Config:
     """Return the very model of a simulation; lever arm and delay are known."""
-    noise = simulation.imu_noise
     return config_for(simulation, **{
-        'imu_grade': 'custom', 'angle_random_walk': 60 * math.degrees(noise.angle_random_walk),
-        'velocity_random_walk': 60 * noise.velocity_random_walk,
-        'gyro_bias_std': math.degrees(noise.gyro_bias_std),
-        'accel_bias_std': noise.accel_bias_std, 'gyro_scale_std': noise.gyro_scale_std,
-        'rate_random_walk': 60 * math.degrees(noise.rate_random_walk),
-        'lever_arm_std': 0.0, 'gnss_delay_std': 0.0, **changes})
+        'imu_grade': 'custom', **noise_parameters(simulation.imu_noise), 'lever_arm_std': 0.0,
+        'gnss_delay_std': 0.0, **changes})
 
 
 # How they are judged
@@ -261,26 +254,17 @@ def errors_of(attitudes: list[Any], true: Truth, std_deg: Any = 0.0) -> list[Any
             for attitude, C_true in zip(attitudes, truths)]
 
 
-# Tables, figures and pages; rows of a table are a name and its runs, or dictionaries
+# Tables and pages; a row of a table is a dictionary of titles and cells
 
 def most(values: Iterable[float]) -> float | None:
     """Return the largest value, None if there is none."""
     return max(values, default=None)
 
 
-def median(values: Any) -> float | None:
-    """Return the median, None if there is nothing."""
-    return float(np.median(values)) if len(values) else None
-
-
-def rms(values: Any, axis: Any = None) -> Any:
-    """Root mean square."""
-    return np.sqrt(np.mean(np.square(values), axis=axis))
-
-
-def field(title: str, name: str, digits: str = '') -> Column:
-    """Return the column of what rows, which are dictionaries, have under a name."""
-    return title, digits, lambda row: row[name]
+def cell(statistic: Callable[[Any], Any], values: Iterable[float], digits: str) -> str | None:
+    """Return a statistic as text, None of no values."""
+    values = [*values]
+    return format(statistic(values), digits) if values else None
 
 
 def groups_of(runs: list[JsonDict], names: Iterable[str]) -> Groups:
@@ -289,63 +273,45 @@ def groups_of(runs: list[JsonDict], names: Iterable[str]) -> Groups:
             ('all', runs)]
 
 
-def worst(moments: Iterable[JsonDict], *angles: str) -> float | None:
-    """Return the largest error of judged moments in sigmas, of some of `ANGLES` or all."""
-    return most(moment[f'{angle}_sigmas'] for moment in moments for angle in angles or ANGLES)
+def worst(moments: Iterable[JsonDict]) -> float | None:
+    """Return the largest error of judged moments in sigmas, of tilt and heading."""
+    return most(moment[f'{angle}_sigmas'] for moment in moments for angle in ANGLES)
 
 
-def beyond(values: Iterable[float | None], limit: float) -> int:
+def beyond(values: Iterable[Any], limit: float) -> int:
     """Count values above a limit."""
-    return sum(value is not None and value > limit for value in values)
+    return sum(value > limit for value in values)
 
 
-def count(values: Iterable[Any]) -> int:
-    """Count what there is."""
-    return sum(map(bool, values))
-
-
-def over(title: str, name: str, value: Callable[[list[Any]], Any], digits: str = '') -> Column:
-    """Return the column of a value of what the runs of a row have under a name, if not None."""
-    return title, digits, lambda group: value(
-        [run[name] for run in group[1] if run[name] is not None])
-
-
-WHICH: list[Column] = [('case', '', lambda group: group[0]),
-                       ('runs', '', lambda group: len(group[1]))]
-
-
-def moment_columns(name: str) -> list[Column]:
+def moment_row(name: str, runs: list[JsonDict], kind: str) -> JsonDict:
     """Return how many runs came to a moment, when, and how wrong each angle was."""
-    def first(title: str, value: Callable[[list[JsonDict]], Any], digits: str = '') -> Column:
-        return over(title, name, lambda found: value([each[0] for each in found if each]), digits)
-
-    def share(found: list[JsonDict], angle: str, limit: float) -> str | None:
-        wrong = beyond((moment[f'{angle}_sigmas'] for moment in found), limit)
-        return f'{wrong} ({100 * wrong / len(found):.1f} %)' if found else None
-
-    columns = [*WHICH, first('declared', len),
-               first('median, s', lambda found: median([each['t_s'] for each in found]), '.1f')]
+    found = [run[kind][0] for run in runs if run[kind]]
+    row = {'case': name, 'runs': len(runs), 'declared': len(found),
+           'median, s': cell(np.median, (moment['t_s'] for moment in found), '.1f')}
     for angle in ANGLES:
-        columns += [first(f'{angle} beyond {limit:g}', partial(share, angle=angle, limit=limit))
-                    for limit in BINS]
-        columns += [first(f'worst {angle}, sigma', lambda found, angle=angle: worst(found, angle),
-                          '.1f'),
-                    first(f'{angle}, deg', lambda found, angle=angle: most(
-                        each[f'{angle}_deg'] for each in found), '.2g')]
-    return columns
+        sigmas = [moment[f'{angle}_sigmas'] for moment in found]
+        for limit in BINS:
+            wrong = beyond(sigmas, limit)
+            row[f'{angle} beyond {limit:g}'] = (
+                f'{wrong} ({100 * wrong / len(found):.1f} %)' if found else None)
+        row[f'worst {angle}, sigma'] = cell(max, sigmas, '.1f')
+        row[f'{angle}, deg'] = cell(max, (moment[f'{angle}_deg'] for moment in found), '.2g')
+    return row
 
 
-ALIGNED_COLUMNS: list[Column] = [
-    *WHICH, over('declared', 'first', count),
-    over('at the end', 'state', lambda states: states.count(State.ALIGNED.value)),
-    over('declared beyond 3', 'first', lambda found: beyond(map(worst, found), BINS[0])),
-    *(over(f'beyond {limit:g}', 'worst_sigmas', partial(beyond, limit=limit)) for limit in BINS),
-    ('beyond 5, s', '.1f', lambda group: most(run['beyond_s'] for run in group[1]
-                                              if run['first'])),
-    over('worst, sigma', 'worst_sigmas', most, '.1f'),
-    over('heading, deg', 'worst_heading_deg', most, '.2g'),
-    over('aligned, %', 'aligned_part', lambda parts: 100 * np.mean(parts), '.0f'),
-    over('after, s', 'declared_s', median, '.1f')]
+def aligned_row(name: str, runs: list[JsonDict]) -> JsonDict:
+    """Return how many runs were called aligned, when, for how long, and how wrong they were."""
+    declared = [run for run in runs if run['first']]
+    sigmas = [run['worst_sigmas'] for run in declared]
+    return {'case': name, 'runs': len(runs), 'declared': len(declared),
+            'at the end': sum(run['state'] == State.ALIGNED.value for run in runs),
+            'declared beyond 3': beyond((worst(run['first']) for run in declared), BINS[0]),
+            **{f'beyond {limit:g}': beyond(sigmas, limit) for limit in BINS},
+            'beyond 5, s': cell(max, (run['beyond_s'] for run in declared), '.1f'),
+            'worst, sigma': cell(max, sigmas, '.1f'),
+            'heading, deg': cell(max, (run['worst_heading_deg'] for run in declared), '.2g'),
+            'aligned, %': cell(np.mean, (100 * run['aligned_part'] for run in runs), '.0f'),
+            'after, s': cell(np.median, (run['declared_s'] for run in declared), '.1f')}
 
 
 class Report:
@@ -363,12 +329,11 @@ class Report:
         self._parts.append(text)
         print(text + '\n')
 
-    def table(self, title: str, objects: Iterable[Any], columns: Sequence[Column]) -> None:
-        """Add a table with a row for each object; a value that is None becomes a dash."""
-        rows = [[None if (value := value_of(each)) is None else format(value, digits)
-                 for _, digits, value_of in columns] for each in objects]
-        table = format_table(rows, [name for name, *_ in columns]) if rows else 'none'
-        self._parts.append(f'{title}\n\n```text\n{table}\n```' if rows else f'{title}: none.')
+    def table(self, title: str, rows: Iterable[JsonDict]) -> None:
+        """Add a table of rows with the same titles; None is a dash."""
+        rows = list(rows)
+        table = format_table([[*row.values()] for row in rows], [*rows[0]])
+        self._parts.append(f'{title}\n\n```text\n{table}\n```')
         print(f'{title}\n\n{table}\n', flush=True)
 
     def figure(self, figure: Any, caption: str) -> None:
@@ -390,27 +355,6 @@ class Report:
                              ('json', json.dumps(_plain(numbers), indent=1))):
             content = f'{text}\n'.encode()
             write_whole(self._out / f'{self._name}.{suffix}', lambda file: file.write(content))
-
-
-def line_figure(width: float, height: float, panels: Sequence[Sequence[JsonDict]],
-                **shared: Any) -> Any:
-    """
-    Draw lines over time in a grid of panels, inches; what they share is for ``subplots``.
-
-    A panel has what ``Axes.set`` takes, and ``lines``: x, y and style of each.
-    """
-    picture = new_figure(width, height)
-    grid = picture.subplots(len(panels), len(panels[0]), squeeze=False, **shared)
-    for axes, panel in zip(grid.ravel(), itertools.chain(*panels)):
-        for x, y, style in panel['lines']:
-            axes.plot(x, y, **style)
-        axes.set(**{name: value for name, value in panel.items() if name != 'lines'})
-        axes.grid(which='both', alpha=0.25)
-    for axes in grid[-1]:
-        axes.set_xlabel('time since t0 (s)')
-    if grid[0, 0].get_legend_handles_labels()[1]:
-        grid[0, 0].legend(fontsize=8)
-    return picture
 
 
 def _plain(value: Any) -> Any:

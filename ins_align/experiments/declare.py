@@ -31,8 +31,8 @@ from typing import Any
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config, PRESETS
 from ins_align.experiments.common import (
-    beyond, BINS, Case, combination, config_for, count, exact_config_for, field, GRADES, groups_of,
-    JsonDict, moment_columns, over, parallel, Report, run_case, setup, worst)
+    BINS, Case, cell, combination, config_for, exact_config_for, GRADES, groups_of, JsonDict,
+    moment_row, parallel, Report, run_case, setup)
 from ins_align.experiments.dense import bound
 from ins_align.simulation.simulate import epochs_of, SCENARIOS, simulate
 import numpy as np
@@ -65,23 +65,20 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         'IMU and faults, none of which is configured, with random heading, latitude, mount and '
         f'lever arm. {ERRORS}')
     groups = groups_of(found, FAULTS)
-    report.table('When ALIGNED was declared first', groups, moment_columns('declared'))
-    report.table('At the end, where still ALIGNED', groups, moment_columns('final'))
-    report.table('When LEVELLED (or ALIGNED at once) was declared first', groups,
-                 moment_columns('levelled'))
-    upset = [each for each in found if beyond([worst(each['levelled'], 'tilt')], BINS[1])]
-    report.text(
-        'LEVELLED claims the tilt alone. At rest and in steady straight motion an IMU with its z '
-        'axis or all accelerations reversed cannot be told from one that is mounted upside down: '
-        'it is levelled wrongly until the vehicle turns or changes speed. Of the '
-        f'{len(upset)} with a tilt beyond {BINS[1]:g} sigma, '
-        f"{sum(each['state'] == State.LEVELLED.value for each in upset)} are still LEVELLED at "
-        f"the end, and {count(each['declared'] for each in upset)} were ever ALIGNED.")
+    for title, kind in (
+            ('When ALIGNED was declared first', 'declared'),
+            ('At the end, where still ALIGNED', 'final'),
+            ('When LEVELLED (or ALIGNED at once) was declared first. At rest and in steady '
+             'straight motion an IMU with its z axis or all accelerations reversed cannot be told '
+             'from one that is mounted upside down', 'levelled')):
+        report.table(title, [moment_row(*group, kind) for group in groups])
     report.table(
         f'MEMS for {SILENT_DURATION:g} s without a change of velocity: LEVELLED, and ALIGNED',
-        groups_of(silent, SILENT)[:-1], [
-            *moment_columns('levelled')[:7], over('ALIGNED', 'declared', count),
-            over('least heading sigma, deg', 'least_heading_sigma_deg', min, '.1f')])
+        [{**moment_row(name, group, 'levelled'),
+          'ALIGNED': sum(bool(each['declared']) for each in group),
+          'least heading sigma, deg': cell(
+              min, (each['least_heading_sigma_deg'] for each in group), '.1f')}
+         for name, group in groups_of(silent, SILENT)[:-1]])
     time_table(report, waits)
     return {'runs': found, 'silent': silent, 'time_to_heading': waits}
 
@@ -189,22 +186,18 @@ def time_table(report: Report, waits: list[JsonDict]) -> None:
     """Print the waits."""
     default = Config()
     met = [wait['ratio'] <= WAIT_LIMIT for wait in waits if wait['exact']]
-    report.text(f'Time to a declared heading: the median is within {WAIT_LIMIT:g} times the '
-                f'bound in {sum(met)} of {len(met)} cases with all known in which the bound '
-                f'crosses {THRESHOLD_DEG:g} deg within {HORIZON:g} s (target: all). The bound '
-                'knows that the axes of the IMU are right; the aligner waits for motion that '
-                'shows it.')
     report.table(
         f'Time to a declared heading of {THRESHOLD_DEG:g} deg: median, and when the Cramer-Rao '
-        'bound crosses it. All known: noise, lever arm and delay, with a threshold of '
-        f'{THRESHOLD_DEG:g} deg for the tilt too; else the defaults, lever arm '
+        f'bound crosses it within {HORIZON:g} s. All known: noise, lever arm and delay, with a '
+        'threshold as large for the tilt; else the defaults, lever arm '
         f'({default.lever_arm_std:g} m) and delay ({default.gnss_delay_std:g} s) unknown to the '
-        f'bound too. A declaration has to hold for {default.hold_time:g} s before it is made',
-        waits, [field('scenario', 'scenario'), field('IMU', 'imu'), field('all known', 'exact'),
-                field('bound, s', 'bound_s', '.1f'), field('median, s', 'median_s', '.1f'),
-                field('ratio', 'ratio', '.2f'),
-                ('runs', '', lambda wait: len(wait['declared_s'])),
-                ('not declared', '', lambda wait: wait['declared_s'].count(None))])
+        f'bound too. A declaration has to hold for {default.hold_time:g} s before it is made, and '
+        'the aligner waits for motion that shows that the axes of the IMU are right. With all '
+        f'known, {sum(met)} of {len(met)} ratios are at most {WAIT_LIMIT:g} (target: all)',
+        [{'scenario': wait['scenario'], 'IMU': wait['imu'], 'all known': wait['exact'],
+          'bound, s': f"{wait['bound_s']:.1f}", 'median, s': f"{wait['median_s']:.1f}",
+          'ratio': f"{wait['ratio']:.2f}", 'runs': len(wait['declared_s']),
+          'not declared': wait['declared_s'].count(None)} for wait in waits])
 
 
 # declare-worse: IMUs worse than configured
@@ -246,9 +239,9 @@ def run_worse(report: Report, runs: int, jobs: int | None, data: Path | None) ->
     pairs = [(f'{name}, in pairs', [each for each in found if PAIR in each['name']
                                     and name in each['name'].split(PAIR)]) for name in WORSE]
     groups = [*alone[:-1], *pairs, alone[-1]]
-    report.table('First declared LEVELLED (or ALIGNED at once)', groups,
-                 moment_columns('levelled'))
-    report.table('First declared ALIGNED', groups, moment_columns('declared'))
+    for title, kind in (('First declared LEVELLED (or ALIGNED at once)', 'levelled'),
+                        ('First declared ALIGNED', 'declared')):
+        report.table(title, [moment_row(*group, kind) for group in groups])
     return {'runs': found}
 
 

@@ -20,7 +20,7 @@ the random-walk errors of all epochs is one dense matrix. On the true motion its
 information is the Cramer-Rao bound; the tests solve the measured data with the same pieces. Cost
 grows with the cube of the number of epochs: 500 take about a second.
 
-Velocity rows come before position rows.
+An IMU has white noise and constant biases here, no scale factor errors and no rate random walk.
 """
 
 from __future__ import annotations
@@ -28,20 +28,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from ins_align.config import ImuNoise, STANDARD_GRAVITY
-from ins_align.estimation.rivals import ACCEL_ERRORS, gyro_matrix_std
+from ins_align.config import ImuNoise
 from ins_align.geometry.rotation import Array, Index, skew
 from ins_align.gnss.messages import ENU_FROM_NED
 from ins_align.simulation.simulate import Simulation
 import numpy as np
 
 # Places of the unknowns.
-ATTITUDE, GYRO_BIAS, GYRO_MATRIX = slice(0, 3), slice(3, 6), slice(6, 15)
-ACCEL_BIAS, ACCEL_MATRIX = slice(15, 18), slice(18, 27)
-START_VELOCITY, START_POSITION = slice(27, 30), slice(30, 33)
-LEVER_ARM, DELAY = slice(33, 36), slice(36, 37)
-SIZE = 37
-GYRO, ACCEL = slice(GYRO_BIAS.start, GYRO_MATRIX.stop), slice(ACCEL_BIAS.start, ACCEL_MATRIX.stop)
+ATTITUDE, GYRO_BIAS, ACCEL_BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
+START_VELOCITY, START_POSITION = slice(9, 12), slice(12, 15)
+LEVER_ARM, DELAY = slice(15, 18), slice(18, 19)
+SIZE = 19
 # Nothing more than "somewhere on the circle" is known of an angle (rad): keeps the information
 # regular where the motion shows no heading.
 _ATTITUDE_STD = math.pi / math.sqrt(3)
@@ -60,23 +57,24 @@ class Bound:
         return self.covariance[np.searchsorted(self.time, seconds + 1e-6) - 1]
 
 
-def bound(simulation: Simulation, *, use_velocity: bool = True, use_position: bool = False,
-          lever_arm_std: float = 0.0, delay_std: float = 0.0) -> Bound:
+def bound(simulation: Simulation, positions: bool = False, lever_arm_std: float = 0.0,
+          delay_std: float = 0.0) -> Bound:
     """
     Cramer-Rao bound on the true motion of a simulation: its noise is not used, what it states is.
 
-    Lever arm (m per axis) and delay (s) are unknowns too where their sigma is above 0.
+    GNSS measures velocities, or positions instead. Lever arm (m per axis) and delay (s) are
+    unknowns too where their sigma is above 0.
     """
     noise = simulation.imu_noise
+    if noise.gyro_scale_std > 0 or noise.rate_random_walk > 0:
+        raise ValueError('the bound knows only noise and constant biases of an IMU')
     # Measurements may be older than their stamps.
     epochs = simulation.gnss_stamps_ns - round(simulation.meta['gnss_delay'] * 1e9)
     path = _true_path(simulation, epochs)
-    H = design_of(path, simulation.lever_arm)
-    walk = bias_walk(path, noise, simulation.lever_arm)
-    V = noise_covariance(path, noise, walk, measurement_covariance(simulation, path))
-    rows = used_rows(len(epochs), use_velocity, use_position)
-    columns, prior = prior_of(simulation, noise, use_position, lever_arm_std, delay_std)
-    whitened = whiten(V[np.ix_(rows, rows)], H[rows][:, columns])
+    columns, prior = prior_of(noise, positions, lever_arm_std, delay_std)
+    stated = simulation.position_covariance if positions else simulation.velocity_covariance
+    whitened = whiten(noise_covariance(path, noise, stated, positions),
+                      design_of(path, simulation.lever_arm, positions)[:, columns])
     each = whitened.reshape(len(epochs), -1, len(columns))
     information = np.cumsum(each.transpose(0, 2, 1) @ each, axis=0) + prior
     return Bound(path.time, np.array([inverse_of(matrix)[:3, :3] for matrix in information]))
@@ -87,9 +85,8 @@ class Path:
     """
     Integrals over the motion at K epochs, in n0 axes.
 
-    U and P are the first and second integral of the specific force; Theta, shape (K, 3, 12), the
-    integral of C and of C times each rate: what bias and matrix of the gyros turn. H, shape
-    (K, 2, 3, 33), derives velocity and position of the IMU by all unknowns but lever arm and
+    U and P are the first and second integral of the specific force, Theta that of C. H_v and H_p,
+    shape (K, 3, 15), derive velocity and position of the IMU by all unknowns but lever arm and
     delay; M holds the integrals of z z^T, z = (1, U, t U - P).
     """
 
@@ -98,7 +95,8 @@ class Path:
     U: Array
     P: Array
     Theta: Array
-    H: Array
+    H_v: Array
+    H_p: Array
     M: Array
     omega: Array          # of the body to inertial space, body axes
     omega_dot: Array
@@ -120,25 +118,18 @@ def path_along(time: Array, C: Array, omega: Array, f: Array, at: Array, C_n0n: 
     force = np.einsum('nij,nj->ni', C, f)
     U = cumulative(time, force)
     P = cumulative(time, U)
-    S = cumulative(time, C)
-    Theta, Sigma = (np.concatenate([S, cumulative(time, _by_row(C, measured))], axis=-1)
-                    for measured in (omega, f))
+    Theta = cumulative(time, C)
     unit = np.broadcast_to(np.eye(3), C.shape)
-    H_v = np.concatenate([-skew(U), cumulative(time, skew(force) @ Theta), -Sigma, unit, 0 * C],
+    H_v = np.concatenate([-skew(U), cumulative(time, skew(force) @ Theta), -Theta, unit, 0 * C],
                          axis=-1)
     H_p = cumulative(time, H_v)
     H_p[..., START_POSITION] = unit
     z = np.hstack([np.ones((len(time), 1)), U, time[:, None] * U - P])
     M = cumulative(time, z[:, :, None] * z[:, None, :])
     gravity = np.einsum('nij,nj->ni', C_n0n, g_n)
-    return Path(time[at], C[at], U[at], P[at], Theta[at], np.stack([H_v[at], H_p[at]], axis=1),
-                M[at], omega[at], _rate_of_change(time, omega)[at], force[at] + gravity,
+    return Path(time[at], C[at], U[at], P[at], Theta[at], H_v[at], H_p[at], M[at], omega[at],
+                _rate_of_change(time, omega)[at], force[at] + gravity,
                 np.einsum('nij,nj->ni', C_n0n, v_n), C_n0n)
-
-
-def _by_row(matrices: Array, vectors: Array) -> Array:
-    """Derive ``matrix @ X @ vector`` by X row by row, shape (K, 3, 9)."""
-    return np.einsum('nij,nk->nijk', matrices, vectors).reshape(-1, 3, 9)
 
 
 def _rate_of_change(time: Array, omega: Array) -> Array:
@@ -204,85 +195,58 @@ def gravity_n(lla: Array) -> Array:
     return np.stack([0 * lla[:, 0], 0 * lla[:, 0], -gravity(lla[:, 0], lla[:, 2])], axis=-1)
 
 
-def lever_terms(path: Path, lever_b: Array) -> tuple[Array, Array]:
-    """Velocity and position of the antenna with respect to the IMU, in n0."""
-    return (np.einsum('nij,nj->ni', path.C, np.cross(path.omega, lever_b)), path.C @ lever_b)
+def lever_velocity(path: Path, lever_b: Array) -> Array:
+    """Velocity of the antenna with respect to the IMU, in n0."""
+    return np.einsum('nij,nj->ni', path.C, np.cross(path.omega, lever_b))
 
 
-def design_of(path: Path, lever_b: Array) -> Array:
-    """Derive the measurements by the unknowns, shape (6 K, 37)."""
-    H = np.concatenate([path.H, np.zeros((len(path.time), 2, 3, SIZE - path.H.shape[-1]))],
-                       axis=-1)
-    velocity, position = H[:, 0], H[:, 1]
-    for rows, lever in zip((velocity, position), lever_terms(path, lever_b)):
-        rows[..., ATTITUDE] -= skew(lever)
-        rows[..., GYRO] += skew(lever) @ path.Theta
-    C_lever = path.C @ skew(lever_b)
-    velocity[..., GYRO_BIAS] += C_lever
-    velocity[..., GYRO_MATRIX] += _by_row(C_lever, path.omega)
-    velocity[..., LEVER_ARM] = path.C @ skew(path.omega)
-    position[..., LEVER_ARM] = path.C
-    swung = np.cross(path.omega_dot, lever_b) + np.cross(path.omega, np.cross(path.omega, lever_b))
-    velocity[..., DELAY] = -(path.acceleration + np.einsum('nij,nj->ni', path.C, swung))[..., None]
-    position[..., DELAY] = -path.v_ground[..., None]
+def design_of(path: Path, lever_b: Array, positions: bool = False) -> Array:
+    """Derive the measurements by the unknowns, shape (3 K, 19)."""
+    H = np.zeros((len(path.time), 3, SIZE))
+    if positions:
+        H[..., :LEVER_ARM.start] = path.H_p
+        lever = path.C @ lever_b
+        H[..., LEVER_ARM] = path.C
+        H[..., DELAY] = -path.v_ground[..., None]
+    else:
+        H[..., :LEVER_ARM.start] = path.H_v
+        lever = lever_velocity(path, lever_b)
+        H[..., GYRO_BIAS] += path.C @ skew(lever_b)
+        H[..., LEVER_ARM] = path.C @ skew(path.omega)
+        swung = (np.cross(path.omega_dot, lever_b)
+                 + np.cross(path.omega, np.cross(path.omega, lever_b)))
+        H[..., DELAY] = -(path.acceleration + np.einsum('nij,nj->ni', path.C, swung))[..., None]
+    H[..., ATTITUDE] -= skew(lever)
+    H[..., GYRO_BIAS] += skew(lever) @ path.Theta
     return H.reshape(-1, SIZE)
 
 
-def measurement_covariance(simulation: Simulation, path: Path) -> Array:
-    """Covariances of velocity and position in n0, shape (K, 2, 3, 3)."""
-    stated = np.stack([simulation.velocity_covariance, simulation.position_covariance])
-    turn = path.C_n0n[:, None]
-    return turn @ stated @ turn.swapaxes(-1, -2)
-
-
-def bias_walk(path: Path, noise: ImuNoise, lever_b: Array) -> Array:
-    """Derive the measurements by the 3 J steps of the gyros' biases in sigmas, (6 K, 3 J)."""
-    lever_v, lever_p = lever_terms(path, lever_b)
-    C_lever = path.C @ skew(lever_b)
-    Theta, Gamma, int_Gamma = path.Theta[..., :3], *np.moveaxis(path.H[..., GYRO_BIAS], 1, 0)
-    n = len(path.time)
-    steps = n if noise.rate_random_walk > 0 else 0
-    to_rows = np.zeros((n, 2, 3, steps, 3))
-    for j in range(1, steps):
-        std = noise.rate_random_walk * math.sqrt(path.time[j] - path.time[j - 1])
-        t = path.time[j:, None] - path.time[j]
-        turned = Theta[j:] - Theta[j]
-        to_rows[j:, 0, :, j] = std * (
-            Gamma[j:] - Gamma[j] - skew(path.U[j:] - path.U[j]) @ Theta[j]
-            + skew(lever_v[j:]) @ turned + C_lever[j:])
-        to_rows[j:, 1, :, j] = std * (
-            int_Gamma[j:] - int_Gamma[j] - t[..., None] * Gamma[j]
-            - skew(path.P[j:] - path.P[j] - t * path.U[j]) @ Theta[j] + skew(lever_p[j:]) @ turned)
-    return to_rows.reshape(6 * n, 3 * steps)
-
-
-def noise_covariance(path: Path, noise: ImuNoise, walk: Array, measurement: Array) -> Array:
+def noise_covariance(path: Path, noise: ImuNoise, stated: Array,
+                     positions: bool = False) -> Array:
     """
-    Covariance of all rows: random walks of the IMU and GNSS noise, shape (6 K, 6 K).
+    Covariance of all rows: random walks of the IMU and stated GNSS noise, shape (3 K, 3 K).
 
     An angle error at s turns a row by ``-[x x]`` with ``x = B z(s)``. Velocity: ``x = U(t) -
     U(s)``; position: ``x = P(t) - P(s) - (t - s) U(s)``. The lever arm, centimetres of motion per
     rad, is left out of the noise.
     """
-    n = 2 * len(path.time)
-    B = np.zeros((len(path.time), 2, 3, 7))
-    B[:, 0, :, 0], B[:, 1, :, 0] = path.U, path.P
-    B[:, 0, :, 1:4] = -np.eye(3)
-    B[:, 1, :, 1:4] = -path.time[:, None, None] * np.eye(3)
-    B[:, 1, :, 4:] = np.eye(3)
-    B, M = B.reshape(-1, 3, 7), np.repeat(path.M, 2, axis=0)
+    n = len(path.time)
+    early, late = path.time[:, None], path.time[None]
+    B = np.zeros((n, 3, 7))
+    # An accelerometer error at s is worth 1 in a velocity, t - s in a position.
+    if positions:
+        B[..., 0] = path.P
+        B[..., 1:4] = -path.time[:, None, None] * np.eye(3)
+        B[..., 4:] = np.eye(3)
+        pushed = early ** 2 * late / 2 - early ** 3 / 6
+    else:
+        B[..., 0] = path.U
+        B[..., 1:4] = -np.eye(3)
+        pushed = early
     # X[i, a, j, b]: integral of x_i[a] x_j[b] up to the earlier one, i <= j.
-    X = ((B @ M).reshape(3 * n, 7) @ B.reshape(3 * n, 7).T).reshape(n, 3, n, 3)
+    X = ((B @ path.M).reshape(3 * n, 7) @ B.reshape(3 * n, 7).T).reshape(n, 3, n, 3)
     trace = np.einsum('iaja->ij', X)
     V = -noise.angle_random_walk ** 2 * X.transpose(0, 3, 2, 1)
-    t = np.repeat(path.time, 2)
-    early, late = t[:, None], t[None]
-    # An accelerometer error at s is worth 1 in a velocity, t - s in a position.
-    position = np.tile([False, True], len(path.time))
-    pushed = np.where(
-        position[:, None],
-        np.where(position, early ** 2 * late / 2 - early ** 3 / 6, early ** 2 / 2),
-        np.where(position, early * late - early ** 2 / 2, early))
     diagonal = (noise.angle_random_walk ** 2 * trace
                 + noise.velocity_random_walk ** 2 * pushed)
     for axis in range(3):
@@ -290,38 +254,22 @@ def noise_covariance(path: Path, noise: ImuNoise, walk: Array, measurement: Arra
     V = V.reshape(3 * n, 3 * n)
     upper = np.kron(np.triu(np.ones((n, n))), np.ones((3, 3)))
     V = np.where(upper > 0, V, V.T)
-    blocks = V.reshape(n, 3, n, 3)
-    blocks[range(n), :, range(n), :] += measurement.reshape(-1, 3, 3)
-    return V + walk @ walk.T
+    V.reshape(n, 3, n, 3)[range(n), :, range(n), :] += (
+        path.C_n0n @ stated @ path.C_n0n.swapaxes(-1, -2))
+    return V
 
 
-def used_rows(epochs: int, use_velocity: bool, use_position: bool) -> Index:
-    """Numbers of the rows that are used, in the order of time."""
-    return np.flatnonzero(np.tile(np.repeat([use_velocity, use_position], 3), epochs))
-
-
-def prior_of(simulation: Simulation, noise: ImuNoise, use_position: bool, lever_arm_std: float,
+def prior_of(noise: ImuNoise, positions: bool, lever_arm_std: float,
              delay_std: float) -> tuple[Index, Array]:
     """Numbers of the unknowns that are estimated, and the prior's information about them."""
     std = np.zeros(SIZE)
     std[ATTITUDE] = _ATTITUDE_STD
+    std[GYRO_BIAS], std[ACCEL_BIAS] = noise.gyro_bias_std, noise.accel_bias_std
     std[START_VELOCITY] = math.inf
-    std[START_POSITION] = math.inf if use_position else 0.0
-    std[GYRO_BIAS] = noise.gyro_bias_std
-    std[GYRO_MATRIX] = gyro_matrix_std(noise.gyro_scale_std).ravel()
-    std[ACCEL_BIAS] = noise.accel_bias_std
-    std[ACCEL_MATRIX] = ACCEL_ERRORS * noise.gyro_scale_std
+    std[START_POSITION] = math.inf if positions else 0.0
     std[LEVER_ARM], std[DELAY] = lever_arm_std, delay_std
     columns = np.flatnonzero(std)
-    # The biases of the accelerometers are what they are said to be under the force at t0, turned
-    # into one of gravity's size.
-    force = interpolated(simulation.imu_stamps_ns, simulation.accel,
-                         simulation.gnss_stamps_ns[:1])
-    force *= STANDARD_GRAVITY / np.linalg.norm(force)
-    told = np.eye(SIZE)
-    told[ACCEL_BIAS, ACCEL_MATRIX] = _by_row(np.eye(3)[None], force)[0]
-    told = told[np.ix_(columns, columns)]
-    return columns, told.T @ np.diag(std[columns] ** -2.0) @ told
+    return columns, np.diag(std[columns] ** -2.0)
 
 
 def whiten(V: Array, columns: Array) -> Array:

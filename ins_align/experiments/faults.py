@@ -30,8 +30,8 @@ import warnings
 from ins_align.aligner import Aligner, Epoch
 from ins_align.config import Config
 from ins_align.experiments.common import (
-    beyond, BINS, Case, Column, combination, count, follow, GRADES, groups_of, JsonDict, most,
-    outcome, over, parallel, prepare, Report, setup, WHICH, worst)
+    beyond, BINS, Case, cell, combination, follow, GRADES, groups_of, JsonDict, outcome, parallel,
+    prepare, Report, setup, worst)
 from ins_align.experiments.spoilt import FAULTS, Random, SECOND, SENSORS, Stream
 from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
@@ -47,7 +47,7 @@ REFUSED = {'fix': ('no_fix', 'nan', 'late', 'ahead', 'duplicate'),
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
-    """Run the campaign and write its tables."""
+    """Run the campaign and write its table."""
     [found] = parallel(run_watched, [range(runs)], jobs, 'faults')
     report.text(
         f'{runs} runs of {DURATION:g} s over {len(FAULTS)} faults, all scenarios '
@@ -55,25 +55,17 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         'lever arm, velocity message and frame. The fault is in the messages; nothing is told to '
         'the aligner but what the name of the fault says. Samples come one by one or many at a '
         'time.')
-    broke = {what: count(each[what] for each in found)
-             for what in ('exception', 'non_finite', 'miscounted', 'warnings')}
     report.text(
-        '{exception} runs ended with an exception, {non_finite} gave a number that is not finite '
-        'or an attitude that is no rotation, in {miscounted} the counters do not fit what was '
-        'sent, {warnings} made numpy warn (target: none). '.format(**broke)
-        + f"An aligner never held more than {max(each['held'] for each in found) * 1e-6:.2f} MB "
-        f'(pickled, every {WEIGH_EVERY} updates; limit {MAX_HELD * 1e-6:g}).')
-    declared, share, gross = (beyond(map(error, found), limit) for limit in (-math.inf, *BINS))
-    report.text(
-        f'{declared} runs were declared ALIGNED at some time, {share} of them '
-        f'({share / max(declared, 1):.1%}) beyond {BINS[0]:g} sigma, '
-        f'{gross} beyond {BINS[1]:g} (target: at most 1 % and none). The error is '
-        'the largest, in stated sigmas, of tilt and heading, of the attitude at t0 and the '
-        'current one, at each declaration and at the end where that is still ALIGNED. The time '
-        f'is that during which, within a run, the current attitude was beyond {BINS[1]:g} sigma '
-        'and still called aligned, the longest.')
-    report.table('What became of it, by fault', [
-        group for group in groups_of(found, FAULTS) if group[1]], COLUMNS)
+        'Targets: no exception, no number that is not finite and no attitude that is no rotation, '
+        'no counter that does not fit what was sent, no warning of numpy, never more than '
+        f'{MAX_HELD * 1e-6:g} MB held by an aligner (pickled, every {WEIGH_EVERY} updates); of '
+        f'the runs that are declared ALIGNED at some time at most 1 % beyond {BINS[0]:g} sigma '
+        f'and none beyond {BINS[1]:g}. The error is the largest, in stated sigmas, of tilt and '
+        'heading, of the attitude at t0 and the current one, at each declaration and at the end '
+        'where that is still ALIGNED. The time is that during which, within a run, the current '
+        f'attitude was beyond {BINS[1]:g} sigma and still called aligned, the longest.')
+    report.table('What became of it, by fault',
+                 [row_of(*group) for group in groups_of(found, FAULTS) if group[1]])
     return {'runs': found}
 
 
@@ -194,13 +186,15 @@ def error(run: JsonDict) -> float | None:
     return worst([*run['declared'], *run['final']])
 
 
-COLUMNS: list[Column] = [
-    *WHICH, over('exceptions', 'exception', count), over('non-finite', 'non_finite', count),
-    over('miscounted', 'miscounted', count),
-    *((title, '', lambda group, limit=limit: beyond(map(error, group[1]), limit))
-      for title, limit in (('declared', -math.inf),
-                           *((f'beyond {limit:g}', limit) for limit in BINS))),
-    ('worst, sigma', '.1f', lambda group: most(
-        sigmas for sigmas in map(error, group[1]) if sigmas is not None)),
-    over('aligned beyond 5, s', 'beyond_s', most, '.1f'),
-    over('held, MB', 'held', lambda values: np.median(values) * 1e-6, '.2f')]
+def row_of(name: str, runs: list[JsonDict]) -> JsonDict:
+    """Return what became of the runs of a fault."""
+    errors = [each for each in map(error, runs) if each is not None]
+    row = {'case': name, 'runs': len(runs)}
+    for title, what in (('exceptions', 'exception'), ('non-finite', 'non_finite'),
+                        ('miscounted', 'miscounted'), ('warnings', 'warnings')):
+        row[title] = sum(bool(run[what]) for run in runs)
+    return {**row, 'declared': len(errors),
+            **{f'beyond {limit:g}': beyond(errors, limit) for limit in BINS},
+            'worst, sigma': cell(max, errors, '.1f'),
+            'aligned beyond 5, s': cell(max, (run['beyond_s'] for run in runs), '.1f'),
+            'held, MB': cell(max, (run['held'] * 1e-6 for run in runs), '.2f')}

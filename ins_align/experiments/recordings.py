@@ -20,7 +20,6 @@ compared with the recording's reference.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 import itertools
 from pathlib import Path
@@ -28,8 +27,7 @@ from typing import Any, NamedTuple
 
 from ins_align.experiments import ExperimentError
 from ins_align.experiments.common import (
-    beyond, BINS, Column, count, error_of, JsonDict, median, moment, most, over, parallel, Report,
-    WHICH, while_aligned, worst)
+    beyond, BINS, cell, errors_of, JsonDict, moment, parallel, Report, while_aligned, worst)
 from ins_align.experiments.spoilt import SECOND
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.messages import Fix, Velocity
@@ -41,12 +39,12 @@ from ins_align.recordings.reader import read, REFERENCE_TOPIC, Request
 from ins_align.results import Epoch, Reference
 import numpy as np
 
-# What is known beside the recording, by the beginning of its name: the lever arm, and how well
-# its reference is known (tilt, heading; degrees), where its stated sigma is too good to be true:
-# the UAV's differs from the on-board filter by 0.6 and 1.4 deg rms, the quadrotor's has a compass.
-KNOWN_LEVER_ARMS = {'car_drive0708': (0.0, 0.05, 0.0)}
-REFERENCE_STD_DEG = {'uav_thor75': (0.6, 1.0), 'car_drive0708': (0.2, 0.5),
-                     'quad_dot08': (1.0, 2.0)}
+# What is known beside the recording, by the beginning of its name: parameters, and how well its
+# reference is known (tilt, heading; degrees), where its stated sigma is too good to be true: the
+# UAV's differs from the on-board filter by 0.6 and 1.4 deg rms, the quadrotor's has a compass.
+KNOWN: dict[str, tuple[JsonDict, float, float]] = {
+    'uav_thor75': ({}, 0.6, 1.0), 'car_drive0708': ({'lever_arm': (0.0, 0.05, 0.0)}, 0.2, 0.5),
+    'quad_dot08': ({}, 1.0, 2.0)}
 MOTION_SPEED, MOTION_TIME = 5.0, 60.0       # m/s of change within so many s is real motion
 STEP, LENGTH = 10.0, 120.0      # s
 SHORTEST = 10.0                 # s of data that a window has to have
@@ -57,6 +55,7 @@ class Recording(NamedTuple):
     """Messages of a recording, and its reference."""
 
     name: str
+    config: JsonDict                            # what is known of it
     imu: ImuSamples
     gnss: list[tuple[int, Fix | Velocity]]      # each with how many IMU samples came before it
     reference: Reference
@@ -66,12 +65,6 @@ class Recording(NamedTuple):
     def duration(self) -> float:
         """Seconds."""
         return float(self.imu.stamps_ns[-1] - self.imu.stamps_ns[0]) * 1e-9
-
-    @property
-    def lever_arm(self) -> JsonDict:
-        """Return the lever arm as a parameter, where it is known."""
-        known = KNOWN_LEVER_ARMS.get(self.name)
-        return {} if known is None else {'lever_arm': known}
 
     def attitudes_at(self, stamps_ns: list[int]) -> list[Array | None]:
         """Return the reference's ``C_nb`` at stamps, None where there is none."""
@@ -113,49 +106,38 @@ def load(path: Path) -> Recording:
     earlier = itertools.accumulate((part.imu.stamps_ns.size for part in parts), initial=0)
     name = path.name.split('.')[0]
     stated = np.degrees(np.sqrt(np.median(np.abs(orientations.covariances[:, [0, 4, 8]]), axis=0)))
-    tilt, heading = REFERENCE_STD_DEG.get(name, (0.0, 0.0))
-    return Recording(
-        name, imu, [(start + before, message) for start, part in zip(earlier, parts)
-                    for before, message in part.gnss if isinstance(message, (Fix, Velocity))],
-        Reference(orientations.known()), np.maximum(stated, [tilt, tilt, heading]))
+    config, tilt, heading = KNOWN.get(name, ({}, 0.0, 0.0))
+    gnss = [(start + before, message) for start, part in zip(earlier, parts)
+            for before, message in part.gnss if isinstance(message, (Fix, Velocity))]
+    return Recording(name, config, imu, gnss, Reference(orientations.known()),
+                     np.maximum(stated, [tilt, tilt, heading]))
 
 
-def run_window(task: tuple[Path, float, float, JsonDict, float]) -> JsonDict:
+def windows_of(path: Path, config: JsonDict) -> list[Any]:
+    """Return tasks for `run_window`, one every `STEP`."""
+    starts = np.arange(0.0, max(load(path).duration - SHORTEST, 0.0) + 1e-6, STEP)
+    return [(path, start, LENGTH, config) for start in starts.tolist()]
+
+
+def run_window(task: tuple[Path, float, float, JsonDict]) -> JsonDict:
     """
     Align a window of a recording.
 
-    The task: its path, from when on and how long, s, parameters of `Config`, the sign of gyro z.
+    The task: its path, from when on and how long, s, parameters of `Config`.
     """
-    path, start_s, duration, config, z_sign = task
+    path, start_s, duration, config = task
     recording = load(path)
     part = recording.part(start_s, duration)
-    part['gyro'] = part['gyro'] * [1.0, 1.0, z_sign]
-    result = align(**part, **{**recording.lever_arm, **config})
+    result = align(**part, **{**recording.config, **config})
     epochs = [epoch for epoch in result.epochs if not epoch.dry]
     stamps, velocities = _velocities(**part)
     minute = velocities[stamps <= stamps[:1] + round(MOTION_TIME * SECOND)]
     return {'start_s': start_s, 'state': result.status.state.value,
             'moves': _change(minute) >= MOTION_SPEED,
             'covers_minute': min(recording.duration - start_s, duration) >= MOTION_TIME,
-            'at': at_times(recording, epochs, stamps, velocities),
+            'at': at_times(recording, epochs),
             **while_aligned(epochs, int(part['stamps'][0]), recording.attitudes_at,
                             recording.reference_std_deg)}
-
-
-def at_times(recording: Recording, epochs: list[Epoch], stamps: np.ndarray,
-             velocities: Array) -> dict[str, list[JsonDict]]:
-    """Judge the last epochs up to `TIMES`, declared or not, and the course over ground there."""
-    known = [(epoch, C_true) for epoch in epochs if epoch.current is not None
-             for C_true in recording.attitudes_at([epoch.current.stamp_ns]) if C_true is not None]
-    found = {}
-    for time in TIMES:
-        before = [each for each in known if each[0].t_s <= time + 1e-6] or known[:1]
-        # A window that ends before has nothing to show.
-        for epoch, C_true in before[-1:] if known and known[-1][0].t_s >= time - 1.5 else ():
-            error = error_of(epoch.current, C_true, recording.reference_std_deg)
-            found[f'{time:g}'] = [{**moment(epoch.t_s, [error]), 'course_deg': _course_error(
-                C_true, velocities[np.searchsorted(stamps, epoch.stamp_ns):][:1])}]
-    return found
 
 
 def _velocities(stamps: np.ndarray, fixes: list[Fix], velocities: list[Velocity], **imu: Array,
@@ -185,12 +167,19 @@ def _change(velocities: Any) -> float:
     return float(np.max(np.ptp(extents, axis=0))) if len(extents) else 0.0
 
 
-def _course_error(C_true: Array, v: Array) -> float | None:
-    """Error of a velocity (1, 2) as heading, degrees; None if there is none above 1 m/s."""
-    if not len(v) or np.hypot(*v[0]) < 1.0:
-        return None
-    error = np.arctan2(C_true[1, 0], C_true[0, 0]) - np.arctan2(v[0, 1], v[0, 0])
-    return float(abs(np.degrees((error + np.pi) % (2 * np.pi) - np.pi)))
+def at_times(recording: Recording, epochs: list[Epoch]) -> dict[str, JsonDict]:
+    """Judge the last epochs up to `TIMES`, declared or not, of what lasts as long."""
+    shown = [epoch for epoch in epochs if epoch.current is not None]
+    errors = errors_of([epoch.current for epoch in shown], recording.attitudes_at,
+                       recording.reference_std_deg)
+    known = [moment(epoch.t_s, [error]) for epoch, error in zip(shown, errors)
+             if error is not None]
+    found = {}
+    for time in TIMES:
+        before = [each for each in known if each['t_s'] <= time + 1e-6] or known[:1]
+        if before and known[-1]['t_s'] >= time - 1.5:
+            found[f'{time:g}'] = before[-1]
+    return found
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
@@ -201,11 +190,10 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         raise ExperimentError(f'no recording with {REFERENCE_TOPIC} in {data}')
     tasks: dict[str, list[Any]] = {}
     for path in paths:
-        name, duration = load(path).name, load(path).duration
-        starts = np.arange(0.0, max(duration - SHORTEST, 0.0) + 1e-6, STEP).tolist()
-        tasks |= {f'{name}, {method}': [(path, start, LENGTH, config, 1.0) for start in starts]
+        name = load(path).name
+        tasks |= {f'{name}, {method}': windows_of(path, config)
                   for method, config in methods_of(path).items()}
-        tasks[f'{name}, bank, all of it'] = [(path, 0.0, duration, {}, 1.0)]
+        tasks[f'{name}, bank, all of it'] = [(path, 0.0, load(path).duration, {})]
     groups = dict(zip(tasks, parallel(run_window, list(tasks.values()), jobs, 'windows')))
     every = [each for name, group in groups.items() for each in group if name.endswith('bank')]
     report.text(
@@ -219,17 +207,13 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     report.table(
         f'At the declaration: median / worst. in {MOTION_TIME:g} s: windows with real motion '
         f'(by {MOTION_SPEED:g} m/s in that time) that declare. Then all epochs while ALIGNED',
-        [*groups.items(), ('all windows, bank', every)], DECLARED_COLUMNS)
+        [declared_row(name, group)
+         for name, group in (*groups.items(), ('all windows, bank', every))])
     report.table(
-        'Errors in deg: median / worst, declared or not; sigmas: of the heading; course: that '
-        'over ground, above 1 m/s, taken for it. Windows with real motion; all if none has', [
-            (name, [each for each in group if each['moves']] or group)
-            for name, group in groups.items()],
-        [*WHICH, *(
-            (f'{title} at {time:g} s', '', _both(lambda run, time=time: run['at'].get(
-                f'{time:g}', ()), name)) for time in TIMES for title, name in (
-                    ('heading', 'heading_deg'), ('tilt', 'tilt_deg'), ('sigmas', 'heading_sigmas'),
-                    ('course', 'course_deg')))])
+        'Errors in deg: median / worst, declared or not; sigmas: of the heading. Windows with '
+        'real motion; all if none has', [
+            times_row(name, [each for each in group if each['moves']] or group)
+            for name, group in groups.items()])
     return groups
 
 
@@ -240,43 +224,41 @@ def methods_of(path: Path) -> dict[str, JsonDict]:
     return {'note': {**note, 'free_start': False}, 'centred': note, 'bank': {'method': 'bank'}}
 
 
-# Columns of tables, whose rows are a name and the runs of its windows
+# Rows of tables, of a name and the runs of its windows
 
-def _both(moments_of: Callable[[JsonDict], list[JsonDict]], name: str) -> Callable[[Any], Any]:
+def _both(moments: list[JsonDict], name: str) -> str | None:
     """Return the median and the largest value of moments."""
-    def cell(group: tuple[str, list[JsonDict]]) -> str | None:
-        values = [moment[name] for run in group[1] for moment in moments_of(run)
-                  if moment[name] is not None]
-        return f'{np.median(values):.2g} / {np.max(values):.2g}' if values else None
-
-    return cell
+    values = [moment[name] for moment in moments]
+    return f'{np.median(values):.2g} / {np.max(values):.2g}' if values else None
 
 
-def _soon(group: tuple[str, list[JsonDict]]) -> str:
-    """Count the windows with real motion that declare within a minute, and all of them."""
-    times = [[first['t_s'] for first in run['first']] for run in group[1]
-             if run['moves'] and run['covers_minute']]
-    return f'{sum(each[0] <= MOTION_TIME for each in times if each)}/{len(times)}'
+def declared_row(name: str, runs: list[JsonDict]) -> JsonDict:
+    """Return when windows declare, how wrong they are then, and in all epochs while ALIGNED."""
+    first = [run['first'][0] for run in runs if run['first']]
+    moving = [run['first'] for run in runs if run['moves'] and run['covers_minute']]
+    soon = sum(each[0]['t_s'] <= MOTION_TIME for each in moving if each)
+    epochs = sum(run['epochs'] for run in runs)
+    row = {'case': name, 'runs': len(runs), 'declared': len(first),
+           'after, s': cell(np.median, (each['t_s'] for each in first), '.0f'),
+           'in 60 s': f'{soon}/{len(moving)}'}
+    for title, key in (('heading, deg', 'heading_deg'), ('heading, sigma', 'heading_sigmas'),
+                       ('tilt, deg', 'tilt_deg'), ('tilt, sigma', 'tilt_sigmas')):
+        row[title] = _both(first, key)
+    row |= {f'> {limit:g}': beyond((worst([each]) for each in first), limit) for limit in BINS}
+    row |= {'at the end': sum(run['state'] == 'ALIGNED' for run in runs), 'epochs': epochs}
+    for place, limit in enumerate(BINS):
+        row[f'> {limit:g} sigma, %'] = (
+            f"{100 * sum(run['beyond'][place] for run in runs) / epochs:.1f}" if epochs else None)
+    return row | {'worst, sigma': cell(
+        max, (run['worst_sigmas'] for run in runs if run['first']), '.1f')}
 
 
-def _share(group: tuple[str, list[JsonDict]], place: int) -> float | None:
-    """Return the part of epochs while ALIGNED that are beyond one of `BINS`, %."""
-    epochs = sum(run['epochs'] for run in group[1])
-    return 100 * sum(run['beyond'][place] for run in group[1]) / epochs if epochs else None
-
-
-DECLARED_COLUMNS: list[Column] = [
-    *WHICH, over('declared', 'first', count),
-    over('after, s', 'first', lambda found: median([
-        each[0]['t_s'] for each in found if each]), '.0f'),
-    ('in 60 s', '', _soon),
-    *((title, '', _both(lambda run: run['first'], name)) for title, name in (
-        ('heading, deg', 'heading_deg'), ('heading, sigma', 'heading_sigmas'),
-        ('tilt, deg', 'tilt_deg'), ('tilt, sigma', 'tilt_sigmas'))),
-    *(over(f'> {limit:g}', 'first', lambda found, limit=limit: beyond(map(worst, found), limit))
-      for limit in BINS),
-    over('at the end', 'state', lambda states: states.count('ALIGNED')),
-    over('epochs', 'epochs', sum),
-    *((f'> {limit:g} sigma, %', '.1f', lambda group, place=place: _share(group, place))
-      for place, limit in enumerate(BINS)),
-    over('worst, sigma', 'worst_sigmas', most, '.1f')]
+def times_row(name: str, runs: list[JsonDict]) -> JsonDict:
+    """Return how wrong windows are at each of `TIMES`."""
+    row = {'case': name, 'runs': len(runs)}
+    for time in map('{:g}'.format, TIMES):
+        found = [run['at'][time] for run in runs if time in run['at']]
+        for title, key in (('heading', 'heading_deg'), ('tilt', 'tilt_deg'),
+                           ('sigmas', 'heading_sigmas')):
+            row[f'{title} at {time} s'] = _both(found, key)
+    return row

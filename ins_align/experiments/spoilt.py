@@ -26,7 +26,7 @@ import itertools
 from operator import itemgetter
 from typing import Any
 
-from ins_align.config import Config
+from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.messages import fixes, MessageError, velocities
 from ins_align.simulation.scenarios import displaced
@@ -39,7 +39,6 @@ Message = tuple[int, str, Any]      # when it arrives (ns), what it is, and itse
 
 SECOND = 1_000_000_000
 HOUR = 3600 * SECOND
-GRAVITY = 9.80665  # m/s^2
 LATENESS_NS = round(Config().gnss_lateness * SECOND)
 LOT = 100       # IMU samples given at once, in which the lateness of their stamps is taken for one
 GNSS = 'fix', 'velocity'
@@ -463,7 +462,7 @@ FAULTS: dict[str, Callable[[Stream, Random], Any]] = {
         random, random.integers(1, 4), 0.05, 3.0), 'stamp'),
     'IMU stamps wild': _imu_wild_stamps,
     'accelerations in g': lambda stream, random: np.divide(
-        stream.imu['accel'], GRAVITY, out=stream.imu['accel']),
+        stream.imu['accel'], STANDARD_GRAVITY, out=stream.imu['accel']),
     'rates in deg/s': lambda stream, random: np.degrees(
         stream.imu['gyro'], out=stream.imu['gyro']),
     'clock loops': _clock_loop,

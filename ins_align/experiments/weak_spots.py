@@ -16,28 +16,28 @@ Experiments ``weak-spots`` and ``vehicle``: where an alignment is easily wrong a
 
 Searches have found the weak spots one by one; here each is a row of one table, so that versions
 can be compared. ``vehicle`` has a car that goes straight on, and motions that are not what the
-parameter ``vehicle`` says. The recorded car is run in both if it is there.
+parameter ``vehicle`` says, and the recorded car if it is there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import pairwise, product
+from itertools import product
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ins_align.config import PRESETS
 from ins_align.experiments.common import (
-    ALIGNED_COLUMNS, BINS, Case, Groups, JsonDict, parallel, Report, run_case)
+    aligned_row, BINS, Case, Groups, JsonDict, parallel, Report, run_case)
 from ins_align.experiments.spoilt import directions, GNSS, Random, SECOND, Stream
 from ins_align.geometry.rotation import Array
+from ins_align.simulation.simulate import gauss_markov
 import numpy as np
 
 DURATION = 90.0         # s, unless a case says otherwise
 RECORDING = 'car_drive0708'
-WINDOW, EVERY = 120.0, 10.0     # s of the recorded car in `vehicle`, from start to start
 MOUNT_STD_DEG = 1.0
 
 
@@ -62,15 +62,10 @@ def _states(stream: Stream, random: Random, std: float) -> None:
     stream.velocity['covariance'] = std ** 2 * np.eye(3)
 
 
-def _lasting(stream: Stream, random: Random, time_s: float, std: float = 0.1) -> None:
+def _lasting(stream: Stream, random: Random, time_s: float) -> None:
     """Add to velocities without noise one of first order, and state its size."""
-    _states(stream, random, std)
-    errors = std * random.standard_normal((len(stream.velocity), 3))
-    rho = math.exp(-0.2 / time_s)
-    for before, error in pairwise(errors):
-        error *= math.sqrt(1.0 - rho ** 2)
-        error += rho * before
-    stream.velocity['velocity'] += errors
+    _states(stream, random, 0.1)
+    stream.velocity['velocity'] += gauss_markov(stream.seconds('velocity'), 0.1, time_s, random)
 
 
 def _stepping(stream: Stream, random: Random) -> None:
@@ -334,10 +329,9 @@ VEHICLE_SPOTS = (
     _vehicle('towed 70 deg across', 'car', {**STREETS, 'crab_deg': 70.0}),
     _vehicle('on a ferry, 70 deg across, in waves', 'swing', {**STREETS, 'crab_deg': 70.0}),
 )
-RECORDED: dict[str, tuple[JsonDict, float]] = {
-    'none': ({}, 1.0), 'vehicle: car': ({'vehicle': 'car'}, 1.0),
-    'vehicle: car, heading_std_threshold: 2': (
-        {'vehicle': 'car', 'heading_std_threshold': 2.0}, 1.0)}
+RECORDED: dict[str, JsonDict] = {
+    'none': {}, 'vehicle: car': {'vehicle': 'car'},
+    'vehicle: car, heading_std_threshold: 2': {'vehicle': 'car', 'heading_std_threshold': 2.0}}
 
 
 # Runs
@@ -359,26 +353,9 @@ def run_spots(spots: Sequence[Spot], runs: int, jobs: int | None) -> Groups:
         for spot in spots], jobs, 'spots')))
 
 
-def run_recorded(data: Path | None, every_s: float, length_s: float, jobs: int | None,
-                 variants: dict[str, tuple[JsonDict, float]]) -> Groups:
-    """Align windows of the car, if it is recorded there, with parameters and a sign of gyro z."""
-    from ins_align.experiments.recordings import load, run_window
-
-    path = next(iter(sorted(data.glob(f'{RECORDING}*'))), None) if data else None
-    if path is None:
-        return []
-    starts = np.arange(0.0, max(load(path).duration - every_s, 1.0), every_s).tolist()
-    return list(zip(variants, parallel(run_window, [
-        [(path, start, length_s, *variant) for start in starts] for variant in variants.values()],
-        jobs, 'recorded car')))
-
-
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
-    """Run ``weak-spots``, and its cases of the recorded car if it is there."""
+    """Run ``weak-spots``."""
     found = run_spots(SPOTS, runs, jobs)
-    found += run_recorded(data, 100.0, 3600.0, jobs, {
-        'recorded car, lever arm told to 3 cm': ({'lever_arm_std': 0.03}, 1.0),
-        'recorded car, gyro z reversed': ({}, -1.0)})
     report.text(
         f'{runs} runs of each case, fewer where they are long, of {DURATION:g} s unless the case '
         'needs more. Car and flight in turn, or a hover, a throw, all of these; MEMS grade unless '
@@ -387,15 +364,14 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         f'first declaration, and at any time at which it was called ALIGNED; runs beyond '
         f'{BINS[0]:g} and {BINS[1]:g}, the seconds beyond {BINS[1]:g} of the longest, the worst '
         'error in sigmas and, of heading, in degrees, the part of the time at which it was '
-        'ALIGNED, and after how many seconds of data it was declared, the median. With --data DIR '
-        'that has it, the recorded car too.')
-    report.table('Weak spots', found, ALIGNED_COLUMNS)
+        'ALIGNED, and after how many seconds of data it was declared, the median.')
+    report.table('Weak spots', [aligned_row(*each) for each in found])
     return {'runs': runs, 'cases': dict(found)}
 
 
 def run_vehicle(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``vehicle``, and the recorded car if it is there."""
-    from ins_align.experiments.recordings import DECLARED_COLUMNS
+    from ins_align.experiments.recordings import declared_row, run_window, STEP, windows_of
 
     found = run_spots(VEHICLE_SPOTS, runs, jobs)
     report.text(
@@ -404,10 +380,13 @@ def run_vehicle(report: Report, runs: int, jobs: int | None, data: Path | None) 
         'case says otherwise, `trust_imu_axes` and a heading threshold of 2 deg. Columns as in '
         'weak-spots; "not used": the runs at whose end the reason says that the motion '
         'contradicts `vehicle`.')
-    report.table('Simulated', found, [*ALIGNED_COLUMNS, ('not used', '', lambda group: sum(
-        'contradicts vehicle' in each['reason'] for each in group[1]))])
-    recorded = run_recorded(data, EVERY, WINDOW, jobs, RECORDED)
-    if recorded:
-        report.table(f'The recorded car, started anew every {EVERY:g} s', recorded,
-                     DECLARED_COLUMNS)
+    report.table('Simulated', [{**aligned_row(name, group), 'not used': sum(
+        'contradicts vehicle' in each['reason'] for each in group)} for name, group in found])
+    recorded: Groups = []
+    for path in sorted(data.glob(f'{RECORDING}*'))[:1] if data else ():
+        recorded = list(zip(RECORDED, parallel(
+            run_window, [windows_of(path, config) for config in RECORDED.values()], jobs,
+            'recorded car')))
+        report.table(f'The recorded car, started anew every {STEP:g} s',
+                     [declared_row(*each) for each in recorded])
     return {'runs': runs, 'cases': dict(found), 'recorded': dict(recorded)}

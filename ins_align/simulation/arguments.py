@@ -90,9 +90,6 @@ class Arguments:
         None, "gyroscope bias, 1 sigma per axis; default: the grade's", 'rad/s')
     accel_bias_std: float | None = _imu(
         None, "accelerometer bias, 1 sigma per axis; default: the grade's", 'm/s^2')
-    accel_bias: Sequence[float] | None = _imu(
-        None, 'accelerometer bias itself, instead of a drawn one', 'm/s^2', -math.inf,
-        names=('X', 'Y', 'Z'))
     gyro_scale_std: float | None = _imu(
         None, 'scale factor error of each gyroscope, 1 sigma, 0.01 is one percent; default: 0, '
         'of a chip what its grade states', '1', 0.0, _MOST['gyro_scale_std'])
@@ -136,8 +133,8 @@ class Arguments:
     velocity_std: float = _gnss(0.1, 'white noise of the velocity, 1 sigma, horizontal', 'm/s')
     velocity_std_vertical: float | None = _gnss(
         None, 'and vertical; default: the same', 'm/s')
-    position_std: float = _gnss(2.5, 'white noise of the position, 1 sigma, horizontal', 'm')
-    position_std_vertical: float | None = _gnss(None, 'and vertical; default: twice that', 'm')
+    position_std: float = _gnss(2.5, 'white noise of the position, 1 sigma, horizontal; vertical '
+                                'twice that', 'm')
     velocity_drift_std: float = _gnss(
         0.0, 'errors of the velocity that last (first-order Gauss-Markov), 1 sigma per axis; not '
         'in the stated covariance', 'm/s')

@@ -31,7 +31,7 @@ from functools import lru_cache, partial
 import math
 from typing import Any, NamedTuple
 
-from ins_align.geometry.earth import ECCENTRICITY2, matrix_en, SEMI_MAJOR_AXIS
+from ins_align.geometry.earth import matrix_en
 from ins_align.geometry.rotation import Array, cross, log_so3, matrix_from_rpy
 from ins_align.gnss.messages import ENU_FROM_NED
 import numpy as np
@@ -262,11 +262,9 @@ _RATE_STEP = 1e-3  # s
 
 def displaced(lla: Array, offset: Array) -> Array:
     """Move positions (n, 3) in degrees and m by offsets (n, 3) in ENU of some metres."""
-    meridian, normal = _radii(np.radians(lla[:, 0]))
-    return lla + np.stack([
-        np.degrees(offset[:, 1] / (meridian + lla[:, 2])),
-        np.degrees(offset[:, 0] / (normal + lla[:, 2]) / np.cos(np.radians(lla[:, 0]))),
-        offset[:, 2]], axis=-1)
+    from pyins.transform import perturb_lla
+
+    return perturb_lla(lla, offset @ ENU_FROM_NED)
 
 
 def wrapped(lla: Array) -> Array:
@@ -274,13 +272,6 @@ def wrapped(lla: Array) -> Array:
     result = lla.copy()
     result[:, 1] = (result[:, 1] + 180.0) % 360.0 - 180.0
     return result
-
-
-def _radii(latitude: Array) -> tuple[Array, Array]:
-    """Radii of curvature of the ellipsoid: meridian and prime vertical."""
-    square = 1 - ECCENTRICITY2 * np.sin(latitude) ** 2
-    normal = SEMI_MAJOR_AXIS / np.sqrt(square)
-    return normal * (1 - ECCENTRICITY2) / square, normal
 
 
 class Trajectory(NamedTuple):
@@ -301,6 +292,8 @@ class Trajectory(NamedTuple):
 
     def antenna(self, time: Array, C_vb: Array, lever_arm: Array) -> tuple[Array, Array]:
         """Position (n, 3) in degrees and m and velocity (n, 3) in ENU of the antenna."""
+        from pyins.earth import principal_radii
+
         velocity, rpy = self.motion(time)
         lla = self.lla_spline(time)
         C_nb = matrix_from_rpy(rpy) @ C_vb
@@ -309,11 +302,10 @@ class Trajectory(NamedTuple):
             np.swapaxes(self._attitude(time - step), 1, 2) @ self._attitude(time + step))
             / (2 * step) for step in (_RATE_STEP, 2 * _RATE_STEP))
         omega_nb_b = (4 * near - far) / 3 @ C_vb
-        latitude = np.radians(lla[:, 0])
-        meridian, normal = _radii(latitude)
-        turn = velocity[:, 0] / (normal + lla[:, 2])
-        omega_en_n = np.stack([-velocity[:, 1] / (meridian + lla[:, 2]), turn,
-                               turn * np.tan(latitude)], axis=-1)
+        north, east, _ = principal_radii(lla[:, 0], lla[:, 2])
+        turn = velocity[:, 0] / east
+        omega_en_n = np.stack([-velocity[:, 1] / north, turn,
+                               turn * np.tan(np.radians(lla[:, 0]))], axis=-1)
         omega_eb_b = omega_nb_b + np.einsum('nji,nj->ni', C_nb, omega_en_n)
         lever_n = C_nb @ lever_arm
         velocity = velocity + np.einsum('nij,nj->ni', C_nb, cross(omega_eb_b, lever_arm))
@@ -333,6 +325,7 @@ def trajectory_of(
         longitude_deg: float, altitude: float, heading_deg: float, crab_deg: float,
         stand_still: float) -> Trajectory:
     """Make the trajectory of `simulate`'s arguments; the last few are kept, read-only."""
+    from pyins.earth import principal_radii
     from pyins.sim import generate_imu
     from pyins.transform import mat_from_rph
     from scipy.interpolate import CubicHermiteSpline
@@ -352,10 +345,8 @@ def trajectory_of(
     truth, imu = generate_imu(time, start[0], np.stack([roll, -pitch, 90 - yaw], axis=-1),
                               velocity @ ENU_FROM_NED, 'rate')
     lla = truth[['lat', 'lon', 'alt']].to_numpy()
-    latitude = np.radians(lla[:, 0])
-    meridian, normal = _radii(latitude)
-    slope = np.stack([np.degrees(velocity[:, 1] / (meridian + lla[:, 2])),
-                      np.degrees(velocity[:, 0] / (normal + lla[:, 2]) / np.cos(latitude)),
+    north, _, parallel = principal_radii(lla[:, 0], lla[:, 2])
+    slope = np.stack([np.degrees(velocity[:, 1] / north), np.degrees(velocity[:, 0] / parallel),
                       velocity[:, 2]], axis=-1)
     keep = slice(_PADDING, -_PADDING)
     C_nv = ENU_FROM_NED @ mat_from_rph(truth[['roll', 'pitch', 'heading']].to_numpy()[keep]) \

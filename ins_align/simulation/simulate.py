@@ -182,10 +182,6 @@ def _imu(asked: Arguments, trajectory: Trajectory, C_vb: Array,
     truth_gyro, truth_accel = trajectory.gyro @ C_vb, trajectory.accel @ C_vb
     gyro_bias = scale * noise.gyro_bias_std * streams[0].standard_normal(3)
     accel_bias = scale * noise.accel_bias_std * streams[0].standard_normal(3)
-    if asked.accel_bias is not None:
-        accel_bias = scale * np.array(asked.accel_bias, dtype=float)
-        noise = noise._replace(accel_bias_std=max(
-            noise.accel_bias_std, float(np.sqrt(np.mean(np.square(asked.accel_bias))))))
     gyro_matrix, accel_matrix = (
         np.eye(3) + scale * scale_std * np.diag(streams[0].standard_normal(3))
         + scale * misalignment_std * (1 - np.eye(3)) * streams[0].standard_normal((3, 3))
@@ -220,11 +216,10 @@ def _gnss(asked: Arguments, trajectory: Trajectory, C_vb: Array, lever_b: Array,
     scale = 0.0 if asked.ideal else 1.0
     stamps, time = _gnss_epochs(asked)
     lla, velocity = trajectory.antenna(time, C_vb, lever_b)
-    velocity_sigma, position_sigma = (
-        np.array([level, level, ratio * level if vertical is None else vertical])
-        for level, vertical, ratio in (
-            (asked.velocity_std, asked.velocity_std_vertical, 1.0),
-            (asked.position_std, asked.position_std_vertical, 2.0)))
+    vertical = asked.velocity_std_vertical
+    velocity_sigma = np.array([asked.velocity_std, asked.velocity_std,
+                               asked.velocity_std if vertical is None else vertical])
+    position_sigma = asked.position_std * np.array([1.0, 1.0, 2.0])
     outlier = streams[4].random(len(time)) < asked.outlier_rate
     direction = streams[4].standard_normal((len(time), 3))
     direction *= (outlier / np.linalg.norm(direction, axis=1))[:, None]
@@ -236,7 +231,7 @@ def _gnss(asked: Arguments, trajectory: Trajectory, C_vb: Array, lever_b: Array,
         # The last draws of a stream each, so that they change nothing else.
         for error, std, stream in ((offset, asked.position_drift_std, streams[3]),
                                    (velocity, asked.velocity_drift_std, streams[5])):
-            error += _gauss_markov(stamps * 1e-9, std, asked.gnss_correlation, stream)
+            error += gauss_markov(stamps * 1e-9, std, asked.gnss_correlation, stream)
     lla = wrapped(displaced(lla, offset))
     velocity_covariance = np.diag(velocity_sigma ** 2)
     if asked.velocity_frame == 'ned':
@@ -261,8 +256,8 @@ def _gnss_epochs(asked: Arguments) -> tuple[np.ndarray, Array]:
     return stamps[received], seconds[received] - asked.gnss_delay
 
 
-def _gauss_markov(time: Array, std: float, correlation_time: float,
-                  random: np.random.Generator) -> Array:
+def gauss_markov(time: Array, std: float, correlation_time: float,
+                 random: np.random.Generator) -> Array:
     """First-order Gauss-Markov process (n, 3) of constant variance."""
     decay = np.exp(-np.diff(time, prepend=-np.inf) / correlation_time)
     drive = std * np.sqrt(1 - decay ** 2)[:, None] * random.standard_normal((len(time), 3))
@@ -381,26 +376,29 @@ def _gnss_messages(simulation: Simulation, ros: SimpleNamespace) -> _Messages:
                 covariance.ravel()))
 
 
+def noise_parameters(noise: ImuNoise) -> dict[str, float]:
+    """Return the noise of an IMU as parameters of `Config`."""
+    return {'angle_random_walk': 60 * math.degrees(noise.angle_random_walk),
+            'velocity_random_walk': 60 * noise.velocity_random_walk,
+            'gyro_bias_std': math.degrees(noise.gyro_bias_std),
+            'accel_bias_std': float(noise.accel_bias_std),
+            'gyro_scale_std': float(noise.gyro_scale_std),
+            'rate_random_walk': 60 * math.degrees(noise.rate_random_walk)}
+
+
 def _parameter_file(simulation: Simulation) -> str:
     """Return the node's YAML with what is known of the recording."""
-    meta, noise = simulation.meta, simulation.imu_noise
+    meta = simulation.meta
     values = {'lever_arm': simulation.lever_arm.tolist(), 'gnss_delay': float(meta['gnss_delay']),
               'velocity_frame': meta['velocity_frame']}
     lateness = float(meta['gnss_latency']) + LATENESS_MARGIN
     if lateness > Config.gnss_lateness:
         values['gnss_lateness'] = lateness
-    preset = PRESETS.get(meta['imu_grade'])
-    values['imu_grade'] = meta['imu_grade'] if preset else 'custom'
-    if preset is None:
-        values['angle_random_walk'] = math.degrees(noise.angle_random_walk) * 60
-        values['velocity_random_walk'] = noise.velocity_random_walk * 60
-        preset = ImuNoise(0.0, 0.0, 0.0, 0.0)
-    if noise[:4] != preset[:4]:
-        values['gyro_bias_std'] = math.degrees(noise.gyro_bias_std)
-        values['accel_bias_std'] = float(noise.accel_bias_std)
-    if noise.gyro_scale_std > preset.gyro_scale_std and not meta['ideal']:
-        values['gyro_scale_std'] = float(noise.gyro_scale_std)
-    if noise.rate_random_walk > preset.rate_random_walk and not meta['ideal']:
-        values['rate_random_walk'] = math.degrees(noise.rate_random_walk) * 60
+    grade = meta['imu_grade']
+    values['imu_grade'] = grade if grade in PRESETS else 'custom'
+    # Noise that is less than a preset's is covered by it.
+    covered = noise_parameters(PRESETS.get(grade, ImuNoise(0.0, 0.0, 0.0, 0.0)))
+    values |= {name: value for name, value in noise_parameters(simulation.imu_noise).items()
+               if value > covered[name]}
     return ''.join(['ins_align:\n  ros__parameters:\n',
                     *(f'    {name}: {value}\n' for name, value in values.items())])
