@@ -25,7 +25,7 @@ from ins_align.checks import InputChecks
 from ins_align.config import Config, config_from_mapping
 from ins_align.geometry.rotation import Array, Index, Transform
 from ins_align.gnss import messages
-from ins_align.gnss.messages import fault_of_fix, Fix, Velocity
+from ins_align.gnss.messages import Fix, usable, Velocity
 from ins_align.processes import run_ahead
 from ins_align.results import Epoch, in_order_of_time, Reference, Result, State
 import numpy as np
@@ -143,7 +143,7 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
                 int(np.count_nonzero(~part.imu.decoded)))
         fixes += [(message.stamp_ns, message.latitude_deg, message.longitude_deg)
                   for _, message in part.gnss
-                  if isinstance(message, Fix) and not fault_of_fix(message)]
+                  if isinstance(message, Fix) and not usable(message)[1]]
         orientations.append(part.orientations.known())
         if progress is not None:
             progress(part.done)

@@ -19,7 +19,7 @@ import math
 from ins_align.config import Config
 from ins_align.gnss.antenna import Antenna, StatedNoise
 from ins_align.gnss.buffer import GnssEpoch
-from ins_align.gnss.messages import Fix, Velocity, with_an_altitude
+from ins_align.gnss.messages import Fix, usable, Velocity
 import numpy as np
 import pytest
 
@@ -108,8 +108,7 @@ def test_altitude_that_comes_and_goes(velocity):
     epochs = []
     for k, altitude in enumerate(altitudes):
         message = told(k * SECOND, 0.0, velocity)
-        message = message._replace(fix=with_an_altitude(
-            message.fix._replace(altitude_m=altitude)))
+        message = message._replace(fix=usable(message.fix._replace(altitude_m=altitude))[0])
         epochs.append(antenna.epoch(message))
     assert [epoch.altitude for epoch in epochs] == [0.0] * 3 + [2500.0] * 6 + [2501.0] * 2
     assert counts['fix_jump'] == 1 and not epochs[-1].position_measured

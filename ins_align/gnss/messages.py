@@ -100,38 +100,34 @@ def velocities_of(epochs: Sequence[AntennaEpoch]) -> Array:
     return np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n for epoch in epochs])
 
 
-def fault_of_fix(fix: Fix) -> str:
-    """Return what a fix that cannot be used is counted as: ``no_fix``, ``nan``, or ''."""
-    fix = with_an_altitude(fix)
-    position = fix.latitude_deg, fix.longitude_deg, fix.altitude_m
-    if fix.status == NO_FIX or position[:2] == (0.0, 0.0):
-        return 'no_fix'
-    return '' if (all(map(math.isfinite, position)) and abs(fix.latitude_deg) <= 90.0
-                  and abs(fix.longitude_deg) <= 360.0
-                  and abs(fix.altitude_m) < MAX_ALTITUDE) else 'nan'
+def usable(message: Fix | Velocity) -> tuple[Fix | Velocity, str]:
+    """
+    Return what can be used of a message, and as what it is counted if nothing can be.
 
-
-def with_an_altitude(fix: Fix) -> Fix:
-    """Return a fix whose altitude is 0, and not measured, where it is nan: in a 2D fix."""
-    return fix._replace(altitude_m=0.0, vertical=False) if math.isnan(fix.altitude_m) else fix
-
-
-def usable_velocity(velocity: Velocity) -> Velocity | None:
-    """Return what can be used of a velocity, without its vertical where that is nan."""
-    east, north, up = velocity.velocity.tolist()
-    if math.isnan(up):
-        up = 0.0
-        velocity = velocity._replace(velocity=np.array([east, north, up]), vertical=False)
-    return velocity if all(abs(value) < MAX_SPEED for value in (east, north, up)) else None
+    That is ``no_fix``, ``nan`` or ''. A vertical that is nan, as in a 2D fix, becomes 0 and is
+    then not measured.
+    """
+    if isinstance(message, Velocity):
+        east, north, up = message.velocity.tolist()
+        if math.isnan(up):
+            up = 0.0
+            message = message._replace(velocity=np.array([east, north, up]), vertical=False)
+        good = all(abs(value) < MAX_SPEED for value in (east, north, up))
+        return message, '' if good else 'nan'
+    if math.isnan(message.altitude_m):
+        message = message._replace(altitude_m=0.0, vertical=False)
+    _, latitude, longitude, altitude, *_ = message
+    if message.status == NO_FIX or latitude == longitude == 0.0:
+        return message, 'no_fix'
+    # What is not finite is not within a bound either.
+    good = abs(latitude) <= 90.0 and abs(longitude) <= 360.0 and abs(altitude) < MAX_ALTITUDE
+    return message, '' if good else 'nan'
 
 
 def numbers_of(message: Fix | Velocity) -> tuple[list[float], str]:
-    """Return a position or velocity, its vertical 0 where that is nan, and why it is useless."""
-    if isinstance(message, Velocity):
-        usable = usable_velocity(message)
-        return (usable or message).velocity.tolist(), '' if usable else 'nan'
-    fix = with_an_altitude(message)
-    return [fix.latitude_deg, fix.longitude_deg, fix.altitude_m], fault_of_fix(fix)
+    """Return position or velocity as `usable` has it, and as what it is counted if it is not."""
+    found, fault = usable(message)
+    return (found.velocity.tolist() if isinstance(found, Velocity) else list(found[1:4])), fault
 
 
 def stamp_from_msg(msg: Any) -> int:
