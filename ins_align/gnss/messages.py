@@ -143,13 +143,8 @@ def imu_from_msg(msg: Any) -> tuple[int, np.ndarray, np.ndarray]:
             np.array([force.x, force.y, force.z]))
 
 
-def fix_from_msg(msg: Any) -> Fix:
-    """Convert sensor_msgs/NavSatFix; a covariance of unknown type or without sense is None."""
-    return fixes_from_msgs([msg])[0]
-
-
 def fixes_from_msgs(msgs: Sequence[Any]) -> list[Fix]:
-    """Convert many messages like `fix_from_msg`."""
+    """Convert sensor_msgs/NavSatFix; a covariance of unknown type or without sense is None."""
     return fixes([stamp_from_msg(msg) for msg in msgs],
                  [[msg.latitude, msg.longitude, msg.altitude] for msg in msgs],
                  np.array([msg.position_covariance for msg in msgs], float).reshape(-1, 3, 3),
@@ -172,13 +167,8 @@ def fixes(stamps_ns: ArrayLike, places: ArrayLike, covariances: np.ndarray,
                    _usable_covariances(covariances, None))]
 
 
-def velocity_from_msg(msg: Any, config: Config) -> Velocity:
-    """Convert the message that ``config.velocity_type`` names, like `velocities`."""
-    return velocities_from_msgs([msg], config)[0]
-
-
 def velocities_from_msgs(msgs: Sequence[Any], config: Config) -> list[Velocity]:
-    """Convert many messages of the same `frame_of_velocity` like `velocity_from_msg`."""
+    """Convert messages of ``config.velocity_type`` and of one frame like `velocities`."""
     covariances = None
     if config.velocity_type == 'Vector3Stamped':
         linear = [msg.vector for msg in msgs]

@@ -28,7 +28,8 @@ from typing import Any, NamedTuple
 from geometry_msgs.msg import TwistStamped, TwistWithCovarianceStamped, Vector3Stamped
 from ins_align.config import Config, ConfigError
 from ins_align.gnss.drivers import LIVE_TYPES, receiver_from_msg
-from ins_align.gnss.messages import Fix, fix_from_msg, imu_from_msg, Velocity, velocity_from_msg
+from ins_align.gnss.messages import (
+    Fix, fixes_from_msgs, imu_from_msg, velocities_from_msgs, Velocity)
 from nav_msgs.msg import Odometry
 from rclpy.callback_groups import CallbackGroup
 from rclpy.serialization import deserialize_message, serialize_message
@@ -153,7 +154,7 @@ def gnss_topics(config: Config) -> dict[str, type]:
 def gnss_from_msg(topic: str, msg: Any, config: Config) -> Sequence[Fix | Velocity]:
     """Return what a message of a topic carries; a MessageError says why it cannot be used."""
     if topic == VELOCITY_TOPIC:
-        return [velocity_from_msg(msg, config)]
+        return velocities_from_msgs([msg], config)
     if config.fix_type == 'NavSatFix':
-        return [fix_from_msg(msg)]
+        return fixes_from_msgs([msg])
     return receiver_from_msg(msg, LIVE_TYPES[config.fix_type], config)
