@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-What the node reads: IMU messages as bytes, the GNSS topics with their types.
+What the node reads: IMU messages as bytes, the GNSS topics with their types, /tf_static.
 
 Turning every IMU sample into a Python message and back costs several times what the alignment
 itself does with it, so the node takes its bytes as they arrive and changes them in place.
@@ -27,13 +27,17 @@ from typing import Any, NamedTuple
 
 from geometry_msgs.msg import TwistStamped, TwistWithCovarianceStamped, Vector3Stamped
 from ins_align.config import Config, ConfigError
+from ins_align.geometry.rotation import Transform
 from ins_align.gnss.drivers import LIVE_TYPES, receiver_from_msg
 from ins_align.gnss.messages import (
     Fix, fixes_from_msgs, imu_from_msg, velocities_from_msgs, Velocity)
+from ins_align.mounting import Lookup, transform_from_msg
 from nav_msgs.msg import Odometry
 from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
+from rclpy.time import Time
 from sensor_msgs.msg import Imu, NavSatFix
 
 FIX_TOPIC, VELOCITY_TOPIC = 'fix', 'fix_velocity'
@@ -158,3 +162,24 @@ def gnss_from_msg(topic: str, msg: Any, config: Config) -> Sequence[Fix | Veloci
     if config.fix_type == 'NavSatFix':
         return fixes_from_msgs([msg])
     return receiver_from_msg(msg, LIVE_TYPES[config.fix_type], config)
+
+
+def open_static_tf(node: Node, config: Config) -> Lookup | None:
+    """Return a lookup in /tf_static; None: it is not wanted, or there is no tf2_ros."""
+    if config.lever_arm_from_tf is False and not config.base_frame:
+        return None
+    try:
+        tf2_ros = import_module('tf2_ros')
+    except ModuleNotFoundError:
+        return None
+    buffer = tf2_ros.Buffer()
+    buffer.listener = tf2_ros.TransformListener(buffer, node)  # which would otherwise be gone
+    # A lever arm does not move, and /tf is too much for a small computer.
+    node.destroy_subscription(buffer.listener.tf_sub)
+
+    def lookup(target: str, source: str) -> Transform | None:
+        if not buffer.can_transform(target, source, Time()):
+            return None
+        return transform_from_msg(buffer.lookup_transform(target, source, Time()).transform)
+
+    return lookup
