@@ -16,7 +16,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-import dataclasses
 import os
 from typing import Any, TYPE_CHECKING, Union
 
@@ -27,7 +26,7 @@ from ins_align.geometry.rotation import Array, Index, Transform
 from ins_align.gnss import messages
 from ins_align.gnss.messages import Fix, usable, Velocity
 from ins_align.processes import run_ahead
-from ins_align.results import Epoch, in_order_of_time, Reference, Result, State
+from ins_align.results import Epoch, in_order_of_time, Reference, Result
 import numpy as np
 
 if TYPE_CHECKING:
@@ -86,11 +85,7 @@ class _Run:
     def result(self, **of_recording: Any) -> Result:
         """Return what came of it, at the end."""
         self._epochs += self._aligner.flush(dry=True)
-        status = self._checks.judge(self._aligner.status())
-        if status.state is not State.ALIGNED:
-            status = dataclasses.replace(
-                status, reason='; '.join([status.reason, *self._checks.late_messages()]))
-        return Result(config=self._config, status=status,
+        return Result(config=self._config, status=self._checks.judge(self._aligner.status()),
                       epochs=in_order_of_time(self._epochs), **of_recording)
 
 

@@ -23,7 +23,7 @@ from ins_align.geometry.earth import (
     dead_reckon, enu_offset, GRAVITY_EQUATOR, Place, SEMI_MAJOR_AXIS)
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.buffer import GnssEpoch
-from ins_align.gnss.messages import AntennaEpoch, Fix, Velocity
+from ins_align.gnss.messages import AntennaEpoch, Fix
 import numpy as np
 
 # A fix this far (m) from where the last one and the velocity lead, and as much again for every

@@ -188,11 +188,6 @@ def frame_of_velocity(msg: Any, velocity_type: str) -> str:
     return frame
 
 
-def is_body_frame(frame: str) -> bool:
-    """Whether a frame_id is one of the customary names of a body frame."""
-    return _BODY_FRAME.search(frame) is not None
-
-
 def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
                covariances: np.ndarray | None, config: Config) -> list[Velocity]:
     """
@@ -204,7 +199,7 @@ def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
     (N, 6, 6), are those of twists. The frame of a body is a MessageError, unless
     ``config.velocity_frame`` says otherwise.
     """
-    if config.velocity_frame == 'auto' and is_body_frame(frame):
+    if config.velocity_frame == 'auto' and _BODY_FRAME.search(frame):
         raise MessageError(
             f'the velocity is given in the body frame {frame[:80]!r}: an alignment needs it in a '
             'world frame, east-north-up or north-east-down; if it is in one, whatever its '

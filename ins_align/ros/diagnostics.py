@@ -38,27 +38,24 @@ class ReasonLog:
 
     def __init__(self) -> None:
         """Start with nothing logged."""
-        self._logged: dict[str, float] = {}  # kinds of the last seconds, and when
-        self._present: set[str] = set()
+        # When kinds of parts that are present, or were lately, were logged last.
+        self._logged: dict[str, float] = {}
 
     def note(self, text: str, now: float) -> None:
         """Take a state with its reason for logged."""
-        kinds = [_kind(part) for part in text.split('; ')]
-        self._present.update(kinds)
-        self._logged.update(dict.fromkeys(kinds, now))
+        self._logged.update(dict.fromkeys(map(_kind, text.split('; ')), now))
 
     def due(self, parts: Sequence[str], now: float, again: bool) -> list[tuple[str, bool]]:
         """
-        Return the parts to log, and whether they were there before; they are taken for logged.
+        Return the parts to log, and whether each was there before; they are taken for logged.
 
         Other numbers in a part make no other kind; `again`: what stays is logged again and again.
         """
+        kinds = {_kind(part): part for part in parts}
         self._logged = {kind: when for kind, when in self._logged.items()
-                        if now - when < LOG_AGAIN}
-        before, kinds = self._present, [_kind(part) for part in parts]
-        self._present = set(kinds)
-        found = [(part, kind in before) for part, kind in zip(parts, kinds)
-                 if kind not in self._logged and (again or kind not in before)]
+                        if kind in kinds or now - when < LOG_AGAIN}
+        found = [(part, kind in self._logged) for kind, part in kinds.items()
+                 if kind not in self._logged or again and now - self._logged[kind] >= LOG_AGAIN]
         self._logged.update((_kind(part), now) for part, _ in found)
         return found
 

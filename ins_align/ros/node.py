@@ -365,14 +365,13 @@ class AlignmentNode(Node):
             self._log_reason(reason.split('; '), more, status.state, now)
 
     def _input_faults(self, status: Status, silent: bool) -> list[str]:
-        """Say what is wrong with topics (nobody there, another type) and what they carry."""
+        """Say what is wrong with topics: nobody is there, or their type is another one."""
         expected = [topic for topic, wanted in (
             (IMU_TOPIC, silent or status.state is State.WAITING_FOR_IMU),
             (FIX_TOPIC, status.state is State.WAITING_FOR_GNSS),
             (VELOCITY_TOPIC, self._config.use_velocity is True
              and not status.counts.get('velocity'))) if wanted]
-        return [*topic_faults(self, self._inputs, expected, VELOCITY_TYPES),
-                *([] if status.state is State.ALIGNED else self._checks.late_messages())]
+        return list(topic_faults(self, self._inputs, expected, VELOCITY_TYPES))
 
     def _log_reason(self, reason: list[str], more: list[str], state: State, now: float) -> None:
         """Log what is new in the reason, and every 10 s what stays and is not as it should be."""
