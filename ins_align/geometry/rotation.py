@@ -94,8 +94,7 @@ def cross(a: ArrayLike, b: ArrayLike) -> Array:
     return result
 
 
-_EYE = np.eye(3)
-_SKEWS = skew(_EYE).reshape(3, 9)       # row i: that of unit vector i
+_SKEWS = skew(np.eye(3)).reshape(3, 9)  # row i: that of unit vector i
 
 
 def _trigonometric_factors(angle2: Array) -> tuple[Array, Array]:
@@ -147,12 +146,7 @@ def exp_so3(vector: ArrayLike) -> Array:
     """Return rotation matrices, shape (..., 3, 3), of rotation vectors (Rodrigues' formula)."""
     v = np.asarray(vector, dtype=float)
     angle2 = np.einsum('...i,...i', v, v)
-    odd, even = _trigonometric_factors(angle2)
-    # Few calls: most arrays are small. Each entry of the skew matrix is one product and zeros.
-    matrix: Array = (even[..., None] * v)[..., :, None] * v[..., None, :]
-    matrix += ((odd[..., None] * v) @ _SKEWS).reshape(matrix.shape)
-    matrix += (1.0 - even * angle2)[..., None, None] * _EYE
-    return matrix
+    return _rodrigues(v, angle2, *_trigonometric_factors(angle2))
 
 
 def rotated(rotation: Array, vectors: Array) -> Array:
