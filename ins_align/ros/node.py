@@ -80,17 +80,7 @@ class AlignmentNode(Node):
     with the attitude that the worker knew last, carried on with the gyros since: at once while
     somebody listens, otherwise it takes them several times a second, which costs half. The
     worker, a thread of its own that no callback waits for, aligns several times a second.
-
-    Attributes
-    ----------
-    failure : exception or None
-        What ended the worker, and with it the context.
-
-    Raises
-    ------
-    ConfigError
-        If a parameter is wrong.
-
+    A parameter that is wrong is a ConfigError.
     """
 
     def __init__(self) -> None:
@@ -103,7 +93,7 @@ class AlignmentNode(Node):
                 raise
             raise ConfigError('the value of a parameter is an empty list: write its numbers, as '
                               'lever_arm:=[0.0, 0.0, 0.0], or leave it out') from None
-        self.failure: BaseException | None = None
+        self.failure: BaseException | None = None  # what ended the worker, and the context with it
         self._config = self._declare_parameters()
         self._search = MountingSearch(self._config, open_static_tf(self, self._config))
         # From the executor to the worker: when it was received, ns, and a message or a request.
