@@ -33,7 +33,7 @@ from ins_align.gnss.messages import (
     Fix, fixes_from_msgs, imu_from_msg, velocities_from_msgs, Velocity)
 from ins_align.mounting import Lookup, transform_from_msg
 from nav_msgs.msg import Odometry
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
@@ -104,7 +104,7 @@ def with_orientation(data: bytes, quaternion_xyzw: Sequence[float],
     return bytes(changed)
 
 
-class Gate(CallbackGroup):
+class Gate(ReentrantCallbackGroup):
     """
     Keeps a subscription from its executor while it is closed.
 
@@ -117,13 +117,6 @@ class Gate(CallbackGroup):
     def can_execute(self, entity: Any) -> bool:
         """Whether the executor may take messages."""
         return self.is_open
-
-    def beginning_execution(self, entity: Any) -> bool:
-        """Allow it."""
-        return True
-
-    def ending_execution(self, entity: Any) -> None:
-        """Do nothing."""
 
 
 def queued(subscription: Subscription) -> list[tuple[Any, int]]:
