@@ -43,7 +43,7 @@ from ins_align.ros.diagnostics import (
     diagnostic_status, inputs_in_words, parameter_descriptor, ReasonLog, topic_faults, vector_msg)
 from ins_align.ros.inputs import (
     FIX_TOPIC, Gate, gnss_from_msg, gnss_topics, ImuSample, open_static_tf, queued, read_imu,
-    REJECTED_AS, VELOCITY_TOPIC, VELOCITY_TYPES, with_orientation)
+    REJECTED_AS, VELOCITY_TOPIC, with_orientation)
 import numpy as np
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -361,7 +361,7 @@ class AlignmentNode(Node):
             (FIX_TOPIC, status.state is State.WAITING_FOR_GNSS),
             (VELOCITY_TOPIC, self._config.use_velocity is True
              and not status.counts.get('velocity'))) if wanted]
-        return list(topic_faults(self, self._inputs, expected, VELOCITY_TYPES))
+        return list(topic_faults(self, self._inputs, expected))
 
     def _log_reason(self, reason: list[str], more: list[str], state: State, now: float) -> None:
         """Log what is new in the reason, and every 10 s what stays and is not as it should be."""
