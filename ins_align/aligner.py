@@ -144,14 +144,13 @@ class Aligner:
 
     def add_fix(self, fix: Fix) -> None:
         """Take a GNSS position."""
-        self._gnss.add_fix(fix._replace(stamp_ns=fix.stamp_ns - self._delay_ns),
-                           self._imu.newest_ns)
+        self._gnss.add(fix._replace(stamp_ns=fix.stamp_ns - self._delay_ns), self._imu.newest_ns)
 
     def add_velocity(self, velocity: Velocity) -> None:
         """Take a GNSS velocity."""
         self._refusal = ''
-        self._gnss.add_velocity(velocity._replace(stamp_ns=velocity.stamp_ns - self._delay_ns),
-                                self._imu.newest_ns)
+        self._gnss.add(velocity._replace(stamp_ns=velocity.stamp_ns - self._delay_ns),
+                       self._imu.newest_ns)
 
     def reject(self, reason: str, why: str = '') -> None:
         """Count a message that the caller could not use; `why`, in words, is an event, once."""

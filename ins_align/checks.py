@@ -200,9 +200,16 @@ class InputChecks:
             del self._cells[next(iter(self._cells))]
 
     def judge(self, status: Status) -> Status:
-        """Return a status that is a FAULT where nothing can be aligned with such messages."""
-        faults = [] if status.state is State.ALIGNED else self.faults()
-        return replace(status, state=State.FAULT, reason='; '.join(faults)) if faults else status
+        """
+        Return a status that is a FAULT where nothing can be aligned with such messages.
+
+        Until it is aligned, its reason says as well that messages come too late.
+        """
+        if status.state is State.ALIGNED:
+            return status
+        if faults := self.faults():
+            status = replace(status, state=State.FAULT, reason='; '.join(faults))
+        return replace(status, reason='; '.join([status.reason, *self.late_messages()]))
 
     def faults(self) -> list[str]:
         """Return what is wrong with units and coordinates, each in a sentence."""

@@ -83,13 +83,8 @@ class Config:
     Everything that a user can set, checked.
 
     Each field's metadata holds ``description``, ``unit``, ``minimum`` and ``maximum`` (inclusive,
-    None: no limit or not a number), ``choices`` and ``read_only``; `parameters` lists them.
-
-    Raises
-    ------
-    ConfigError
-        If a value has the wrong type, lies outside its range or contradicts another one.
-
+    None: no limit or not a number), ``choices`` and ``read_only``; `parameters` lists them. A
+    value of the wrong type, outside its range or that contradicts another one is a ConfigError.
     """
 
     lever_arm: tuple[float, float, float] = _parameter(
@@ -300,13 +295,8 @@ def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     Read the values for this node from a ROS 2 parameter file, by name, not checked.
 
-    The YAML has ``ros__parameters`` below the node's name or a wildcard (``/**``).
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read or holds no parameters for this node.
-
+    The YAML has ``ros__parameters`` below the node's name or a wildcard (``/**``). A ConfigError
+    says that the file cannot be read or holds no parameters for this node.
     """
     try:
         with open(path, 'rb') as file:

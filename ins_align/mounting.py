@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 import dataclasses
 from typing import Any, NamedTuple
@@ -25,7 +26,9 @@ from ins_align.results import Event, Severity
 import numpy as np
 
 ROUNDING = 1e-6  # m: numbers of a robot's model that differ less are the same
-
+# A robot's model is published once, to all who join: it is there as soon as the sensors are.
+WAIT = 2.0  # s, for what may not be there, from when both frame_ids are known
+MAX_HELD = 4000
 
 # Target and source frame to the transform between them, None where there is none.
 Lookup = Callable[[str, str], 'Transform | None']
@@ -120,3 +123,70 @@ def _with_lever_arm(config: Config, found: Array, frames: tuple[str, str],
     elif use:
         words.append(Event(Severity.INFO, f'lever arm from TF: {in_tf}'))
     return from_tf if use else config
+
+
+class MountingSearch:
+    """
+    Looks for the transforms that the parameters want while messages arrive.
+
+    It begins once messages have told their frames. Without a `lookup` there is no TF: a
+    ConfigError if the parameters cannot do without.
+    """
+
+    def __init__(self, config: Config, lookup: Lookup | None) -> None:
+        self._config, self._lookup = config, lookup
+        self._required = config.lever_arm_from_tf is True or bool(config.base_frame)
+        if self._required and lookup is None:
+            raise ConfigError('lever_arm_from_tf is true or base_frame is set, but tf2_ros is not '
+                              'installed: sudo apt install ros-$ROS_DISTRO-tf2-ros-py')
+        self.antenna_frame = self._imu_frame = ''
+        self._lever_arm = config.lever_arm  # that is in use
+        self._held: deque[tuple[int, Any]] = deque(maxlen=MAX_HELD)
+        self.restart()
+
+    def restart(self) -> None:
+        """Look again: the IMU is another one."""
+        self.mounting: Mounting | None = None
+        self.waits_for = 'the transforms of IMU and antenna' if self._required else ''
+        self._since: float | None = None
+        self._held.clear()
+
+    def take(self, items: list[tuple[int, Any]], now: float,
+             ) -> tuple[list[tuple[int, Any]], Mounting | None]:
+        """
+        Look for the transforms; keep the messages until they are known or given up.
+
+        Items are messages and, callable, requests, with when they came, ns; IMU samples have a
+        `frame_id`. Returns what to align with now, which is all that was kept where a lever arm
+        was found, and once what TF says. `now` is in seconds.
+        """
+        if self.mounting is not None:
+            return items, None
+        messages = [item for item in items if not callable(item[1])]
+        requests = [item for item in items if callable(item[1])]
+        self._held.extend(messages)
+        self._imu_frame = next((item.frame_id for _, item in reversed(messages)
+                                if hasattr(item, 'frame_id')), self._imu_frame)
+        self.mounting = self._find(now)
+        if self.mounting is None:
+            return requests if self._required else items, None
+        self.waits_for = ''
+        anew = self._required or self.mounting.config.lever_arm != self._lever_arm
+        self._lever_arm = self.mounting.config.lever_arm
+        held = list(self._held)
+        self._held.clear()
+        return [*requests, *held] if anew else items, self.mounting
+
+    def _find(self, now: float) -> Mounting | None:
+        """Return what TF says, or that it says nothing; None while that is not known."""
+        if self._lookup is None:
+            return Mounting(self._config, None)
+        if not (self._imu_frame and self.antenna_frame):
+            return None
+        self._since = now if self._since is None else self._since
+        found = find_mounting(self._lookup, self._imu_frame, self.antenna_frame, self._config)
+        if found.missing and (self._required or now - self._since < WAIT):
+            if self._required:
+                self.waits_for = f'the transform {" and that ".join(found.missing)}'
+            return None
+        return found

@@ -16,7 +16,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-import dataclasses
 import os
 from typing import Any, TYPE_CHECKING, Union
 
@@ -25,9 +24,9 @@ from ins_align.checks import InputChecks
 from ins_align.config import Config, config_from_mapping
 from ins_align.geometry.rotation import Array, Index, Transform
 from ins_align.gnss import messages
-from ins_align.gnss.messages import fault_of_fix, Fix, Velocity
+from ins_align.gnss.messages import Fix, usable, Velocity
 from ins_align.processes import run_ahead
-from ins_align.results import Epoch, in_order_of_time, Reference, Result, State
+from ins_align.results import Epoch, in_order_of_time, Reference, Result
 import numpy as np
 
 if TYPE_CHECKING:
@@ -86,11 +85,7 @@ class _Run:
     def result(self, **of_recording: Any) -> Result:
         """Return what came of it, at the end."""
         self._epochs += self._aligner.flush(dry=True)
-        status = self._checks.judge(self._aligner.status())
-        if status.state is not State.ALIGNED:
-            status = dataclasses.replace(
-                status, reason='; '.join([status.reason, *self._checks.late_messages()]))
-        return Result(config=self._config, status=status,
+        return Result(config=self._config, status=self._checks.judge(self._aligner.status()),
                       epochs=in_order_of_time(self._epochs), **of_recording)
 
 
@@ -143,7 +138,7 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
                 int(np.count_nonzero(~part.imu.decoded)))
         fixes += [(message.stamp_ns, message.latitude_deg, message.longitude_deg)
                   for _, message in part.gnss
-                  if isinstance(message, Fix) and not fault_of_fix(message)]
+                  if isinstance(message, Fix) and not usable(message)[1]]
         orientations.append(part.orientations.known())
         if progress is not None:
             progress(part.done)

@@ -240,9 +240,9 @@ def velocity(stamp=0, v=(1.0, 2.0, 3.0)):
 
 def test_fix_and_velocity_of_one_stamp_are_one_epoch():
     buffer, counts = gnss_buffer()
-    buffer.add_velocity(velocity(20), None)
-    buffer.add_fix(fix(20), None)
-    buffer.add_fix(fix(10), None)
+    buffer.add(velocity(20), None)
+    buffer.add(fix(20), None)
+    buffer.add(fix(10), None)
     first, second = buffer.release(20)
     assert (first.stamp_ns, first.velocity) == (10, None) and first.fix is not None
     assert second.fix is not None and second.velocity is not None
@@ -252,7 +252,7 @@ def test_fix_and_velocity_of_one_stamp_are_one_epoch():
 def test_epochs_are_released_in_order_up_to_a_stamp():
     buffer, _ = gnss_buffer()
     for stamp in (50, 10, 40, 20, 30):
-        buffer.add_fix(fix(stamp), None)
+        buffer.add(fix(stamp), None)
     assert [e.stamp_ns for e in buffer.release(30)] == [10, 20, 30]
     assert [e.stamp_ns for e in buffer.release(99)] == [40, 50]
 
@@ -264,22 +264,22 @@ def test_epochs_are_released_in_order_up_to_a_stamp():
     ({'status': -1}, 'fix_no_fix'), ({'latitude_deg': 0.0, 'longitude_deg': 0.0}, 'fix_no_fix')])
 def test_fixes_that_are_none_are_counted_by_reason(changes, reason):
     buffer, counts = gnss_buffer()
-    buffer.add_fix(fix(5, **changes), None)
+    buffer.add(fix(5, **changes), None)
     assert buffer.release(10) == [] and counts[reason] == 1
 
 
 def test_broken_velocities_are_counted():
     buffer, counts = gnss_buffer()
     for v in ((np.nan, 0, 0), (0, np.inf, 0), (0, 0, 1e9)):
-        buffer.add_velocity(velocity(5, v), None)
+        buffer.add(velocity(5, v), None)
     assert buffer.release(10) == [] and counts['velocity_nan'] == 3
 
 
 def test_position_without_its_altitude_is_kept():
     buffer, counts = gnss_buffer()
-    buffer.add_fix(fix(5, altitude_m=math.nan), None)
-    buffer.add_fix(fix(6, altitude_m=math.inf), None)
-    buffer.add_fix(fix(7, altitude_m=math.nan, latitude_deg=math.nan), None)
+    buffer.add(fix(5, altitude_m=math.nan), None)
+    buffer.add(fix(6, altitude_m=math.inf), None)
+    buffer.add(fix(7, altitude_m=math.nan, latitude_deg=math.nan), None)
     kept, = buffer.release(10, last=True)
     assert kept.fix.latitude_deg == 48.0 and kept.fix.altitude_m == 0.0 and not kept.fix.vertical
     assert counts['fix'] == 3 and counts['fix_nan'] == 2 and counts['fix_no_altitude'] == 1
@@ -287,7 +287,7 @@ def test_position_without_its_altitude_is_kept():
 
 def test_velocity_without_its_vertical_is_kept():
     buffer, counts = gnss_buffer()
-    buffer.add_velocity(velocity(5, (1.0, 2.0, np.nan)), None)
+    buffer.add(velocity(5, (1.0, 2.0, np.nan)), None)
     kept = buffer.release(10, last=True)[0].velocity
     assert kept.velocity.tolist() == [1.0, 2.0, 0.0] and not kept.vertical
     assert counts['velocity'] == 1 and counts['velocity_nan'] == 0
@@ -295,10 +295,10 @@ def test_velocity_without_its_vertical_is_kept():
 
 def test_duplicates_are_counted_and_the_first_is_kept():
     buffer, counts = gnss_buffer()
-    buffer.add_fix(fix(5, altitude_m=1.0), None)
-    buffer.add_fix(fix(5, altitude_m=2.0), None)
-    buffer.add_velocity(velocity(5, (1.0, 0, 0)), None)
-    buffer.add_velocity(velocity(5, (2.0, 0, 0)), None)
+    buffer.add(fix(5, altitude_m=1.0), None)
+    buffer.add(fix(5, altitude_m=2.0), None)
+    buffer.add(velocity(5, (1.0, 0, 0)), None)
+    buffer.add(velocity(5, (2.0, 0, 0)), None)
     epoch, = buffer.release(10)
     assert epoch.fix.altitude_m == 1.0 and epoch.velocity.velocity[0] == 1.0
     assert counts['fix_duplicate'] == 1 and counts['velocity_duplicate'] == 1
@@ -311,8 +311,8 @@ def test_epochs_that_move_and_repeat_the_one_before_are_left_out(late):
     buffer = GnssBuffer(LATENESS, counts, PAIR_NS)
     said = [(48.0, 3.0), (48.0, 3.0), (48.1, 3.0), (48.1, 3.0), (48.1, 3.0), (48.1, 3.1)]
     for k, (latitude, north) in enumerate(said):
-        buffer.add_fix(fix(k * 200 * MS, latitude_deg=latitude), None)
-        buffer.add_velocity(velocity(k * 200 * MS + late, (0.0, north, 0.0)), None)
+        buffer.add(fix(k * 200 * MS, latitude_deg=latitude), None)
+        buffer.add(velocity(k * 200 * MS + late, (0.0, north, 0.0)), None)
         if k == 3:
             epochs = buffer.release(700 * MS)
     epochs += buffer.release(2000 * MS)
@@ -324,10 +324,10 @@ def test_a_receiver_that_stands_or_says_half_repeats_nothing():
     """At rest some receivers hold position and velocity; positions alone may do so too."""
     buffer, counts = gnss_buffer()
     for k in range(3):
-        buffer.add_fix(fix(k * MS), None)
-        buffer.add_velocity(velocity(k * MS, (0.0, 0.0, 0.0)), None)
-        buffer.add_fix(fix((10 + k) * MS), None)
-        buffer.add_velocity(velocity((20 + k) * MS, (1.0, 2.0, 0.0)), None)
+        buffer.add(fix(k * MS), None)
+        buffer.add(velocity(k * MS, (0.0, 0.0, 0.0)), None)
+        buffer.add(fix((10 + k) * MS), None)
+        buffer.add(velocity((20 + k) * MS, (1.0, 2.0, 0.0)), None)
     assert len(buffer.release(100 * MS)) == 9 and counts['gnss_repeated'] == 0
 
 
@@ -339,28 +339,28 @@ def test_velocities_of_a_receiver_without_a_fix_are_left_out(late):
     epochs = []
     for k in range(12):                                     # twice as many velocities as fixes
         if k % 2 == 0:
-            buffer.add_fix(fix(k * 100 * MS, status=-1 if 4 <= k < 8 else 0), None)
-        buffer.add_velocity(velocity(k * 100 * MS + late), None)
+            buffer.add(fix(k * 100 * MS, status=-1 if 4 <= k < 8 else 0), None)
+        buffer.add(velocity(k * 100 * MS + late), None)
         epochs += buffer.release((k - 2) * 100 * MS)
     epochs += buffer.release(2000 * MS)
     assert [epoch.stamp_ns - late for epoch in epochs] == [
         k * 100 * MS for k in range(12) if not 4 <= k < 8]
     assert counts['velocity_no_fix'] == 4 and counts['fix_no_fix'] == 2
     # Who says nothing of a fix any more may have one again.
-    buffer.add_fix(fix(3000 * MS, status=-1), 3000 * MS)
+    buffer.add(fix(3000 * MS, status=-1), 3000 * MS)
     for stamp in (3000 * MS, 5000 * MS, 5100 * MS):
-        buffer.add_velocity(velocity(stamp), None)
+        buffer.add(velocity(stamp), None)
     assert [epoch.stamp_ns for epoch in buffer.release(6000 * MS)] == [5100 * MS]
     # Too late to tell anything, as a fix would be.
-    buffer.add_fix(fix(7000 * MS, status=-1), 9000 * MS)
-    buffer.add_velocity(velocity(7500 * MS), 8000 * MS)
+    buffer.add(fix(7000 * MS, status=-1), 9000 * MS)
+    buffer.add(velocity(7500 * MS), 8000 * MS)
     assert len(buffer.release(9000 * MS)) == 1
 
 
 def test_what_is_behind_the_end_is_left_out_and_counted():
     buffer = GnssBuffer(LATENESS, counts := Counter(), PAIR_NS)
     for k in range(4):
-        buffer.add_fix(fix(k * 1000 * MS), None)
+        buffer.add(fix(k * 1000 * MS), None)
     assert len(buffer.release(1000 * MS)) == 1 and counts['gnss_after_imu'] == 0
     assert len(buffer.release(2000 * MS, last=True)) == 2 and buffer.oldest_ns is None
     assert counts['gnss_after_imu'] == 1
@@ -369,18 +369,18 @@ def test_what_is_behind_the_end_is_left_out_and_counted():
 def test_messages_too_late_or_of_another_clock_are_counted():
     buffer, counts = gnss_buffer()
     newest = 100_000 * MS
-    buffer.add_fix(fix(newest - LATENESS - 1), newest)
-    buffer.add_velocity(velocity(newest - LATENESS - 1), newest)
-    buffer.add_fix(fix(newest + 3_600_000 * MS), newest)
+    buffer.add(fix(newest - LATENESS - 1), newest)
+    buffer.add(velocity(newest - LATENESS - 1), newest)
+    buffer.add(fix(newest + 3_600_000 * MS), newest)
     assert counts['fix_late'] == 1 and counts['velocity_late'] == 1 and counts['fix_ahead'] == 1
-    buffer.add_fix(fix(newest - LATENESS), newest)
+    buffer.add(fix(newest - LATENESS), newest)
     assert len(buffer.release(newest)) == 1
 
 
 def test_gnss_without_imu_is_bounded():
     buffer, counts = gnss_buffer()
     for k in range(12_000):
-        buffer.add_velocity(velocity(k), None)
+        buffer.add(velocity(k), None)
     assert counts['gnss_overflow'] == 2_000
     released = buffer.release(12_000)
     assert len(released) == 10_000
@@ -396,8 +396,8 @@ def test_fix_and_velocity_with_stamps_of_their_own_are_one_epoch(late):
     """At the velocity's stamp, the fix carried to it: 30 ms at 100 m/s are 3 m."""
     buffer = pairing_buffer()
     for stamp, longitude in ((1000 * MS, 11.0), (1200 * MS, 11.1)):
-        buffer.add_fix(fix(stamp, longitude_deg=longitude), None)
-        buffer.add_velocity(velocity(stamp + late, (0.0, 100.0, 10.0)), None)
+        buffer.add(fix(stamp, longitude_deg=longitude), None)
+        buffer.add(velocity(stamp + late, (0.0, 100.0, 10.0)), None)
     epochs = buffer.release(2000 * MS)
     assert [epoch.stamp_ns for epoch in epochs] == [1000 * MS + late, 1200 * MS + late]
     for epoch in epochs:
@@ -409,14 +409,14 @@ def test_fix_and_velocity_with_stamps_of_their_own_are_one_epoch(late):
 
 def test_half_an_epoch_waits_for_the_other_half_and_not_for_ever():
     buffer = pairing_buffer()
-    buffer.add_fix(fix(1000 * MS), None)
+    buffer.add(fix(1000 * MS), None)
     assert buffer.release(1040 * MS) == [] and buffer.oldest_ns == 1000 * MS
-    buffer.add_velocity(velocity(1045 * MS), None)
+    buffer.add(velocity(1045 * MS), None)
     assert buffer.release(1040 * MS) == []             # the epoch is the velocity's
     joint, = buffer.release(1045 * MS)
     assert joint.fix is not None and joint.velocity is not None and buffer.oldest_ns is None
-    buffer.add_velocity(velocity(1200 * MS), None)
-    buffer.add_fix(fix(1300 * MS), None)
+    buffer.add(velocity(1200 * MS), None)
+    buffer.add(fix(1300 * MS), None)
     assert [epoch.stamp_ns for epoch in buffer.release(1310 * MS)] == [1200 * MS]
     assert [epoch.stamp_ns for epoch in buffer.release(1310 * MS, last=True)] == [1300 * MS]
 
@@ -424,15 +424,15 @@ def test_half_an_epoch_waits_for_the_other_half_and_not_for_ever():
 def test_two_of_a_kind_are_no_pair():
     buffer = pairing_buffer()
     for stamp in (1000 * MS, 1040 * MS):
-        buffer.add_velocity(velocity(stamp), None)
+        buffer.add(velocity(stamp), None)
     assert len(buffer.release(2000 * MS)) == 2
 
 
 def test_an_epoch_is_whole_whatever_comes_right_behind_it():
     buffer = pairing_buffer()
-    buffer.add_fix(fix(0), None)
+    buffer.add(fix(0), None)
     for stamp in (0, 30 * MS):
-        buffer.add_velocity(velocity(stamp), None)
+        buffer.add(velocity(stamp), None)
     whole, alone = buffer.release(1000 * MS)
     assert whole.fix is not None and whole.velocity.stamp_ns == whole.stamp_ns == 0
     assert alone.fix is None and alone.velocity.stamp_ns == alone.stamp_ns == 30 * MS

@@ -197,9 +197,9 @@ def prepared(s, *, velocity=True, **changes):
     delay_ns = round(config.gnss_delay * 1e9)
     for k in range(len(s.gnss_stamps_ns)):
         fix, measured = s.fix(k), s.velocity_measurement(k)
-        messages.add_fix(fix._replace(stamp_ns=fix.stamp_ns - delay_ns), None)
+        messages.add(fix._replace(stamp_ns=fix.stamp_ns - delay_ns), None)
         if velocity:
-            messages.add_velocity(measured._replace(stamp_ns=measured.stamp_ns - delay_ns), None)
+            messages.add(measured._replace(stamp_ns=measured.stamp_ns - delay_ns), None)
     samples.add_many(s.imu_stamps_ns, s.gyro, s.accel)
     antenna = Antenna(config, counts)
     first, *epochs = map(antenna.epoch, messages.release(samples.settled_ns(True), True))

@@ -17,10 +17,18 @@ from types import SimpleNamespace as Msg
 
 from ins_align.config import Config
 from ins_align.gnss.messages import (
-    _usable_covariances, fix_from_msg, imu_from_msg, MessageError, stamp_from_msg,
-    velocity_from_msg)
+    _usable_covariances, fixes_from_msgs, imu_from_msg, MessageError, stamp_from_msg,
+    velocities_from_msgs)
 import numpy as np
 import pytest
+
+
+def fix_from_msg(msg):
+    return fixes_from_msgs([msg])[0]
+
+
+def velocity_from_msg(msg, config):
+    return velocities_from_msgs([msg], config)[0]
 
 
 def header(frame_id='gnss_link', sec=12, nanosec=34):

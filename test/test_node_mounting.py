@@ -14,12 +14,11 @@
 """Lever arm and base from TF in the live node, with a stand-in for tf2_ros and its Buffer."""
 
 import os
-from types import SimpleNamespace
 
-from geometry_msgs.msg import TransformStamped
 from ins_align.config import Config, ConfigError
+from ins_align.geometry.rotation import Transform
 from ins_align.gnss.messages import Fix
-from ins_align.ros.frames import MountingSearch
+from ins_align.mounting import MountingSearch
 from ins_align.ros.inputs import ImuSample
 from ins_align.simulation.simulate import simulate, write_bag
 from node_harness import bag_script, Listener, play, RELIABLE, replayed, running_node
@@ -28,6 +27,7 @@ import pytest
 
 SAMPLE = (1, ImuSample(10, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), 'imu'))
 FIX = (2, Fix(10, 48.0, 11.0, 300.0, None, 0))
+LEVER_ARM = np.array([1.0, 2.0, 3.0])
 # tf2_ros as the node uses it: the transforms of the simulation, there after some questions only.
 STAND_IN = """
 from geometry_msgs.msg import TransformStamped
@@ -59,58 +59,46 @@ class TransformListener:
 """
 
 
-class Buffer:
-    """Transforms that appear one after the other."""
+def search(translations, **parameters):
+    """Look in transforms that may appear one after the other; None: there is no TF."""
+    def lookup(target, source):
+        return Transform(np.eye(3), translations[source]) if source in translations else None
 
-    def __init__(self, **translations):
-        self.translations = translations
-
-    def can_transform(self, target, source, time):
-        return source in self.translations
-
-    def lookup_transform(self, target, source, time):
-        found = TransformStamped()
-        vector = found.transform.translation
-        vector.x, vector.y, vector.z = self.translations[source]
-        return found
-
-
-def search(buffer, **parameters):
-    found = MountingSearch(Config(**parameters), buffer)
+    found = MountingSearch(Config(**parameters), None if translations is None else lookup)
     found.antenna_frame = 'gnss'
     return found
 
 
 def test_without_tf_nothing_waits():
     assert search(None).take([SAMPLE], 0.0)[0] == [SAMPLE]
-    assert search(Buffer(), lever_arm_from_tf=False).take([SAMPLE], 0.0)[0] == [SAMPLE]
+    assert search({}, lever_arm_from_tf=False).take([SAMPLE], 0.0)[0] == [SAMPLE]
     with pytest.raises(ConfigError, match='tf2_ros is not installed: sudo apt install'):
         search(None, lever_arm_from_tf=True)
 
 
 def test_messages_from_before_the_transform_are_aligned_with_it():
-    buffer = Buffer()
-    auto = search(buffer)
+    translations = {}
+    auto = search(translations)
     assert auto.take([SAMPLE], 0.0) == ([SAMPLE], None)
-    buffer.translations['gnss'] = 1.0, 2.0, 3.0
+    translations['gnss'] = LEVER_ARM
     items, mounting = auto.take([FIX], 0.5)
     assert items == [SAMPLE, FIX] and mounting.config.lever_arm == (1.0, 2.0, 3.0)
     assert auto.take([SAMPLE], 1.0) == ([SAMPLE], None)
     auto.restart()  # another IMU, which the model does not have
-    del buffer.translations['gnss']
+    del translations['gnss']
     assert auto.take([SAMPLE], 10.0) == ([SAMPLE], None)
     items, mounting = auto.take([FIX], 13.0)
     assert items == [SAMPLE, FIX] and mounting.config.lever_arm == (0.0, 0.0, 0.0)
 
 
 def test_what_is_wanted_is_waited_for_and_named():
-    buffer = Buffer(gnss=(1.0, 2.0, 3.0))
-    wanted = search(buffer, lever_arm_from_tf=True, base_frame='base_link')
-    request = (3, SimpleNamespace())
+    translations = {'gnss': LEVER_ARM}
+    wanted = search(translations, lever_arm_from_tf=True, base_frame='base_link')
+    request = (3, print)
     assert wanted.take([SAMPLE, request, FIX], 0.0) == ([request], None)
     assert wanted.waits_for == "the transform from 'base_link' (base) to 'imu' (IMU)"
     assert wanted.take([], 100.0) == ([], None)
-    buffer.translations['base_link'] = 0.0, 0.0, 0.0
+    translations['base_link'] = np.zeros(3)
     items, mounting = wanted.take([], 101.0)
     assert items == [SAMPLE, FIX] and wanted.waits_for == ''
     assert np.array_equal(mounting.base.rotation, np.eye(3))

@@ -21,7 +21,8 @@ import struct
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ins_align.config import Config
-from ins_align.gnss.messages import fix_from_msg, imu_from_msg, MessageError, velocity_from_msg
+from ins_align.gnss.messages import (
+    fixes_from_msgs, imu_from_msg, MessageError, velocities_from_msgs)
 from ins_align.recordings import bag as bags
 from ins_align.recordings import BagError, Topic
 from ins_align.recordings.bag import Bag
@@ -492,7 +493,8 @@ def test_gnss_as_one_by_one(encoding, little, msgtype, frame):
         if kind == 'velocity' and b'base_link' in raw and frame == 'auto':
             assert message.counter == 'velocity_body_frame' and "'base_link'" in message.why
             continue
-        expected = fix_from_msg(read) if kind == 'fix' else velocity_from_msg(read, config)
+        expected, = (fixes_from_msgs([read]) if kind == 'fix'
+                     else velocities_from_msgs([read], config))
         for mine, other in zip(message, expected):
             assert type(mine) is type(other)
             np.testing.assert_array_equal(mine, other)

@@ -142,16 +142,10 @@ class LocalLevel:
     The non-rotating frame n0: the local level frozen at a start position and instant.
 
     ``C_n0n(t) = C_en(0)^T Rz(W t) C_en(t)`` needs no integration (docs, "Theory").
-
-    Parameters
-    ----------
-    latitude, longitude : float
-        Radians, of the antenna at t0.
-
     """
 
     def __init__(self, latitude: float, longitude: float) -> None:
-        """Freeze the local level."""
+        """Freeze the local level where the antenna is at t0, radians."""
         self._C_n0e = matrix_en(latitude, longitude).T
 
     def matrix(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike) -> Array:

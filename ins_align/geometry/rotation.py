@@ -128,18 +128,10 @@ def _squared_norm(v: Array) -> Array:
 
 def _rodrigues(v: Array, angle2: Array, odd: Array, even: Array) -> Array:
     """Return ``I + odd [v x] + even [v x]^2``, shape (..., 3, 3)."""
-    matrix = (even[..., None] * v)[..., :, None] * v[..., None, :]
-    diagonal = 1.0 - even * angle2
-    w = odd[..., None] * v
-    matrix[..., 0, 0] += diagonal
-    matrix[..., 1, 1] += diagonal
-    matrix[..., 2, 2] += diagonal
-    matrix[..., 0, 1] -= w[..., 2]
-    matrix[..., 0, 2] += w[..., 1]
-    matrix[..., 1, 0] += w[..., 2]
-    matrix[..., 1, 2] -= w[..., 0]
-    matrix[..., 2, 0] -= w[..., 1]
-    matrix[..., 2, 1] += w[..., 0]
+    # Few calls: most arrays are small. Each entry of the skew matrix is one product and zeros.
+    matrix: Array = (even[..., None] * v)[..., :, None] * v[..., None, :]
+    matrix += ((odd[..., None] * v) @ _SKEWS).reshape(matrix.shape)
+    matrix += (1.0 - even * angle2)[..., None, None] * _EYE
     return matrix
 
 
@@ -147,12 +139,7 @@ def exp_so3(vector: ArrayLike) -> Array:
     """Return rotation matrices, shape (..., 3, 3), of rotation vectors (Rodrigues' formula)."""
     v = np.asarray(vector, dtype=float)
     angle2 = np.einsum('...i,...i', v, v)
-    odd, even = _trigonometric_factors(angle2)
-    # Few calls: most arrays are small. Each entry of the skew matrix is one product and zeros.
-    matrix: Array = (even[..., None] * v)[..., :, None] * v[..., None, :]
-    matrix += ((odd[..., None] * v) @ _SKEWS).reshape(matrix.shape)
-    matrix += (1.0 - even * angle2)[..., None, None] * _EYE
-    return matrix
+    return _rodrigues(v, angle2, *_trigonometric_factors(angle2))
 
 
 def rotated(rotation: Array, vectors: Array) -> Array:

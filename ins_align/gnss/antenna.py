@@ -23,7 +23,7 @@ from ins_align.geometry.earth import (
     dead_reckon, enu_offset, GRAVITY_EQUATOR, Place, SEMI_MAJOR_AXIS)
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.buffer import GnssEpoch
-from ins_align.gnss.messages import AntennaEpoch, Fix, Velocity
+from ins_align.gnss.messages import AntennaEpoch, Fix
 import numpy as np
 
 # A fix this far (m) from where the last one and the velocity lead, and as much again for every
@@ -70,18 +70,17 @@ class Antenna:
         self._vertical = config.velocity_vertical == 'measured'
         self._vertical_seen = False
         self._check = VelocityCheck()
-        self._velocity_noise = StatedNoise(config.velocity_std, config.velocity_std_vertical)
-        self._position_noise = StatedNoise(config.position_std, config.position_std_vertical)
+        self._velocity_noise = StatedNoise(
+            config.velocity_std, config.velocity_std_vertical, _UNKNOWN_VERTICAL_STD, counts,
+            'velocity_covariance')
+        self._position_noise = StatedNoise(
+            config.position_std, config.position_std_vertical, UNKNOWN_ALTITUDE_STD, counts,
+            'fix_covariance')
 
     @property
     def jumped(self) -> bool:
         """Whether fix after fix says that the antenna is somewhere else altogether."""
         return self._jumps >= FIX_JUMPS_BELIEVED
-
-    @property
-    def fault(self) -> str:
-        """Fault of the velocities in words; empty when nothing is known to be wrong."""
-        return self._check.fault
 
     def gravity_drift(self, stamp_ns: int) -> float:
         """
@@ -102,11 +101,9 @@ class Antenna:
         believed = self._locate(message.stamp_ns, fix, self._v_n if v_n is None else v_n)
         if self._place is None or self.jumped:
             return None
-        position_covariance = self._believed(
-            self._position_noise, fix.covariance if fix is not None and believed else None,
-            'fix_covariance')
-        if fix is not None and not fix.vertical:
-            position_covariance = _without_vertical(position_covariance, UNKNOWN_ALTITUDE_STD)
+        position_covariance = self._position_noise.covariance(
+            fix.covariance if fix is not None and believed else None,
+            fix is None or fix.vertical)
         if v_n is not None or believed:
             self._seen_ns = message.stamp_ns
         if v_n is not None:
@@ -116,9 +113,12 @@ class Antenna:
                 variances = position_covariance.diagonal().tolist()
                 self._check.add(message.stamp_ns * 1e-9, self._place, v_n,
                                 math.sqrt(max(variances[:2])))
-        return AntennaEpoch(message.stamp_ns, *self._place, v_n, self._covariance_of(velocity),
-                            believed, position_covariance, self.gravity_drift(message.stamp_ns),
-                            self.fault, fix is None and velocity is None,
+        velocity_covariance = self._velocity_noise.covariance(
+            None if velocity is None else velocity.covariance,
+            self._vertical and (velocity is None or velocity.vertical))
+        return AntennaEpoch(message.stamp_ns, *self._place, v_n, velocity_covariance, believed,
+                            position_covariance, self.gravity_drift(message.stamp_ns),
+                            self._check.fault, fix is None and velocity is None,
                             (velocity is None or velocity.covariance is not None,
                              fix is None or fix.covariance is not None))
 
@@ -161,43 +161,36 @@ class Antenna:
             self._place, self._place_ns = predicted, stamp_ns
         return False
 
-    def _believed(self, noise: StatedNoise, stated: Array | None, counter: str) -> Array:
-        covariance = noise.believed(stated)
-        if covariance is not stated and stated is not None:
-            self._counts[counter] += 1
-        return covariance
-
-    def _covariance_of(self, velocity: Velocity | None) -> Array:
-        covariance = self._believed(self._velocity_noise, None if velocity is None
-                                    else velocity.covariance, 'velocity_covariance')
-        if not self._vertical or (velocity is not None and not velocity.vertical):
-            return _without_vertical(covariance, _UNKNOWN_VERTICAL_STD)
-        return covariance
-
-
-def _without_vertical(covariance: Array, std: float) -> Array:
-    covariance = covariance.copy()
-    covariance[2, :2] = covariance[:2, 2] = 0.0
-    covariance[2, 2] = std ** 2
-    return covariance
-
 
 class StatedNoise:
-    """What a receiver states about its noise, as far as it can be believed."""
+    """
+    What a receiver states about its noise, as far as it can be believed.
 
-    def __init__(self, std: float, std_vertical: float) -> None:
-        """Expect what is configured, 1 sigma, for a receiver that states nothing."""
+    For a receiver that states nothing, 1 sigma is what is configured; `unknown_std` is that of a
+    vertical that is not measured. What is not believed is counted by the name `counter`.
+    """
+
+    def __init__(self, std: float, std_vertical: float, unknown_std: float, counts: Counter[str],
+                 counter: str) -> None:
         self._default = np.diag([std ** 2, std ** 2, std_vertical ** 2])
         self._variances = self._default.diagonal().tolist()
+        self._unknown_variance = unknown_std ** 2
+        self._counts, self._counter = counts, counter
         self._recent: list[deque[float]] = [deque(maxlen=USUAL_EPOCHS) for _ in self._variances]
 
-    def believed(self, covariance: Array | None) -> Array:
+    def covariance(self, stated: Array | None, vertical: bool = True) -> Array:
         """Return the covariance to work with, (3, 3), ENU: the stated one if it is believed."""
-        if covariance is None:
-            return self._default
-        variances = covariance.diagonal().tolist()
+        covariance = self._default if stated is None else self._believed(stated)
+        if not vertical:
+            covariance = covariance.copy()
+            covariance[2, :2] = covariance[:2, 2] = 0.0
+            covariance[2, 2] = self._unknown_variance
+        return covariance
+
+    def _believed(self, covariance: Array) -> Array:
         factors = []
-        for variance, recent, default in zip(variances, self._recent, self._variances):
+        for variance, recent, default in zip(covariance.diagonal().tolist(), self._recent,
+                                             self._variances):
             recent.append(variance)
             usual = default
             # The most that is usual is the default.
@@ -207,6 +200,7 @@ class StatedNoise:
             factors.append(usual / variance if usual > BETTER_THAN_USUAL * variance else 1.0)
         if max(factors) == 1.0:
             return covariance
+        self._counts[self._counter] += 1
         scale = np.sqrt(factors)
         return covariance * scale * scale[:, None]
 

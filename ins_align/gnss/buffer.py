@@ -24,8 +24,7 @@ import math
 from typing import NamedTuple
 
 from ins_align.geometry.earth import dead_reckon
-from ins_align.gnss.messages import (
-    fault_of_fix, Fix, usable_velocity, Velocity, with_an_altitude)
+from ins_align.gnss.messages import Fix, usable, Velocity
 
 # A GNSS stamp this far ahead of the IMU comes from another clock (ns).
 MAX_AHEAD_NS = 10_000_000_000
@@ -78,37 +77,27 @@ class GnssBuffer:
         # How far from the newest IMU sample the last one was that is counted by a name.
         self._off_ns: dict[str, int] = {}
 
-    def add_fix(self, fix: Fix, imu_newest_ns: int | None) -> None:
-        """Take a position, or count why not."""
-        self._counts['fix'] += 1
-        fix = with_an_altitude(fix)
-        if fault := fault_of_fix(fix):
-            self._counts[f'fix_{fault}'] += 1
-            if fault == 'no_fix' and not self._off(fix.stamp_ns, imu_newest_ns):
-                self._no_fix_ns.append(fix.stamp_ns)
-        else:
-            if fix.status == STATUS_UNKNOWN:
-                self._counts['fix_status_unknown'] += 1
-            if not fix.vertical:
-                self._counts['fix_no_altitude'] += 1
-            self._put('fix', fix, imu_newest_ns)
-
-    def add_velocity(self, velocity: Velocity, imu_newest_ns: int | None) -> None:
-        """Take a velocity, or count why not."""
-        self._counts['velocity'] += 1
-        usable = usable_velocity(velocity)
-        if usable is None:
-            self._counts['velocity_nan'] += 1
-        else:
-            self._put('velocity', usable, imu_newest_ns)
-
-    def _put(self, kind: str, message: Fix | Velocity, imu_newest_ns: int | None) -> None:
-        """Put a fix or a velocity into the epoch of its stamp; of two the first counts."""
+    def add(self, message: Fix | Velocity, imu_newest_ns: int | None) -> None:
+        """Put a message into the epoch of its stamp, or count why not; of two the first counts."""
+        kind = 'fix' if isinstance(message, Fix) else 'velocity'
+        self._counts[kind] += 1
+        message, fault = usable(message)
         stamp_ns = message.stamp_ns
-        off = self._off(stamp_ns, imu_newest_ns)
-        if imu_newest_ns is not None and off:
-            self._counts[f'{kind}_{off}'] += 1
-            self._off_ns[f'{kind}_{off}'] = abs(stamp_ns - imu_newest_ns)
+        behind_ns = 0 if imu_newest_ns is None else imu_newest_ns - stamp_ns
+        off = behind_ns > self._lateness_ns or behind_ns < -MAX_AHEAD_NS
+        if fault:
+            self._counts[f'{kind}_{fault}'] += 1
+            if fault == 'no_fix' and not off:
+                self._no_fix_ns.append(stamp_ns)
+            return
+        if isinstance(message, Fix) and message.status == STATUS_UNKNOWN:
+            self._counts['fix_status_unknown'] += 1
+        if isinstance(message, Fix) and not message.vertical:
+            self._counts['fix_no_altitude'] += 1
+        if off:
+            name = f'{kind}_late' if behind_ns > 0 else f'{kind}_ahead'
+            self._counts[name] += 1
+            self._off_ns[name] = abs(behind_ns)
             return
         if len(self._pending) >= MAX_PENDING:
             del self._pending[min(self._pending)]
@@ -119,14 +108,6 @@ class GnssBuffer:
         else:
             self._pending[stamp_ns] = (epoch._replace(fix=message) if isinstance(message, Fix)
                                        else epoch._replace(velocity=message))
-
-    def _off(self, stamp_ns: int, imu_newest_ns: int | None) -> str:
-        """Return how a stamp is too far from the IMU to be used: ``late``, ``ahead`` or ''."""
-        if imu_newest_ns is None:
-            return ''
-        if stamp_ns < imu_newest_ns - self._lateness_ns:
-            return 'late'
-        return 'ahead' if stamp_ns > imu_newest_ns + MAX_AHEAD_NS else ''
 
     def left_out(self, kind: str, before: Counter[str]) -> str:
         """List in words which of a kind, fix or velocity, were left out since counts `before`."""

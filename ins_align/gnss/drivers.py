@@ -64,15 +64,6 @@ class Receiver(NamedTuple):
     unknown: tuple[float, ...] = ()  # what stands for a number that is not known
 
 
-class InertialUnit(NamedTuple):
-    """How to read angular rate and specific force, rad/s and m/s^2."""
-
-    stamp: Callable[[Any], int]
-    gyro: str
-    accel: str
-    axes: np.ndarray  # signs that make them forward, left, up
-
-
 RECEIVERS = {
     # github.com/swri-robotics/gps_umd: what is stated as an error is 95 percent.
     'gps_msgs/msg/GPSFix': Receiver(
@@ -97,14 +88,11 @@ RECEIVERS = {
         {'eph': 1.0, 'epv': 1.0}, {'vel_n_m_s': 1.0, 'vel_e_m_s': 1.0, 'vel_d_m_s': 1.0}, 'ned',
         {'s_variance_m_s': 1.0}, has_velocity=lambda msg: bool(msg.vel_ned_valid)),
 }
-INERTIAL_UNITS = {
-    'px4_msgs/msg/SensorCombined': InertialUnit(
-        _microseconds_ns, 'gyro_rad', 'accelerometer_m_s2', FLU_FROM_FRD),
-}
+INERTIAL_UNITS = ('px4_msgs/msg/SensorCombined',)
 # Of those which the node can read, by the parameter fix_type.
 LIVE_TYPES = {name.rsplit('/', 1)[-1]: name
               for name in ('gps_msgs/msg/GPSFix', 'ublox_msgs/msg/NavPVT')}
-DRIVER_TYPES = {**RECEIVERS, **INERTIAL_UNITS}
+DRIVER_TYPES = (*RECEIVERS, *INERTIAL_UNITS)
 
 
 def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velocity]:
@@ -144,11 +132,10 @@ def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velo
 
 
 def imu_from_driver(msg: Any, msgtype: str) -> tuple[int, np.ndarray, np.ndarray]:
-    """Convert a message of one of INERTIAL_UNITS; a field that is missing is a MessageError."""
-    row = INERTIAL_UNITS[msgtype]
+    """Convert px4_msgs/SensorCombined to ns, rad/s and m/s^2; MessageError: a field is missing."""
     try:
-        return (row.stamp(msg), row.axes * np.asarray(getattr(msg, row.gyro), float),
-                row.axes * np.asarray(getattr(msg, row.accel), float))
+        return (_microseconds_ns(msg), FLU_FROM_FRD * np.asarray(msg.gyro_rad, float),
+                FLU_FROM_FRD * np.asarray(msg.accelerometer_m_s2, float))
     except AttributeError as error:
         raise _no_field(msgtype, error) from None
 

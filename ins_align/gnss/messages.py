@@ -100,38 +100,34 @@ def velocities_of(epochs: Sequence[AntennaEpoch]) -> Array:
     return np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n for epoch in epochs])
 
 
-def fault_of_fix(fix: Fix) -> str:
-    """Return what a fix that cannot be used is counted as: ``no_fix``, ``nan``, or ''."""
-    fix = with_an_altitude(fix)
-    position = fix.latitude_deg, fix.longitude_deg, fix.altitude_m
-    if fix.status == NO_FIX or position[:2] == (0.0, 0.0):
-        return 'no_fix'
-    return '' if (all(map(math.isfinite, position)) and abs(fix.latitude_deg) <= 90.0
-                  and abs(fix.longitude_deg) <= 360.0
-                  and abs(fix.altitude_m) < MAX_ALTITUDE) else 'nan'
+def usable(message: Fix | Velocity) -> tuple[Fix | Velocity, str]:
+    """
+    Return what can be used of a message, and as what it is counted if nothing can be.
 
-
-def with_an_altitude(fix: Fix) -> Fix:
-    """Return a fix whose altitude is 0, and not measured, where it is nan: in a 2D fix."""
-    return fix._replace(altitude_m=0.0, vertical=False) if math.isnan(fix.altitude_m) else fix
-
-
-def usable_velocity(velocity: Velocity) -> Velocity | None:
-    """Return what can be used of a velocity, without its vertical where that is nan."""
-    east, north, up = velocity.velocity.tolist()
-    if math.isnan(up):
-        up = 0.0
-        velocity = velocity._replace(velocity=np.array([east, north, up]), vertical=False)
-    return velocity if all(abs(value) < MAX_SPEED for value in (east, north, up)) else None
+    That is ``no_fix``, ``nan`` or ''. A vertical that is nan, as in a 2D fix, becomes 0 and is
+    then not measured.
+    """
+    if isinstance(message, Velocity):
+        east, north, up = message.velocity.tolist()
+        if math.isnan(up):
+            up = 0.0
+            message = message._replace(velocity=np.array([east, north, up]), vertical=False)
+        good = all(abs(value) < MAX_SPEED for value in (east, north, up))
+        return message, '' if good else 'nan'
+    if math.isnan(message.altitude_m):
+        message = message._replace(altitude_m=0.0, vertical=False)
+    _, latitude, longitude, altitude, *_ = message
+    if message.status == NO_FIX or latitude == longitude == 0.0:
+        return message, 'no_fix'
+    # What is not finite is not within a bound either.
+    good = abs(latitude) <= 90.0 and abs(longitude) <= 360.0 and abs(altitude) < MAX_ALTITUDE
+    return message, '' if good else 'nan'
 
 
 def numbers_of(message: Fix | Velocity) -> tuple[list[float], str]:
-    """Return a position or velocity, its vertical 0 where that is nan, and why it is useless."""
-    if isinstance(message, Velocity):
-        usable = usable_velocity(message)
-        return (usable or message).velocity.tolist(), '' if usable else 'nan'
-    fix = with_an_altitude(message)
-    return [fix.latitude_deg, fix.longitude_deg, fix.altitude_m], fault_of_fix(fix)
+    """Return position or velocity as `usable` has it, and as what it is counted if it is not."""
+    found, fault = usable(message)
+    return (found.velocity.tolist() if isinstance(found, Velocity) else list(found[1:4])), fault
 
 
 def stamp_from_msg(msg: Any) -> int:
@@ -147,13 +143,8 @@ def imu_from_msg(msg: Any) -> tuple[int, np.ndarray, np.ndarray]:
             np.array([force.x, force.y, force.z]))
 
 
-def fix_from_msg(msg: Any) -> Fix:
-    """Convert sensor_msgs/NavSatFix; a covariance of unknown type or without sense is None."""
-    return fixes_from_msgs([msg])[0]
-
-
 def fixes_from_msgs(msgs: Sequence[Any]) -> list[Fix]:
-    """Convert many messages like `fix_from_msg`."""
+    """Convert sensor_msgs/NavSatFix; a covariance of unknown type or without sense is None."""
     return fixes([stamp_from_msg(msg) for msg in msgs],
                  [[msg.latitude, msg.longitude, msg.altitude] for msg in msgs],
                  np.array([msg.position_covariance for msg in msgs], float).reshape(-1, 3, 3),
@@ -176,13 +167,8 @@ def fixes(stamps_ns: ArrayLike, places: ArrayLike, covariances: np.ndarray,
                    _usable_covariances(covariances, None))]
 
 
-def velocity_from_msg(msg: Any, config: Config) -> Velocity:
-    """Convert the message that ``config.velocity_type`` names, like `velocities`."""
-    return velocities_from_msgs([msg], config)[0]
-
-
 def velocities_from_msgs(msgs: Sequence[Any], config: Config) -> list[Velocity]:
-    """Convert many messages of the same `frame_of_velocity` like `velocity_from_msg`."""
+    """Convert messages of ``config.velocity_type`` and of one frame like `velocities`."""
     covariances = None
     if config.velocity_type == 'Vector3Stamped':
         linear = [msg.vector for msg in msgs]
@@ -202,11 +188,6 @@ def frame_of_velocity(msg: Any, velocity_type: str) -> str:
     return frame
 
 
-def is_body_frame(frame: str) -> bool:
-    """Whether a frame_id is one of the customary names of a body frame."""
-    return _BODY_FRAME.search(frame) is not None
-
-
 def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
                covariances: np.ndarray | None, config: Config) -> list[Velocity]:
     """
@@ -218,7 +199,7 @@ def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
     (N, 6, 6), are those of twists. The frame of a body is a MessageError, unless
     ``config.velocity_frame`` says otherwise.
     """
-    if config.velocity_frame == 'auto' and is_body_frame(frame):
+    if config.velocity_frame == 'auto' and _BODY_FRAME.search(frame):
         raise MessageError(
             f'the velocity is given in the body frame {frame[:80]!r}: an alignment needs it in a '
             'world frame, east-north-up or north-east-down; if it is in one, whatever its '

@@ -85,29 +85,8 @@ class ImuBuffer:
     """
     IMU samples that are not integrated yet, in the order of their stamps.
 
-    Parameters
-    ----------
-    lateness_ns : int
-        How far out of order a sample may arrive.
-    counts : Counter
-        Where is counted what becomes of samples, by names that begin with ``imu``.
-    stated : ImuNoise, optional
-        What noise the sensors have at least.
-
-    Attributes
-    ----------
-    stamps : ndarray of int, shape (N,)
-        Of what is sorted, strictly increasing, ns.
-    samples : ndarray, shape (N, 6)
-        Angular rate, rad/s, and specific force, m/s^2; in Fortran order, so that each axis is
-        contiguous in memory.
-    newest_ns : int or None
-        The newest stamp that has come.
-    used_ns : int
-        Up to here samples are cut: what comes later and is older is late.
-    jumped_to_ns : int or None
-        Where the clock has jumped back to.
-
+    Samples may arrive out of order by `lateness_ns`. What becomes of them is counted by names
+    that begin with ``imu``; `stated` is the noise that the sensors have at least.
     """
 
     def __init__(self, lateness_ns: int, counts: Counter[str],
@@ -117,17 +96,20 @@ class ImuBuffer:
         self._reach_ns = max(lateness_ns, MAX_GAP_NS)
         self._counts = counts
         self._stated = np.array(stated[:2])
+        # What is sorted: stamps, (N,), strictly increasing, ns; angular rate, rad/s, and specific
+        # force, m/s^2, (N, 6), in Fortran order, so that each axis is contiguous in memory.
         self.stamps = np.zeros(0, np.int64)
         self.samples = np.zeros((0, 6), order='F')
         # What is not sorted into these yet: stamps and samples, of one sample or of many.
         self._new: list[tuple[ArrayLike, ArrayLike]] = []
-        self.newest_ns: int | None = None
+        self.newest_ns: int | None = None           # that has come
         self._suspect_ns: int | None = None
         # A sample far ahead of the others, until the next one shows whether time goes on there.
         self._ahead: tuple[int, Array, Array] | None = None
         # The samples in a row behind the newest one: that one, the first, the last, how many.
         self._behind: tuple[int | None, int, int, int] = None, 0, 0, 0
-        self.jumped_to_ns: int | None = None
+        self.jumped_to_ns: int | None = None        # where the clock has jumped back to
+        # Up to here samples are cut: what comes later and is older is late.
         self.used_ns = -(1 << 62)
         self._range = RangeCheck()
         self._checked_ns = 0                # up to where it has seen them

@@ -104,21 +104,7 @@ def stuck(stamps: Index, samples: Array) -> list[tuple[int, int, int]]:
 
 
 class RangeCheck:
-    """
-    Notices that an IMU is at the end of its range: the same extreme comes again and again.
-
-    Attributes
-    ----------
-    stamps : ndarray of int, shape (M,)
-        Samples at the end of the range, ns.
-    densities : ndarray, shape (M, 2)
-        What the motion may have been beyond it from each to the next, as noise of gyros and
-        accelerometers, rad/sqrt(s) and m/s/sqrt(s).
-    blind : list of int
-        Stamps at which the gyros may have missed another `BLIND_ANGLE` since they were within
-        their range.
-
-    """
+    """Notices that an IMU is at the end of its range: an extreme comes again and again."""
 
     def __init__(self) -> None:
         """Start with no samples."""
@@ -131,7 +117,11 @@ class RangeCheck:
         # The last sample within the range, of gyros and accelerometers, ns.
         self._within_ns = np.zeros(2, np.int64)
         self._angles = 0.0                  # so many times the blind angle
+        # Of M samples at the end of the range, ns, and what the motion may have been beyond it
+        # from each to the next, (M, 2), as noise of gyros and accelerometers, rad/sqrt(s) and
+        # m/s/sqrt(s).
         self.stamps, self.densities = np.zeros(0, np.int64), np.zeros((0, 2))
+        # Where the gyros may have missed another `BLIND_ANGLE` since they were within it, ns.
         self.blind: list[int] = []
 
     def add(self, stamps: Index, samples: Array) -> None:

@@ -39,20 +39,9 @@ class Prediction:
     """
     An attitude that gyroscopes carry on from an epoch.
 
-    Parameters
-    ----------
-    attitude : Attitude
-        At the epoch.
-    gyro_bias, gyro_matrix : ndarray, shape (3,) and (3, 3)
-        The rate is ``measured - gyro_matrix @ measured - gyro_bias``, rad/s.
-    gyro_bias_std : float
-        How far the rate may be off steadily, rad/s. That the Earth turns, too, is left out of the
-        rate and counts as an error.
-    angle_random_walk : float
-        Of the gyroscopes, rad/sqrt(s).
-    rate : ndarray, shape (3,)
-        As measured at the epoch, rad/s.
-
+    The rate is ``measured - gyro_matrix @ measured - gyro_bias``, rad/s, and may be off steadily
+    by `gyro_bias_std`; that the Earth turns, too, is left out of it and counts as an error.
+    `angle_random_walk` is in rad/sqrt(s), `rate` is what was measured at the epoch, shape (3,).
     """
 
     def __init__(self, attitude: Attitude, gyro_bias: Array, gyro_matrix: Array,

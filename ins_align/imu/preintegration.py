@@ -64,42 +64,23 @@ class Intervals:
     """
     Preintegrated IMU data of K intervals, each in the body frame at the interval's start.
 
-    Attributes
-    ----------
-    duration : ndarray, shape (K,)
-        Seconds.
-    R : ndarray, shape (K, 3, 3)
-        Rotation from the body frame at the end to the one at the start.
-    v, p : ndarray, shape (K, 3)
-        Integral and double integral of the specific force, m/s and m.
-    J_Rg, J_vg, J_pg, J_va, J_pa : ndarray, shape (K, 3, 12)
-        Derivatives to bias and matrix of the gyros (g) and of the accelerometers (a), in the order
-        of `SensorErrors.of`: of the rotation as a left error (``R <- exp_so3(J_Rg d) R``), of v,
-        of p.
-    Q : ndarray, shape (K, 9, 9)
-        Covariance of the errors (rotation at the start, v, p) that the sensors' noise leaves.
-    Q_excess : ndarray, shape (K, 9, 9)
-        The same for the noise that was measured in excess of what is stated.
-    omega : ndarray, shape (K, 3)
-        Angular rate at the end of the interval, as measured.
-    gained, turned : ndarray, shape (K, RUNGS, 3)
-        Before the end of the interval, as measured; see `Recent`.
-
+    Errors of rotation are left ones (``R <- exp_so3(J_Rg d) R``). J are derivatives to bias and
+    matrix of the gyros (g) or of the accelerometers (a), in the order of `SensorErrors.of`.
     """
 
-    duration: Array
-    R: Array
-    v: Array
-    p: Array
-    J_Rg: Array
+    duration: Array     # (K,), s
+    R: Array            # (K, 3, 3), from the body frame at the end to the one at the start
+    v: Array            # (K, 3), integral of the specific force, m/s
+    p: Array            # (K, 3), double integral, m
+    J_Rg: Array         # (K, 3, 12)
     J_vg: Array
     J_pg: Array
     J_va: Array
     J_pa: Array
-    Q: Array
-    Q_excess: Array
-    omega: Array
-    gained: Array
+    Q: Array            # (K, 9, 9), of the errors (rotation, v, p) that the sensors' noise leaves
+    Q_excess: Array     # the same for the noise that was measured in excess of what is stated
+    omega: Array        # (K, 3), angular rate at the end, as measured, rad/s
+    gained: Array       # (K, RUNGS, 3), before the end, as measured; see `Recent`
     turned: Array
 
     def take(self, index: 'slice | Array') -> 'Intervals':

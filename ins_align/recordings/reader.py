@@ -29,7 +29,7 @@ from ins_align.geometry.rotation import Transform
 from ins_align.gnss.drivers import (
     DRIVER_TYPES, imu_from_driver, INERTIAL_UNITS, LIVE_TYPES, NoTimeError, receiver_from_msg,
     RECEIVERS, type_in_words)
-from ins_align.gnss.messages import MessageError, velocity_from_msg
+from ins_align.gnss.messages import MessageError, velocities_from_msgs
 from ins_align.mounting import find_mounting, FixedFrames, Mounting
 from ins_align.recordings import BagError, listed, Topic
 from ins_align.recordings.bag import Bag, Block
@@ -306,7 +306,7 @@ def _measures(bag: Bag, topic: Topic, config: Config = Config(), say: bool = Tru
         elif topic.msgtype in INERTIAL_UNITS:
             imu_from_driver(message, topic.msgtype)
         elif topic.msgtype in VELOCITY_TYPES:
-            velocity_from_msg(message, dataclasses.replace(
+            velocities_from_msgs([message], dataclasses.replace(
                 config, velocity_type=short_name(topic.msgtype)))
     except MessageError as error:
         if say:

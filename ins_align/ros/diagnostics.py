@@ -15,7 +15,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import re
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -24,6 +24,7 @@ from ins_align.config import Config, Parameter, parameters
 from ins_align.gnss.drivers import type_in_words
 from ins_align.mounting import Mounting
 from ins_align.results import Status, status_values
+from ins_align.ros.inputs import VELOCITY_TOPIC, VELOCITY_TYPES
 import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.node import Node
@@ -38,27 +39,25 @@ class ReasonLog:
 
     def __init__(self) -> None:
         """Start with nothing logged."""
-        self._logged: dict[str, float] = {}  # kinds of the last seconds, and when
-        self._present: set[str] = set()
+        # When kinds of parts that are present, or were lately, were logged last.
+        self._logged: dict[str, float] = {}
 
     def note(self, text: str, now: float) -> None:
         """Take a state with its reason for logged."""
-        kinds = [_kind(part) for part in text.split('; ')]
-        self._present.update(kinds)
-        self._logged.update(dict.fromkeys(kinds, now))
+        self._logged.update(dict.fromkeys(map(_kind, text.split('; ')), now))
 
     def due(self, parts: Sequence[str], now: float, again: bool) -> list[tuple[str, bool]]:
         """
-        Return the parts to log, and whether they were there before; they are taken for logged.
+        Return the parts to log, and whether each was there before; they are taken for logged.
 
         Other numbers in a part make no other kind; `again`: what stays is logged again and again.
         """
+        kinds = {_kind(part): part for part in parts}
         self._logged = {kind: when for kind, when in self._logged.items()
-                        if now - when < LOG_AGAIN}
-        before, kinds = self._present, [_kind(part) for part in parts]
-        self._present = set(kinds)
-        found = [(part, kind in before) for part, kind in zip(parts, kinds)
-                 if kind not in self._logged and (again or kind not in before)]
+                        if kind in kinds or now - when < LOG_AGAIN}
+        found = [(part, kind in self._logged) for kind, part in kinds.items()
+                 if kind not in self._logged
+                 or (again and now - self._logged[kind] >= LOG_AGAIN)]
         self._logged.update((_kind(part), now) for part, _ in found)
         return found
 
@@ -86,13 +85,13 @@ def inputs_in_words(node: Node, inputs: Mapping[str, type], config: Config) -> s
             'other parameters at their defaults')
 
 
-def topic_faults(node: Node, inputs: Mapping[str, type], expected: Iterable[str],
-                 velocity_types: Mapping[str, type]) -> Iterator[str]:
+def topic_faults(node: Node, inputs: Mapping[str, type], expected: Sequence[str],
+                 ) -> Iterator[str]:
     """
     Look at the publishers of the topics that a node reads, and say what is wrong with them.
 
-    `inputs` and `velocity_types` are message types by topic and by the parameter velocity_type;
-    topics that are `expected` are worth a word where nobody publishes them.
+    `inputs` are message types by topic; topics that are `expected` are worth a word where nobody
+    publishes them.
     """
     for topic, msg_type in inputs.items():
         name = node.resolve_topic_name(topic)
@@ -103,8 +102,8 @@ def topic_faults(node: Node, inputs: Mapping[str, type], expected: Iterable[str]
         if not types or wanted in types:
             continue
         other = min(types)
-        known = [parameter for parameter, velocity in velocity_types.items()
-                 if msg_type in velocity_types.values() and type_name(velocity) == other]
+        known = [parameter for parameter, velocity in VELOCITY_TYPES.items()
+                 if topic == VELOCITY_TOPIC and type_name(velocity) == other]
         hint = f': set velocity_type to {known[0]}' if known else ''
         yield f'{name} is published as {type_in_words(other)}, not {type_in_words(wanted)}{hint}'
 

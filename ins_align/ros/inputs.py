@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-What the node reads: IMU messages as bytes, the GNSS topics with their types.
+What the node reads: IMU messages as bytes, the GNSS topics with their types, /tf_static.
 
 Turning every IMU sample into a Python message and back costs several times what the alignment
 itself does with it, so the node takes its bytes as they arrive and changes them in place.
@@ -27,12 +27,17 @@ from typing import Any, NamedTuple
 
 from geometry_msgs.msg import TwistStamped, TwistWithCovarianceStamped, Vector3Stamped
 from ins_align.config import Config, ConfigError
+from ins_align.geometry.rotation import Transform
 from ins_align.gnss.drivers import LIVE_TYPES, receiver_from_msg
-from ins_align.gnss.messages import Fix, fix_from_msg, imu_from_msg, Velocity, velocity_from_msg
+from ins_align.gnss.messages import (
+    Fix, fixes_from_msgs, imu_from_msg, velocities_from_msgs, Velocity)
+from ins_align.mounting import Lookup, transform_from_msg
 from nav_msgs.msg import Odometry
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
+from rclpy.time import Time
 from sensor_msgs.msg import Imu, NavSatFix
 
 FIX_TOPIC, VELOCITY_TOPIC = 'fix', 'fix_velocity'
@@ -99,7 +104,7 @@ def with_orientation(data: bytes, quaternion_xyzw: Sequence[float],
     return bytes(changed)
 
 
-class Gate(CallbackGroup):
+class Gate(ReentrantCallbackGroup):
     """
     Keeps a subscription from its executor while it is closed.
 
@@ -112,13 +117,6 @@ class Gate(CallbackGroup):
     def can_execute(self, entity: Any) -> bool:
         """Whether the executor may take messages."""
         return self.is_open
-
-    def beginning_execution(self, entity: Any) -> bool:
-        """Allow it."""
-        return True
-
-    def ending_execution(self, entity: Any) -> None:
-        """Do nothing."""
 
 
 def queued(subscription: Subscription) -> list[tuple[Any, int]]:
@@ -153,7 +151,28 @@ def gnss_topics(config: Config) -> dict[str, type]:
 def gnss_from_msg(topic: str, msg: Any, config: Config) -> Sequence[Fix | Velocity]:
     """Return what a message of a topic carries; a MessageError says why it cannot be used."""
     if topic == VELOCITY_TOPIC:
-        return [velocity_from_msg(msg, config)]
+        return velocities_from_msgs([msg], config)
     if config.fix_type == 'NavSatFix':
-        return [fix_from_msg(msg)]
+        return fixes_from_msgs([msg])
     return receiver_from_msg(msg, LIVE_TYPES[config.fix_type], config)
+
+
+def open_static_tf(node: Node, config: Config) -> Lookup | None:
+    """Return a lookup in /tf_static; None: it is not wanted, or there is no tf2_ros."""
+    if config.lever_arm_from_tf is False and not config.base_frame:
+        return None
+    try:
+        tf2_ros = import_module('tf2_ros')
+    except ModuleNotFoundError:
+        return None
+    buffer = tf2_ros.Buffer()
+    buffer.listener = tf2_ros.TransformListener(buffer, node)  # which would otherwise be gone
+    # A lever arm does not move, and /tf is too much for a small computer.
+    node.destroy_subscription(buffer.listener.tf_sub)
+
+    def lookup(target: str, source: str) -> Transform | None:
+        if not buffer.can_transform(target, source, Time()):
+            return None
+        return transform_from_msg(buffer.lookup_transform(target, source, Time()).transform)
+
+    return lookup

@@ -30,19 +30,10 @@ _SOURCE_LINES = re.compile(r', at \S+:\d+')  # where in its sources rcl found an
 
 def main(args: Sequence[str] | None = None) -> int:
     """
-    Run the node until it is interrupted.
+    Run the node until it is interrupted; `args` are by default those of the process.
 
-    Parameters
-    ----------
-    args : sequence of str, optional
-        Arguments behind the program's name; by default those of the process.
-
-    Returns
-    -------
-    int
-        Exit status: 0 after an interruption, 2 if an argument or a parameter is wrong, or without
-        a ROS installation.
-
+    Returns the exit status: 0 after an interruption, 2 if an argument or a parameter is wrong, or
+    without a ROS installation.
     """
     keep_to_one()  # several times as cheap
 

@@ -37,14 +37,13 @@ from ins_align.config import (
     without_unknown)
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
-from ins_align.mounting import Mounting
+from ins_align.mounting import Mounting, MountingSearch
 from ins_align.results import level_of, Severity, WARN
 from ins_align.ros.diagnostics import (
     diagnostic_status, inputs_in_words, parameter_descriptor, ReasonLog, topic_faults, vector_msg)
-from ins_align.ros.frames import MountingSearch, open_buffer
 from ins_align.ros.inputs import (
-    FIX_TOPIC, Gate, gnss_from_msg, gnss_topics, ImuSample, queued, read_imu, REJECTED_AS,
-    VELOCITY_TOPIC, VELOCITY_TYPES, with_orientation)
+    FIX_TOPIC, Gate, gnss_from_msg, gnss_topics, ImuSample, open_static_tf, queued, read_imu,
+    REJECTED_AS, VELOCITY_TOPIC, with_orientation)
 import numpy as np
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -81,17 +80,7 @@ class AlignmentNode(Node):
     with the attitude that the worker knew last, carried on with the gyros since: at once while
     somebody listens, otherwise it takes them several times a second, which costs half. The
     worker, a thread of its own that no callback waits for, aligns several times a second.
-
-    Attributes
-    ----------
-    failure : exception or None
-        What ended the worker, and with it the context.
-
-    Raises
-    ------
-    ConfigError
-        If a parameter is wrong.
-
+    A parameter that is wrong is a ConfigError.
     """
 
     def __init__(self) -> None:
@@ -104,9 +93,9 @@ class AlignmentNode(Node):
                 raise
             raise ConfigError('the value of a parameter is an empty list: write its numbers, as '
                               'lever_arm:=[0.0, 0.0, 0.0], or leave it out') from None
-        self.failure: BaseException | None = None
+        self.failure: BaseException | None = None  # what ended the worker, and the context with it
         self._config = self._declare_parameters()
-        self._search = MountingSearch(self._config, open_buffer(self, self._config))
+        self._search = MountingSearch(self._config, open_static_tf(self, self._config))
         # From the executor to the worker: when it was received, ns, and a message or a request.
         self._inbox: deque[tuple[int, Any]] = deque()
         # From the worker to the executor, replaced as a whole: what ~/imu goes on from, None for
@@ -210,9 +199,7 @@ class AlignmentNode(Node):
         items, mounting = self._search.take(items, time.monotonic())
         if mounting is not None:
             self._use_mounting(mounting)
-        for received_ns, item in items:
-            self._feed(received_ns, item)
-        self._check([item for _, item in items])
+        self._feed(items)
         self._align()
         newest_ns = self._aligner.newest_imu_ns
         if newest_ns is not None and newest_ns != self._newest_imu_ns:
@@ -247,26 +234,23 @@ class AlignmentNode(Node):
         else:
             self.get_logger().info(text)
 
-    def _feed(self, received_ns: int, item: Any) -> None:
-        if isinstance(item, ImuSample):
-            if self._accepts_frame(item.frame_id, received_ns):
-                self._aligner.add_imu(item.stamp_ns, item.gyro, item.accel)
-        elif isinstance(item, Fix):
-            self._aligner.add_fix(item)
-        elif isinstance(item, Velocity):
-            self._aligner.add_velocity(item)
-        else:
-            item()
-
-    def _check(self, items: list[Any]) -> None:
-        """Let the checks see what has come from the IMU in use and from the GNSS."""
+    def _feed(self, items: list[tuple[int, Any]]) -> None:
+        """Give messages to the aligner and the checks, and do what is asked for in between."""
         samples: list[ImuSample] = []
-        gnss = []
-        for item in items:
-            if isinstance(item, ImuSample) and item.frame_id == self._imu_frame:
-                samples.append(item)
-            elif isinstance(item, (Fix, Velocity)):
+        gnss: list[tuple[int, Fix | Velocity]] = []  # with how many samples come before
+        for received_ns, item in items:
+            if isinstance(item, ImuSample):
+                if self._accepts_frame(item.frame_id, received_ns):
+                    self._aligner.add_imu(item.stamp_ns, item.gyro, item.accel)
+                    samples.append(item)
+            elif isinstance(item, Fix):
+                self._aligner.add_fix(item)
                 gnss.append((len(samples), item))
+            elif isinstance(item, Velocity):
+                self._aligner.add_velocity(item)
+                gnss.append((len(samples), item))
+            else:
+                item()
         stamps, gyro, accel, _ = zip(*samples) if samples else ((), (), (), ())
         self._checks.add(np.array(stamps, np.int64), np.array(gyro).reshape(-1, 3),
                          np.array(accel).reshape(-1, 3), gnss)
@@ -371,14 +355,13 @@ class AlignmentNode(Node):
             self._log_reason(reason.split('; '), more, status.state, now)
 
     def _input_faults(self, status: Status, silent: bool) -> list[str]:
-        """Say what is wrong with topics (nobody there, another type) and what they carry."""
+        """Say what is wrong with topics: nobody is there, or their type is another one."""
         expected = [topic for topic, wanted in (
             (IMU_TOPIC, silent or status.state is State.WAITING_FOR_IMU),
             (FIX_TOPIC, status.state is State.WAITING_FOR_GNSS),
             (VELOCITY_TOPIC, self._config.use_velocity is True
              and not status.counts.get('velocity'))) if wanted]
-        return [*topic_faults(self, self._inputs, expected, VELOCITY_TYPES),
-                *([] if status.state is State.ALIGNED else self._checks.late_messages())]
+        return list(topic_faults(self, self._inputs, expected))
 
     def _log_reason(self, reason: list[str], more: list[str], state: State, now: float) -> None:
         """Log what is new in the reason, and every 10 s what stays and is not as it should be."""
