@@ -214,7 +214,7 @@ def _add_replay(commands: Any) -> None:
                        help='skip this many seconds of the recording')
     group.add_argument('--duration', type=_seconds, metavar='S', help='read this many seconds')
     group.add_argument('--jobs', type=_count, metavar='N',
-                       help='processes; two can share a recording (default: one a processor)')
+                       help='recordings at a time (default: one a processor)')
     group.add_argument('--dask', metavar='ADDRESS',
                        help='process the recordings on the Dask cluster with this scheduler')
     group = command.add_argument_group('output')

@@ -26,7 +26,6 @@ from ins_align.config import Config, config_from_mapping
 from ins_align.geometry.rotation import Array, Index, Transform
 from ins_align.gnss import messages
 from ins_align.gnss.messages import fault_of_fix, Fix, Velocity
-from ins_align.processes import run_ahead
 from ins_align.results import Epoch, in_order_of_time, Reference, Result, State
 import numpy as np
 
@@ -98,8 +97,7 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
            imu_topic: str | None = None, fix_topic: str | None = None,
            velocity_topic: str | None = None,
            start: float | None = None, duration: float | None = None,
-           progress: Callable[[float], None] | None = None,
-           read_ahead: bool = False) -> Result:
+           progress: Callable[[float], None] | None = None) -> Result:
     """
     Align a recording.
 
@@ -115,8 +113,6 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
         Part of the recording, seconds from its start, by recorded time.
     progress : callable, optional
         Called with how much has been read, 0 to 1.
-    read_ahead : bool
-        Let another process read: the same result in less time.
 
     Returns
     -------
@@ -126,18 +122,15 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
     ------
     BagError
         If the recording cannot be read, lacks a topic, or has no messages in the part asked for.
-    BrokenProcessPool
-        If the other process is killed.
 
     """
-    from ins_align.recordings import reader  # with rosbags, which arrays do not need
+    from ins_align.recordings.reader import read  # with rosbags, which arrays do not need
 
-    request = reader.Request(path, config or Config(), imu_topic, fix_topic, velocity_topic,
-                             start, duration)
     run: _Run | None = None
     fixes: list[tuple[int, float, float]] = []
     orientations: list[tuple[np.ndarray, np.ndarray]] = []
-    for part in run_ahead(reader.read, request) if read_ahead else reader.read(request):
+    for part in read(path, config or Config(), imu_topic, fix_topic, velocity_topic, start,
+                     duration):
         run = run or _Run(part.config, part.topics.base)
         run.add(part.imu.stamps_ns, part.imu.gyro, part.imu.accel, part.gnss,
                 int(np.count_nonzero(~part.imu.decoded)))

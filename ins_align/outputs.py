@@ -16,7 +16,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures.process import BrokenProcessPool
 import dataclasses
 from dataclasses import dataclass
 import errno
@@ -68,8 +67,7 @@ class Outcome:
                                'want of memory; --jobs 1 takes less')
 
 
-def process(task: Task, read_ahead: bool = False,
-            progress: Callable[[float], None] | None = None) -> Outcome:
+def process(task: Task, progress: Callable[[float], None] | None = None) -> Outcome:
     """Replay one recording and write its files; whatever the user can put right is an error."""
     from ins_align.offline import replay
     from ins_align.recordings import BagError
@@ -79,7 +77,7 @@ def process(task: Task, read_ahead: bool = False,
         return str(error).replace(str(task.arguments['path']), task.name)
 
     try:
-        result = replay(**task.arguments, progress=progress, read_ahead=read_ahead)
+        result = replay(**task.arguments, progress=progress)
         if task.results:
             from ins_align.recordings.results_bag import write_results
             write_results(result, task.results)
@@ -92,8 +90,6 @@ def process(task: Task, read_ahead: bool = False,
                 plot(result).savefig, format=Path(task.plot).suffix[1:].lower(), dpi=120))
     except BagError as error:
         return Outcome.failed(task.name, named(error))
-    except BrokenProcessPool as error:
-        return Outcome.lost(task.name, error)
     except OSError as error:
         return Outcome.failed(task.name, f'cannot write {error.filename}: {error.strerror}')
     warnings = tuple(about(task.name, named(text)) for text in result.warnings)

@@ -72,18 +72,6 @@ def test_blocks_do_not_matter(flight, result, monkeypatch, block):
     assert numbers(replay(flight, CONFIG)) == numbers(result)
 
 
-def test_another_process_that_reads_does_not_matter(flight, result):
-    done = []
-    other = replay(flight, CONFIG, read_ahead=True, progress=done.append)
-    assert numbers(other) == numbers(result)
-    assert done[-1] == 1.0 and done == sorted(done)
-
-
-def test_errors_of_the_process_that_reads(tmp_path):
-    with pytest.raises(BagError, match='does not exist'):
-        replay(tmp_path / 'none', CONFIG, read_ahead=True)
-
-
 def test_format_does_not_matter(simulation, result, tmp_path):
     write_bag(simulation, tmp_path / 'flight', 'mcap')
     assert numbers(replay(tmp_path / 'flight', CONFIG)) == numbers(result)

@@ -37,7 +37,7 @@ from ins_align.gnss.motion import series_of, track
 from ins_align.offline import align
 from ins_align.recordings import BagError
 from ins_align.recordings.decode import ImuSamples, Orientations
-from ins_align.recordings.reader import read, REFERENCE_TOPIC, Request
+from ins_align.recordings.reader import read, REFERENCE_TOPIC
 from ins_align.results import Epoch, Reference
 import numpy as np
 
@@ -104,7 +104,7 @@ def recordings_in(folder: Path) -> list[Path]:
 @lru_cache(maxsize=3)
 def load(path: Path) -> Recording:
     """Read and decode a recording; the last few are kept."""
-    parts = list(read(Request(path)))
+    parts = list(read(path))
     if parts[0].topics.reference is None:
         raise BagError(f'it has no reference attitude on {REFERENCE_TOPIC}')
     imu = ImuSamples(*map(np.concatenate, zip(*(part.imu for part in parts))))

@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 import dataclasses
-from dataclasses import dataclass
 import itertools
 from operator import attrgetter, itemgetter
 import os
@@ -57,19 +56,6 @@ class Topics(NamedTuple):
     base: Transform | None = None  # from the configured base to the IMU
 
 
-@dataclass(frozen=True)
-class Request:
-    """What to read of which recording: the arguments of `replay`."""
-
-    path: str | os.PathLike[str]
-    config: Config = Config()
-    imu_topic: str | None = None
-    fix_topic: str | None = None
-    velocity_topic: str | None = None
-    start: float | None = None  # s from the start of the recording, by recorded time
-    duration: float | None = None
-
-
 class Part(NamedTuple):
     """Consecutive messages of a recording, decoded."""
 
@@ -82,30 +68,30 @@ class Part(NamedTuple):
     warnings: tuple[str, ...]  # so far
 
 
-def read(request: Request) -> Iterator[Part]:
+def read(path: str | os.PathLike[str], config: Config = Config(), imu_topic: str | None = None,
+         fix_topic: str | None = None, velocity_topic: str | None = None,
+         start: float | None = None, duration: float | None = None) -> Iterator[Part]:
     """
-    Read a recording; the last part has no messages and all warnings.
+    Read a recording as `replay` does; the last part has no messages and all warnings.
 
     A BagError says that the recording cannot be read or lacks a topic, or that a part was asked
     for that holds no message of these topics.
     """
-    with Bag(request.path) as bag:
+    with Bag(path) as bag:
         try:
-            topics = choose_topics(bag, request.config, request.imu_topic, request.fix_topic,
-                                   request.velocity_topic)
+            topics = choose_topics(bag, config, imu_topic, fix_topic, velocity_topic)
         except BagError as error:
             reasons = f' ({bag.warnings[0]})' if bag.warnings else ''
             raise BagError(f'{error}{reasons}') from None
-        config = request.config
         if topics.velocity is not None and topics.velocity.msgtype in VELOCITY_TYPES:
             config = dataclasses.replace(config, velocity_type=short_name(topics.velocity.msgtype))
         mounting = _mounting(bag, topics, config)
         config, topics = mounting.config, topics._replace(base=mounting.base)
         wanted = list(dict.fromkeys(topic for topic in topics if isinstance(topic, Topic)))
         first_ns = bag.start_ns or 0
-        start_ns = None if request.start is None else first_ns + round(request.start * 1e9)
+        start_ns = None if start is None else first_ns + round(start * 1e9)
         begin_ns, end_ns = first_ns if start_ns is None else start_ns, bag.end_ns or first_ns
-        stop_ns = None if request.duration is None else begin_ns + round(request.duration * 1e9)
+        stop_ns = None if duration is None else begin_ns + round(duration * 1e9)
         length_ns = (end_ns if stop_ns is None else min(end_ns, stop_ns)) - begin_ns
         done, empty = 0.0, True
         for block in bag.blocks(wanted, start_ns, stop_ns):
@@ -114,8 +100,11 @@ def read(request: Request) -> Iterator[Part]:
             yield _decoded(block, wanted, topics, config, done, tuple(bag.warnings))
             empty = False
         if empty and (start_ns, stop_ns) != (None, None):
-            raise BagError(f'{request.path} has no IMU or GNSS messages '
-                           f'{_window(request, ((bag.end_ns or first_ns) - first_ns) * 1e-9)}')
+            from_s = start or 0.0
+            window = (f'after {from_s:g} s' if duration is None
+                      else f'between {from_s:g} s and {from_s + duration:g} s')
+            raise BagError(f'{path} has no IMU or GNSS messages {window}: it is '
+                           f'{((bag.end_ns or first_ns) - first_ns) * 1e-9:.1f} s long')
         nothing = Block(np.zeros(0, np.int64), np.zeros(0, np.int64), [()] * len(wanted))
         yield _decoded(nothing, wanted, topics, config, 1.0, tuple(bag.warnings))
 
@@ -148,14 +137,6 @@ def _frame_id(bag: Bag, topic: Topic) -> str:
     with suppress(MessageError, AttributeError):
         return str(deserialize(data or b'', topic).header.frame_id)
     return ''
-
-
-def _window(request: Request, length_s: float) -> str:
-    """Say which part of a recording was asked for, and how long all of it is."""
-    start = request.start or 0.0
-    window = (f'after {start:g} s' if request.duration is None
-              else f'between {start:g} s and {start + request.duration:g} s')
-    return f'{window}: it is {length_s:.1f} s long'
 
 
 def _decoded(block: Block, wanted: list[Topic], topics: Topics, config: Config, done: float,
