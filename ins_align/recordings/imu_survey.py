@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Surveys the samples of an IMU: unit, noise, bias, resolution, end of its range."""
+"""Surveys the samples of an IMU: unit, noise, bias, end of its range, dead band."""
 
 from __future__ import annotations
 
@@ -35,8 +35,6 @@ BIAS_SIGMAS = 2.5
 REST_SPEED = 0.3  # m/s below which a vehicle may stand
 REST_RATE, REST_FORCE = math.radians(1.0), 0.3  # rad/s, m/s^2: scatter of half seconds at rest
 MIN_REST = 5.0  # s
-ON_LATTICE = 0.1  # of a quantum: how far a value may be off its multiples
-MIN_REPEATS = 3  # samples for each value: with fewer the digits of a text may be the quantum
 MIN_ZEROS, MIN_ZERO_SHARE = 20, 0.01  # samples that are exactly 0 because of a dead band
 # What a chip reaches in a minute or two of turns, deg.
 CHIP_THRESHOLDS = {'tilt_std_threshold': 1.0, 'heading_std_threshold': 2.0}
@@ -108,52 +106,51 @@ def _add_end_of_range(imu: Surveyed, samples: Series) -> None:
 
 def _add_noise(imu: Surveyed, samples: Series, rest: tuple[float, float] | None, gravity: float,
                ) -> None:
-    """Add resolution, noise, biases and grade, of all or of what is at rest."""
+    """Add dead bands, noise, biases and grade, of all or of what is at rest."""
     times, values = samples
     part = slice(None) if rest is None else slice(*np.searchsorted(times, rest))
     rate, force = values[part].mean(axis=0).reshape(2, 3)
     off_gravity = float(np.linalg.norm(force) - gravity)
-    widths = [_add_resolution(imu, sensor, triad)
-              for sensor, triad in zip(SENSORS, np.split(values, 2, axis=1))]
     interval = float(np.median(np.diff(times)))
-    walks, lost = _walks(times[part], values[part], 0.5 if rest else QUIET).tolist(), [0.0, 0.0]
-    for k, width in enumerate(widths):
-        # Noise of half a quantum carries small values over it; less leaves an error that lasts.
-        if walks[k] < width * math.sqrt(interval):
-            lost[k] = width / math.sqrt(3.0)  # uniform, 1 sigma
-            walks[k] = max(walks[k], lost[k] * math.sqrt(interval))
+    walks, hidden = _walks(times[part], values[part], 0.5 if rest else QUIET).tolist(), [0.0, 0.0]
+    for k, (sensor, triad) in enumerate(zip(SENSORS, np.split(values, 2, axis=1))):
+        band, zeros = _dead_band(triad)
+        # Noise of this size carries smaller values over it.
+        if walks[k] < band * math.sqrt(interval):
+            imu.add(f'{sensor.name} have a dead band: less than {band / sensor.size:.2g} '
+                    f'{sensor.unit} becomes 0, {zeros:.0%} of the samples of an axis',
+                    **{f'{sensor.name}_dead_band': band})
+            hidden[k] = band / math.sqrt(3.0)  # uniform, 1 sigma: an error that lasts
+            walks[k] = max(walks[k], hidden[k] * math.sqrt(interval))
     # What the Earth's rate does not explain is bias, in whatever direction.
     bias = abs(float(np.linalg.norm(rate)) - EARTH_RATE) / math.sqrt(3.0)
-    measured = ImuNoise(*walks, *map(math.hypot, lost, (bias, off_gravity) if rest else (0, 0)))
+    measured = ImuNoise(*walks, *map(math.hypot, hidden, (bias, off_gravity) if rest else (0, 0)))
     grade, covers = _grade(measured)
     preset = PRESETS[grade if rest else Config.imu_grade]
-    settings, biases = {}, {}
-    # Other noise is measured by the alignment itself; what is rounded away does not look noisy.
-    if lost[0] and measured.angle_random_walk > preset.angle_random_walk:
+    settings = {}
+    # Noise is measured by the alignment itself; what a dead band hides does not look noisy.
+    if hidden[0] and measured.angle_random_walk > preset.angle_random_walk:
         settings['angle_random_walk'] = rounded(math.degrees(60.0 * measured.angle_random_walk))
-    if measured.gyro_bias_std > preset.gyro_bias_std * (1.0 if lost[0] else BIAS_SIGMAS):
-        biases['gyro_bias_std'] = rounded(math.degrees(measured.gyro_bias_std))
+    if measured.gyro_bias_std > preset.gyro_bias_std * (1.0 if hidden[0] else BIAS_SIGMAS):
+        settings['gyro_bias_std'] = rounded(math.degrees(measured.gyro_bias_std))
     if measured.accel_bias_std > preset.accel_bias_std * BIAS_SIGMAS:
-        biases['accel_bias_std'] = rounded(measured.accel_bias_std)
-    shown = [f'{walk / sensor.walk_size:.2g} {sensor.walk_unit}' + ' of rounding' * (hidden > 0.0)
-             for walk, hidden, sensor in zip(walks, lost, SENSORS)]
-    imu.add(f'noise: {", ".join(shown)}' + ('' if rest else ' at most, measured in motion'),
-            settings if rest else settings | biases,
+        settings['accel_bias_std'] = rounded(measured.accel_bias_std)
+    shown = ', '.join(f'{walk / sensor.walk_size:.2g} {sensor.walk_unit}'
+                      for walk, sensor in zip(walks, SENSORS))
+    imu.add(f'noise: {shown}' + ('' if rest else ' at most, measured in motion'),
             angle_random_walk=math.degrees(60.0 * walks[0]), velocity_random_walk=60.0 * walks[1])
     if rest is None:
         imu.add(f'imu_grade: {Config.imu_grade} is the default; not seen at rest, which would '
                 'show biases' + f'; its noise is no worse than that of {grade}' * covers,
-                imu_grade=grade)
+                settings, imu_grade=grade)
         return
     degrees_s = np.degrees(rate).tolist()
-    within = [f' +- {width / sensor.size:.2g}' * (hidden > 0.0)
-              for width, hidden, sensor in zip(widths, lost, SENSORS)]
     imu.add(f'at rest for {rest[1] - rest[0]:.0f} s: rate '
-            f'({", ".join(f"{each:+.4f}" for each in degrees_s)}){within[0]} deg/s, specific '
-            f'force {off_gravity:+.3f}{within[1]} m/s^2 off gravity', biases,
+            f'({", ".join(f"{each:+.4f}" for each in degrees_s)}) deg/s, specific '
+            f'force {off_gravity:+.3f} m/s^2 off gravity', settings,
             rest_s=rest[1] - rest[0], rest_rate_deg_s=degrees_s, rest_force_error=off_gravity)
-    noisy = any(walk > NOISE_MARGIN * limit and not hidden
-                for walk, limit, hidden in zip(walks, preset, lost))
+    noisy = any(walk > NOISE_MARGIN * limit and not lost
+                for walk, limit, lost in zip(walks, preset, hidden))
     imu.add(f'suits imu_grade {grade}' if covers else f'worse than imu_grade {grade}'
             + ': more noise is measured while aligning' * noisy,
             {} if grade == Config.imu_grade else
@@ -177,38 +174,24 @@ def _grade(measured: ImuNoise) -> tuple[str, bool]:
     return name, all(covered)
 
 
-def _add_resolution(imu: Surveyed, sensor: Sensor, values: Array) -> float:
+def _dead_band(values: Array) -> tuple[float, float]:
     """
-    Add the resolution of a sensor, values of shape (N, 3), of its coarsest axis.
+    Return what size is lost since axes read 0 instead, and how often the worst axis does.
 
-    Returns the largest error of what is rounded to a multiple of the quantum or to 0.
+    Of values of shape (N, 3). A filter may do so, and the rounding of a coarse sensor.
     """
-    quantum = dead_band = zeros = 0.0
+    band = zeros = 0.0
     for axis in values.T:
-        levels = np.unique(axis)
-        steps = np.diff(levels)
-        # Across a dead band there is no step of the quantum.
-        inner = steps[(levels[1:] != 0.0) & (levels[:-1] != 0.0)]
-        if inner.size and axis.size > MIN_REPEATS * levels.size:
-            q = float(np.median(inner[inner < 1.5 * inner.min()]))
-            if np.mean(np.abs(inner / q - np.round(inner / q)) < ON_LATTICE) > 0.99:
-                quantum = max(quantum, q)
         sizes = np.abs(axis[axis != 0.0])
         count = axis.size - sizes.size
-        zeros = max(zeros, count / axis.size)
         if sizes.size and count > max(MIN_ZEROS, MIN_ZERO_SHARE * axis.size):
             smallest = float(sizes.min())
             # Further out there are values as usual: else these zeros are something else.
-            if np.count_nonzero(sizes < 2.0 * smallest) > MIN_ZEROS and smallest > dead_band:
-                dead_band = smallest
-    dead_band *= dead_band > 1.5 * quantum
-    exactly = f': {zeros:.0%} of the samples of an axis are exactly 0' * (zeros > 0.01)
-    for figure, text, value in (
-            ('quantum', 'round to multiples of', quantum),
-            ('dead_band', 'have a dead band: nothing between 0 and', dead_band)):
-        line = f'{sensor.name} {text} {value / sensor.size:.2g} {sensor.unit}{exactly}'
-        imu.add(line if value else '', **{f'{sensor.name}_{figure}': value})
-    return max(0.5 * quantum, dead_band)
+            if np.count_nonzero(sizes < 2.0 * smallest) > MIN_ZEROS:
+                rounds = not np.any((sizes > 1.1 * smallest) & (sizes < 1.9 * smallest))
+                band = max(band, smallest * (0.5 if rounds else 1.0))
+                zeros = max(zeros, count / axis.size)
+    return band, zeros
 
 
 def _walks(times: Array, values: Array, quiet: float) -> Array:
