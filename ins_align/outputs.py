@@ -20,6 +20,7 @@ import dataclasses
 from dataclasses import dataclass
 import errno
 from functools import partial
+from importlib import import_module
 import os
 from pathlib import Path
 from typing import Any, IO
@@ -187,12 +188,7 @@ def _spoilt(target: Path, inputs: Sequence[str]) -> str:
 
 def check_plot(path: str) -> None:
     """Find out before the work whether a figure can be drawn in the format that is asked for."""
-    from importlib.util import find_spec
-
-    suffix = Path(path).suffix.lower()
-    if suffix not in PLOT_SUFFIXES:
+    if Path(path).suffix.lower() not in PLOT_SUFFIXES:
         raise UsageError(f'cannot draw {path}: its name must end with one of '
                          f'{", ".join(PLOT_SUFFIXES)}')
-    if find_spec('matplotlib') is None:
-        raise UsageError(f'--plot {path} needs matplotlib, which is not installed: '
-                         'pip install matplotlib')
+    import_module('matplotlib')

@@ -24,13 +24,11 @@ import signal
 import threading
 from typing import Any, TypeVar
 
+from ins_align.outputs import UsageError
+
 T = TypeVar('T')
 VARIABLES = ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'OMP_NUM_THREADS')
 CONNECT_TIMEOUT = 10.0  # s, to the scheduler of a Dask cluster
-
-
-class ClusterError(RuntimeError):
-    """A Dask cluster that cannot be used; the text says why in one sentence."""
 
 
 def processors() -> int:
@@ -68,23 +66,20 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def run_all(function: Callable[..., T], tasks: Sequence[Any], jobs: int,
-            progress: Callable[[float], None]) -> Iterator[T | Exception]:
+def run_all(function: Callable[[Any], T], tasks: Sequence[Any], jobs: int,
+            ) -> Iterator[T | Exception]:
     """
     Do tasks in so many processes; yield in their order what a function returns of each.
 
-    One job is this process; there the function has the option `progress`, which is called with its
-    share. That of all is called with the number of tasks done. Where the process of a task is gone,
-    the exception that says so takes the place of what it should have returned.
+    One job is this process. Where the process of a task is gone, the exception that says so takes
+    the place of what it should have returned.
     """
-    if jobs == 1 or len(tasks) == 1:
-        for index, task in enumerate(tasks):
-            yield function(task, progress=lambda part: progress(index + part))
-            progress(index + 1.0)
+    if jobs == 1:
+        yield from map(function, tasks)
         return
     executor = pool(min(jobs, len(tasks)))
     try:
-        yield from _in_order(executor, function, tasks, progress, BrokenProcessPool)
+        yield from _in_order(executor, function, tasks, BrokenProcessPool)
     except BaseException:
         for child in multiprocessing.active_children():
             child.terminate()
@@ -93,45 +88,40 @@ def run_all(function: Callable[..., T], tasks: Sequence[Any], jobs: int,
         executor.shutdown(cancel_futures=True)
 
 
-def run_on_cluster(function: Callable[..., T], tasks: Sequence[Any], address: str,
-                   progress: Callable[[float], None]) -> Iterator[T | Exception]:
+def run_on_cluster(function: Callable[[Any], T], tasks: Sequence[Any], address: str,
+                   ) -> Iterator[T | Exception]:
     """
-    Do tasks on a Dask cluster, otherwise as `run_all`; a ClusterError says what is missing.
+    Do tasks on a Dask cluster, otherwise as `run_all`; a UsageError says that there is none.
 
     The workers read and write the files: they need the same folders as this machine. What a worker
     that dies had in hand, another one does again; files are replaced as a whole.
     """
     import asyncio
 
-    try:
-        from distributed import Client
-    except ImportError:
-        raise ClusterError('--dask needs Dask, which is not installed: '
-                           'pip install distributed') from None
+    from distributed import Client
+
     try:
         # A client by itself waits for a stranger for ever.
         asyncio.run(asyncio.wait_for(_ask_scheduler(address), CONNECT_TIMEOUT))
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except Exception as error:  # strangers answer all kinds of things
         reason = f'{type(error).__name__}: {error}'.partition('\n')[0].rstrip(': ')
-        raise ClusterError(f'no Dask scheduler answers at {address} ({reason}); an address is '
-                           'like tcp://localhost:8786') from None
+        raise UsageError(f'no Dask scheduler answers at {address} ({reason}); an address is '
+                         'like tcp://localhost:8786') from None
     with client, client.get_executor() as executor:
-        yield from _in_order(executor, function, tasks, progress, Exception)
+        yield from _in_order(executor, function, tasks, Exception)
 
 
-def _in_order(executor: Executor, function: Callable[..., T], tasks: Sequence[Any],
-              progress: Callable[[float], None], lost: type[Exception],
-              ) -> Iterator[T | Exception]:
+def _in_order(executor: Executor, function: Callable[[Any], T], tasks: Sequence[Any],
+              lost: type[Exception]) -> Iterator[T | Exception]:
     """Yield what comes of tasks; `lost` says that whoever worked on one is gone."""
     futures = [executor.submit(function, task) for task in tasks]
     try:
-        for index, future in enumerate(futures):
+        for future in futures:
             try:
                 yield future.result()
             except lost as error:
                 yield error
-            progress(index + 1.0)
     finally:
         for future in futures:
             future.cancel()
