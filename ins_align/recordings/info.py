@@ -46,8 +46,6 @@ import numpy as np
 MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
 MIN_AHEAD = 0.3  # s: clocks that differ by less may be jitter
 MAX_AHEAD, MAX_BEHIND = MAX_AHEAD_NS * 1e-9, 10.0  # s: stamps further apart are of two clocks
-MIN_APART = 5.0  # s between manoeuvres that are listed
-MAX_LISTED = 8
 FRAMES_THAT_FIT = ('enu', 'ned')
 FRAME_FAULTS = {
     'body': 'its speed fits the change of position and its direction does not: it is given in the '
@@ -105,10 +103,9 @@ def inspect(path: str | os.PathLike[str]) -> Info:
         imu, fix = (_best(of_kind) or next(iter(of_kind), None) for of_kind in (imus, fixes))
         chosen = {'imu': imu, 'fix': fix, 'velocity': velocity}
         # The end of a file that was cut off is known from what could be read of it.
-        start_ns = bag.start_ns or 0
-        end_ns = max([bag.end_ns or start_ns, *(
+        end_ns = max([bag.end_ns, *(
             int(data.recorded_ns.max()) for data in candidates if data.recorded_ns.size)])
-        info = Info(str(bag.path), (end_ns - start_ns) * 1e-9, start_ns,
+        info = Info(str(bag.path), (end_ns - bag.start_ns) * 1e-9, bag.start_ns,
                     tuple(data for of_kind in topics for data in of_kind),
                     {kind: data and data.name for kind, data in chosen.items()})
         _add_manoeuvres(info, find_manoeuvres(motion))
@@ -210,12 +207,8 @@ def _add_manoeuvres(info: Info, found: Manoeuvres | None) -> None:
     info.add(f'up to {found.max_speed:.1f} m/s; velocity changes by up to '
              f'{found.largest_change:.1f} m/s within {MANOEUVRE_TIME:g} s',
              max_speed=found.max_speed, largest_change=found.largest_change)
-    apart = [start for before, start in zip((-math.inf, *found.starts), found.starts)
-             if start - before > MIN_APART]
-    listing = [f'{start:.0f}' for start in apart[:MAX_LISTED]] + ['...'] * (
-        len(apart) > MAX_LISTED)
-    info.add(f'changes by {MANOEUVRE_SPEED:g} m/s: {len(found.starts)}, at '
-             f'{", ".join(listing)} s' if apart else '', manoeuvres_s=list(found.starts))
+    info.add(f'changes by {MANOEUVRE_SPEED:g} m/s: {len(found.starts)}, the first at '
+             f'{found.starts[0]:.0f} s' if found.starts else '', manoeuvres_s=list(found.starts))
 
 
 def _different_clocks(imu: Recorded, gnss: list[Recorded]) -> list[str]:
