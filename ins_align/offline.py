@@ -128,7 +128,7 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
 
     run: _Run | None = None
     fixes: list[tuple[int, float, float]] = []
-    orientations: list[tuple[np.ndarray, np.ndarray]] = []
+    references: list[tuple[np.ndarray, np.ndarray]] = []
     for part in read(path, config or Config(), imu_topic, fix_topic, velocity_topic, start,
                      duration):
         run = run or _Run(part.config, part.topics.base)
@@ -137,15 +137,15 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
         fixes += [(message.stamp_ns, message.latitude_deg, message.longitude_deg)
                   for _, message in part.gnss
                   if isinstance(message, Fix) and not fault_of_fix(message)]
-        orientations.append(part.orientations.known())
+        references.append(part.reference.orientations()[:2])
         if progress is not None:
             progress(part.done)
     assert run is not None
     first_fix_ns = fixes[0][0] if fixes else 0
     return run.result(
         bag=str(path), warnings=part.warnings, topics=part.topics, first_fix_ns=first_fix_ns,
-        reference=Reference(*orientations) if any(
-            stamps_ns.size for stamps_ns, _ in orientations) else None,
+        reference=Reference(*references) if any(
+            stamps_ns.size for stamps_ns, _ in references) else None,
         track=np.array([(stamp_ns - first_fix_ns, *place)
                         for stamp_ns, *place in fixes]).reshape(-1, 3))
 

@@ -25,7 +25,7 @@ from ins_align.config import Config
 from ins_align.geometry.rotation import exp_so3, matrix_from_rpy, quaternion_from_matrix
 from ins_align.offline import replay
 from ins_align.recordings import bag, BagError
-from ins_align.recordings.decode import Orientations
+from ins_align.recordings.decode import ImuSamples
 from ins_align.results import CSV_HEADER, Reference
 from ins_align.simulation.simulate import feed, simulate, write_bag
 import numpy as np
@@ -259,9 +259,11 @@ def test_attitudes_that_are_not_known_are_left_out():
     covariances = np.full((5, 9), 0.1)
     covariances[1, 0] = -1.0
     quaternions[2], quaternions[3, 1] = 0.0, np.nan
-    known_stamps, known = Orientations(stamps, quaternions, covariances).known()
+    samples = ImuSamples(stamps, np.hstack([quaternions, covariances]), np.ones(5, bool))
+    known_stamps, known, known_covariances = samples.orientations()
     np.testing.assert_array_equal(known_stamps, [0, 4])
     np.testing.assert_array_equal(known, quaternions[[0, 4]])
+    np.testing.assert_array_equal(known_covariances, covariances[[0, 4]])
 
 
 def test_reference_comes_in_parts_in_any_order():

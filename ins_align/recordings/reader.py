@@ -33,8 +33,8 @@ from ins_align.mounting import find_mounting, FixedFrames, Mounting
 from ins_align.recordings import BagError, listed, Topic
 from ins_align.recordings.bag import Bag, Block
 from ins_align.recordings.decode import (
-    decode_gnss, decode_imu, decode_orientations, deserialize, FIX_TYPE, Gnss, IMU_TYPE,
-    ImuSamples, Orientations, short_name, unmeasured, VECTOR_TYPE, VELOCITY_TYPES)
+    decode_gnss, decode_imu, deserialize, FIX_TYPE, Gnss, IMU_TYPE, ImuSamples, short_name,
+    unmeasured, VECTOR_TYPE, VELOCITY_TYPES)
 from ins_align.results import Severity
 import numpy as np
 
@@ -63,7 +63,7 @@ class Part(NamedTuple):
     config: Config  # as requested, for the type of velocity that was found
     imu: ImuSamples
     gnss: tuple[tuple[int, Gnss], ...]  # each after how many of the IMU samples
-    orientations: Orientations
+    reference: ImuSamples  # whose orientations are those to compare with
     done: float  # how much of the recording this ends at, 0 to 1
     warnings: tuple[str, ...]  # so far
 
@@ -88,23 +88,20 @@ def read(path: str | os.PathLike[str], config: Config = Config(), imu_topic: str
         mounting = _mounting(bag, topics, config)
         config, topics = mounting.config, topics._replace(base=mounting.base)
         wanted = list(dict.fromkeys(topic for topic in topics if isinstance(topic, Topic)))
-        first_ns = bag.start_ns or 0
-        start_ns = None if start is None else first_ns + round(start * 1e9)
-        begin_ns, end_ns = first_ns if start_ns is None else start_ns, bag.end_ns or first_ns
+        begin_ns = bag.start_ns + round((start or 0.0) * 1e9)
         stop_ns = None if duration is None else begin_ns + round(duration * 1e9)
-        length_ns = (end_ns if stop_ns is None else min(end_ns, stop_ns)) - begin_ns
-        done, empty = 0.0, True
-        for block in bag.blocks(wanted, start_ns, stop_ns):
-            if length_ns > 0:
-                done = min(max((int(block.times_ns[-1]) - begin_ns) / length_ns, 0.0), 1.0)
+        length_ns = (bag.end_ns if stop_ns is None else min(bag.end_ns, stop_ns)) - begin_ns
+        empty = True
+        for block in bag.blocks(wanted, None if start is None else begin_ns, stop_ns):
+            done = float(np.clip((block.times_ns[-1] - begin_ns) / max(length_ns, 1), 0.0, 1.0))
             yield _decoded(block, wanted, topics, config, done, tuple(bag.warnings))
             empty = False
-        if empty and (start_ns, stop_ns) != (None, None):
+        if empty and (start, duration) != (None, None):
             from_s = start or 0.0
             window = (f'after {from_s:g} s' if duration is None
                       else f'between {from_s:g} s and {from_s + duration:g} s')
             raise BagError(f'{path} has no IMU or GNSS messages {window}: it is '
-                           f'{((bag.end_ns or first_ns) - first_ns) * 1e-9:.1f} s long')
+                           f'{(bag.end_ns - bag.start_ns) * 1e-9:.1f} s long')
         nothing = Block(np.zeros(0, np.int64), np.zeros(0, np.int64), [()] * len(wanted))
         yield _decoded(nothing, wanted, topics, config, 1.0, tuple(bag.warnings))
 
@@ -156,10 +153,10 @@ def _decoded(block: Block, wanted: list[Topic], topics: Topics, config: Config, 
                 gnss += zip(places, found[kind])
     gnss.sort(key=itemgetter(0))
     reference = topics.reference or topics.imu
-    orientations = block.messages[number_of[reference]] if topics.reference else ()
+    references = block.messages[number_of[reference]] if topics.reference else ()
     return Part(topics, config, samples,
                 tuple((int(before[place]), message) for place, message in gnss),
-                decode_orientations(orientations, reference), done, warnings)
+                decode_imu(references, reference), done, warnings)
 
 
 def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | None = None,
@@ -168,14 +165,8 @@ def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | N
     Find the topics by message type, or by name where one is given.
 
     Velocities that cannot be used, or that are left out for one of another type, are among the
-    warnings of `bag` afterwards.
-
-    Raises
-    ------
-    BagError
-        If a topic is missing or there is more than one candidate: the text lists them and names
-        the option that chooses one.
-
+    warnings of `bag` afterwards. Where a topic is missing, or there is more than one candidate, a
+    BagError lists what there is and names the option that chooses.
     """
     imu_topic = _required(bag, 'IMU', ([IMU_TYPE], [*INERTIAL_UNITS]), imu)
     fix_topic = _required(bag, 'position', (
