@@ -31,7 +31,7 @@ from ins_align.cli import main, SCENARIOS
 from ins_align.outputs import labels
 from ins_align.simulation.scenarios import trajectory_of
 import pytest
-from recordings import FIX, IMU, messages_of, real_recording, TWIST, write_recording
+from recordings import FIX, messages_of, real_recording, TWIST, write_recording
 
 COMMAND = [sys.executable, '-m', 'ins_align.cli']
 
@@ -332,12 +332,6 @@ def test_no_imu(tmp_path, capsys, kind):
     path = write_recording(tmp_path / 'a.bag', kind, 1.0, {'/fix': FIX, '/fix_velocity': TWIST})
     assert main(['replay', str(path)]) == 2
     assert 'no IMU topic (sensor_msgs/Imu); it has /fix, /fix_velocity' in one_sentence(capsys)
-
-
-def test_reference_alone_is_no_imu(tmp_path, capsys):
-    path = write_recording(tmp_path / 'a', 'mcap', 1.0, {'/fix': FIX, '/reference/imu': IMU})
-    assert main(['replay', str(path)]) == 2
-    assert 'no IMU topic' in one_sentence(capsys)
 
 
 @pytest.mark.parametrize('kind, reason', [

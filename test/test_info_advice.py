@@ -24,7 +24,6 @@ from ins_align.recordings.info import describe, inspect
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
 import pytest
-from recordings import real_recording
 
 QUANTUM = math.radians(0.57)
 NO_COVARIANCE = np.zeros((3, 3))
@@ -142,21 +141,6 @@ def test_a_level_names_a_setting_of_the_accelerometers_alone(gyro, accel):
     said = level_in_words(Rival(gyro=gyro, accel=accel), PRESETS['mems'])
     assert ('gyros look worse' in said) == (gyro > 1) and '_walk' not in said
     assert ('bias_std' in said) == ('accel_bias_std 0.5 ' in said) == (accel > 1 and gyro == 1)
-
-
-REAL = {
-    'uav_thor75': {}, 'car_drive0708': {'accel_bias_std': (0.13, 0.15)}, 'quad_dot08.bag': {}}
-
-
-@pytest.mark.parametrize('name', REAL)
-def test_real_recordings(name):
-    info = inspect(real_recording(name))
-    settings = settings_of(info)
-    assert set(settings) == set(REAL[name])
-    for parameter, (least, most) in REAL[name].items():
-        assert least < float(settings[parameter]) < most
-    said = describe(info)
-    assert all(word not in said for word in ('end of their range', 'dead band'))
 
 
 def test_both_biases_beyond_the_default_are_another_grade(tmp_path):

@@ -24,7 +24,7 @@ from ins_align.aligner import Aligner, Attitude
 from ins_align.config import Config
 from ins_align.geometry.rotation import exp_so3, matrix_from_rpy, quaternion_from_matrix
 from ins_align.offline import replay
-from ins_align.recordings import bag, BagError
+from ins_align.recordings import bag
 from ins_align.recordings.decode import ImuSamples
 from ins_align.results import CSV_HEADER, Reference
 from ins_align.simulation.simulate import feed, simulate, write_bag
@@ -219,11 +219,6 @@ def test_positions_only(flight):
     assert alone.topics.velocity is None
     assert 'velocity' not in alone.status.counts
     assert alone.status.initial is not None
-
-
-def test_no_recording(tmp_path):
-    with pytest.raises(BagError, match='does not exist'):
-        replay(tmp_path / 'none')
 
 
 def test_uav_velocity_integration_formula():

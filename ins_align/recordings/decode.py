@@ -43,7 +43,8 @@ KINDS = {IMU_TYPE: ('imu',), **dict.fromkeys(INERTIAL_UNITS, ('imu',)), FIX_TYPE
 # sensor_msgs/Imu is a header (four bytes that differ, seconds, nanoseconds, length of the
 # frame_id, frame_id) and 37 float64: orientation, rate, specific force, each with its covariance.
 HEADER_BYTES, IMU_NUMBERS = 16, 37
-ORIENTATION_COVARIANCE, GYRO, ACCEL = slice(4, 13), slice(13, 16), slice(25, 28)
+ORIENTATION, ORIENTATION_COVARIANCE = slice(0, 4), slice(4, 13)
+GYRO, ACCEL = slice(13, 16), slice(25, 28)
 
 
 class ImuSamples(NamedTuple):
@@ -69,7 +70,8 @@ class ImuSamples(NamedTuple):
 
         Stamps, (K,), quaternions (x, y, z, w), (K, 4), and covariances, (K, 9), rad^2.
         """
-        turns, covariances = self.numbers[:, :4], self.numbers[:, ORIENTATION_COVARIANCE]
+        turns = self.numbers[:, ORIENTATION]
+        covariances = self.numbers[:, ORIENTATION_COVARIANCE]
         known = (np.isfinite(turns).all(axis=1)
                  & (np.abs(turns).max(axis=1, initial=0.0) > 1e-3) & ~(covariances[:, 0] < 0.0))
         return self.stamps_ns[known], turns[known], covariances[known]
@@ -101,7 +103,7 @@ def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
                 stamps_ns[place], numbers[place, GYRO], numbers[place, ACCEL] = imu_from_msg(
                     message)
                 turn = message.orientation
-                numbers[place, :4] = turn.x, turn.y, turn.z, turn.w
+                numbers[place, ORIENTATION] = turn.x, turn.y, turn.z, turn.w
                 numbers[place, ORIENTATION_COVARIANCE] = message.orientation_covariance
             else:
                 stamps_ns[place], numbers[place, GYRO], numbers[place, ACCEL] = imu_from_driver(

@@ -38,8 +38,7 @@ from ins_align.recordings import BagError, printable
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.imu_survey import survey_imu
 from ins_align.recordings.reader import choose_topics
-from ins_align.recordings.topic_survey import (
-    in_words, read_candidates, Recorded, Surveyed, TopicInfo)
+from ins_align.recordings.topic_survey import in_words, read_candidates, Recorded, Surveyed
 from ins_align.report import format_table
 import numpy as np
 
@@ -71,7 +70,7 @@ class Info(Surveyed):
     bag: str
     duration_s: float
     start_ns: int
-    topics: tuple[TopicInfo, ...]
+    topics: tuple[Recorded, ...]
     chosen: dict[str, str | None]  # topic by kind that the command reads
     obstacles: tuple[str, ...] = ()  # why it cannot be aligned
     command: str | None = None  # to align it, quoted for a shell; None: it cannot be
@@ -159,15 +158,15 @@ def _survey_velocity(data: Recorded, positions: Series) -> None:
         return
     frame = velocity_frame(data.series(), positions)
     name = frame.frame
-    if data.refused and name not in FRAMES_THAT_FIT:
-        data.add(data.refused, fault=True)
+    if data.doubt and name not in FRAMES_THAT_FIT:
+        data.add(data.doubt, fault=True)
     if name in FRAME_FAULTS:
         data.add(FRAME_FAULTS[name].format(frame), fault=True)
     text = 'frame: not known, too little motion: it is taken as east-north-up'
     if name in FRAMES_THAT_FIT:
         text = f'frame: {name} (fits the change of position over {frame.windows} distances)'
     data.add('' if name in FRAME_FAULTS else text,
-             {'velocity_frame': name} if name == 'ned' or name == 'enu' and data.refused else {},
+             {'velocity_frame': name} if name == 'ned' or name == 'enu' and data.doubt else {},
              frame=name, speed_ratio=frame.speed_ratio)
     if frame.upside_down:
         data.add('the vertical velocity has the wrong sign')
@@ -178,8 +177,8 @@ def _survey_velocity(data: Recorded, positions: Series) -> None:
 
 def _survey_imu(data: Recorded, motion: Series, gravity: float, alone: bool) -> None:
     """Measure an IMU and find what makes it useless."""
-    if data.unmeasured:
-        data.add(data.unmeasured + '; its numbers are used all the same (covariances that are not '
+    if data.doubt:
+        data.add(data.doubt + '; its numbers are used all the same (covariances that are not '
                  'known are 0)' * alone, fault=not alone)
     rate, gap = (data.figures.get(name) for name in ('rate_hz', 'longest_gap_s'))
     if rate is not None and rate < MIN_RATE:
@@ -288,7 +287,7 @@ def describe(info: Info) -> str:
     return '\n'.join(printable(line) for text in lines for line in text.split('\n'))
 
 
-def _row(topic: TopicInfo) -> list[str]:
+def _row(topic: Recorded) -> list[str]:
     figures = topic.figures
     return [topic.name, topic.msgtype.rsplit('/', 1)[-1], *(
         '-' if (value := figures.get(name)) is None else format(value, digits)

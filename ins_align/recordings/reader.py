@@ -139,24 +139,24 @@ def _frame_id(bag: Bag, topic: Topic) -> str:
 def _decoded(block: Block, wanted: list[Topic], topics: Topics, config: Config, done: float,
              warnings: tuple[str, ...]) -> Part:
     """Decode a block, the messages of a topic all at once."""
-    number_of = {topic: number for number, topic in enumerate(wanted)}
-    samples = decode_imu(block.messages[number_of[topics.imu]], topics.imu)
+    messages = dict(zip(wanted, block.messages))
+    samples = decode_imu(messages[topics.imu], topics.imu)
     before = np.zeros(block.topics.size, np.int64)
-    before[block.topics == number_of[topics.imu]] = samples.decoded
+    before[block.topics == wanted.index(topics.imu)] = samples.decoded
     before = np.cumsum(before)
     gnss: list[tuple[int, Gnss]] = []
     for topic in dict.fromkeys(filter(None, (topics.fix, topics.velocity))):
-        found = decode_gnss(block.messages[number_of[topic]], topic, config)
-        places = np.flatnonzero(block.topics == number_of[topic]).tolist()
+        found = decode_gnss(messages[topic], topic, config)
+        places = np.flatnonzero(block.topics == wanted.index(topic)).tolist()
         for kind, source in (('fix', topics.fix), ('velocity', topics.velocity)):
             if topic is source:
                 gnss += zip(places, found[kind])
     gnss.sort(key=itemgetter(0))
-    reference = topics.reference or topics.imu
-    references = block.messages[number_of[reference]] if topics.reference else ()
+    reference = (decode_imu(messages[topics.reference], topics.reference) if topics.reference
+                 else decode_imu((), topics.imu))
     return Part(topics, config, samples,
-                tuple((int(before[place]), message) for place, message in gnss),
-                decode_imu(references, reference), done, warnings)
+                tuple((int(before[place]), message) for place, message in gnss), reference, done,
+                warnings)
 
 
 def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | None = None,

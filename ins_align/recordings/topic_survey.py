@@ -71,10 +71,10 @@ class Surveyed:
         self.figures |= figures
 
 
-@dataclass
-class TopicInfo(Surveyed):
+@dataclass(init=False)
+class Recorded(Surveyed):
     """
-    A topic that an alignment could read.
+    A topic that an alignment could read, with all its messages in recorded order.
 
     Figures of all are ``messages``, ``rate_hz``, ``first_s`` and ``last_s`` (recorded),
     ``stamp_age_s`` (recorded time less the header's stamp, median), ``stamp_age_spread_s`` (98
@@ -86,21 +86,18 @@ class TopicInfo(Surveyed):
     msgtype: str
     kind: str  # imu, fix or velocity
 
-
-class Recorded(TopicInfo):
-    """A topic with all its messages, in recorded order."""
-
     def __init__(self, topic: Topic, kind: str, bag_start_ns: int) -> None:
-        super().__init__(topic.name, type_in_words(topic.msgtype), kind)
+        super().__init__()
+        self.name, self.msgtype, self.kind = topic.name, type_in_words(topic.msgtype), kind
         self.topic, self._start_ns, self._age_ns = topic, bag_start_ns, 0
         self.recorded_ns = self.stamps_ns = np.zeros(0, np.int64)
-        # (N, 6), rate and specific force; (N, 3), latitude, longitude, degrees, and altitude, m, or
-        # velocity as if it were ENU, m/s.
+        # (N, 6), rate and specific force; or (N, 3), latitude, longitude, degrees, and altitude,
+        # m, or velocity as if it were ENU, m/s.
         self.values: Array = np.zeros((0, 6 if kind == 'imu' else 3))
         self.usable = np.zeros(0, bool)  # finite, with a stamp near the others and with a fix
-        # In words: why velocities are refused for their frame_id; what an IMU says it does not
-        # measure; why messages cannot be decoded.
-        self.refused = self.unmeasured = self._why = ''
+        # In words: why velocities would be refused for their frame_id, or what an IMU says it does
+        # not measure; why messages cannot be decoded.
+        self.doubt = self._why = ''
         self._undecodable = self._without_fix = 0
         self._sigmas: list[tuple[float, float]] = []  # of messages that state a covariance
         self._parts: list[tuple[Any, ...]] = []  # recorded_ns, stamps_ns, values, usable
@@ -138,12 +135,12 @@ class Recorded(TopicInfo):
         """See what a message says that it does not measure, or in what frame it is."""
         if self.topic.msgtype in VELOCITY_TYPES:
             message, = decode_gnss([data], self.topic, Config())['velocity']
-            self.refused = message.why if isinstance(message, Refused) else ''
+            self.doubt = message.why if isinstance(message, Refused) else ''
         if self.topic.msgtype == IMU_TYPE:
             with suppress(MessageError):
                 what = ' and '.join(unmeasured(deserialize(data, self.topic)))
-                self.unmeasured = what and (f'its messages say that it does not measure {what} '
-                                            '(covariance -1)')
+                self.doubt = what and (f'its messages say that it does not measure {what} '
+                                       '(covariance -1)')
 
     def finish(self) -> None:
         """Put together what has been taken, and say what it tells of itself."""
