@@ -212,20 +212,13 @@ class Reference:
         return exp_so3((stamp_ns - start) / (end - start) * log_so3(C_after @ C_before.T)) \
             @ C_before
 
-    def errors_deg(self, attitude: Attitude) -> tuple[Array, Array] | None:
-        """
-        Return attitude and reference compared, degrees; None where there is no reference.
-
-        The small rotation about east, north, up that takes the attitude to the reference, shape
-        (3,), and the differences of roll, pitch, yaw, attitude less reference, shape (3,).
-        """
+    def errors_deg(self, attitude: Attitude) -> Array | None:
+        """Return roll, pitch, yaw less the reference's, degrees, (3,); None where it is not."""
         C_reference = self.attitude_at(attitude.stamp_ns)
         if C_reference is None:
             return None
-        C_nb = matrix_from_quaternion(attitude.quaternion_xyzw)
-        difference = roll_pitch_yaw(C_nb) - roll_pitch_yaw(C_reference)
-        return (np.degrees(log_so3(C_reference @ C_nb.T)),
-                np.degrees(np.remainder(difference + np.pi, 2.0 * np.pi) - np.pi))
+        difference = roll_pitch_yaw(attitude.C_nb) - roll_pitch_yaw(C_reference)
+        return np.degrees(np.remainder(difference + np.pi, 2.0 * np.pi) - np.pi)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
