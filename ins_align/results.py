@@ -83,8 +83,8 @@ class Attitude:
     """An attitude of the IMU frame in ENU."""
 
     stamp_ns: int
-    C_nb: Array  # (3, 3), body to ENU
-    covariance: Array  # (3, 3), of the small rotation about the axes of ENU, rad^2
+    C_nb: Array  #: (3, 3), body to ENU
+    covariance: Array  #: (3, 3), of the small rotation about the axes of ENU, rad^2
 
     @cached_property
     def quaternion_xyzw(self) -> Array:
@@ -126,18 +126,19 @@ class Epoch:
     """What came of an epoch."""
 
     stamp_ns: int
-    t_s: float  # since the first t0
+    t_s: float  #: s since the first t0
     state: State
-    initial: Attitude | None  # at t0
-    current: Attitude | None  # at this epoch
-    # (3,), east, north, up: what the measured velocity (or position, where only that is used) did
-    # not agree with the estimate before it, over its sigma; nan where nothing was tested.
+    initial: Attitude | None  #: at t0
+    current: Attitude | None  #: at this epoch
+    #: (3,), east, north, up: what the measured velocity (or position, where only that is used) did
+    #: not agree with the estimate before it, over its sigma; nan where nothing was tested.
     innovation: Array
-    gyro_bias: Array  # (3,), rad/s
-    accel_bias: Array  # (3,), m/s^2
-    dry: bool = False  # whether it is without GNSS, on the way through an outage
-    reason: str = ''  # for the state
-    started_over: str = ''  # why the alignment did since the epoch before; empty: it did not
+    gyro_bias: Array  #: (3,), rad/s
+    accel_bias: Array  #: (3,), m/s^2
+    dry: bool = False  #: whether it is without GNSS, on the way through an outage
+    reason: str = ''  #: for the state
+    #: Why the alignment started over since the epoch before; empty where it did not.
+    started_over: str = ''
 
 
 class Change(NamedTuple):
@@ -153,13 +154,13 @@ class Change(NamedTuple):
 class Nuisance:
     """Estimates beside the attitude at the last epoch, with their sigmas."""
 
-    gyro_bias: Array  # (3,), rad/s
+    gyro_bias: Array  #: (3,), rad/s
     gyro_bias_std: Array
-    accel_bias: Array  # (3,), m/s^2
+    accel_bias: Array  #: (3,), m/s^2
     accel_bias_std: Array
-    lever_arm: Array  # (3,), IMU to antenna in the IMU frame, m
+    lever_arm: Array  #: (3,), IMU to antenna in the IMU frame, m
     lever_arm_std: Array
-    gnss_delay: float  # of the GNSS behind its stamps, s
+    gnss_delay: float  #: of the GNSS behind its stamps, s
     gnss_delay_std: float
 
     @classmethod
@@ -226,13 +227,13 @@ class Result:
     """What came of an alignment of recorded data."""
 
     config: Config
-    status: Status  # at the end
-    epochs: tuple[Epoch, ...]  # those without GNSS, too
-    bag: str = ''  # path of the recording; empty, as is the rest, where arrays were aligned
+    status: Status  #: at the end
+    epochs: tuple[Epoch, ...]  #: those without GNSS, too
+    bag: str = ''  #: path of the recording; empty, as is the rest, where arrays were aligned
     warnings: tuple[str, ...] = ()
     reference: Reference | None = None
     topics: Topics | None = None
-    # (K, 3), of usable fixes: stamp, ns since the first; latitude and longitude, degrees.
+    #: (K, 3), of usable fixes: stamp, ns since the first; latitude and longitude, degrees.
     track: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     first_fix_ns: int = 0
 

@@ -188,6 +188,7 @@ def _dead_band(values: Array) -> tuple[float, float]:
             smallest = float(sizes.min())
             # Further out there are values as usual: else these zeros are something else.
             if np.count_nonzero(sizes < 2.0 * smallest) > MIN_ZEROS:
+                # What rounds has nothing between one and two of its steps either, and loses half.
                 rounds = not np.any((sizes > 1.1 * smallest) & (sizes < 1.9 * smallest))
                 band = max(band, smallest * (0.5 if rounds else 1.0))
                 zeros = max(zeros, count / axis.size)
