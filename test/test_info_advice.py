@@ -15,6 +15,7 @@
 
 import dataclasses
 import math
+import re
 import shlex
 
 from ins_align.cli import main
@@ -56,8 +57,11 @@ def test_coarse_gyros_are_named_as_such(tmp_path):
     info = inspected(truth, tmp_path / 'a', gyro=gyro)
     said = describe(info)
     zeros = np.mean(gyro == 0.0, axis=0).max()
-    assert f'a dead band: less than 0.28 deg/s becomes 0, {zeros:.0%} of the' in said
-    assert 'end of their range' not in said and 'accelerometers have' not in said
+    assert f'gyroscopes round to multiples of 0.57 deg/s: {zeros:.0%} of the samples' in said
+    assert 'dead band' not in said and 'end of their range' not in said
+    assert 'accelerometers round' not in said
+    # Nothing is measured of a bias that is rounded away.
+    assert re.search(r'rate \(.*\) \+- 0.28 deg/s', said) and 'of rounding' in said
     settings = settings_of(info)
     # Uniform within half a quantum.
     assert float(settings['gyro_bias_std']) >= 0.57 / math.sqrt(12.0) * 0.95
@@ -65,12 +69,14 @@ def test_coarse_gyros_are_named_as_such(tmp_path):
     assert imu_of(info)['imu_grade'] == 'mems' and 'worse than imu_grade mems\n' in said
 
 
-@pytest.mark.parametrize('quantum', [1e-4, 0.0])
-def test_a_quantum_below_the_noise_does_no_harm(tmp_path, quantum):
+@pytest.mark.parametrize('quantum, said', [
+    (1e-4, 'round to multiples of 0.0057 deg/s'), (0.0, '')])
+def test_a_quantum_below_the_noise_does_no_harm(tmp_path, quantum, said):
     truth = drive(duration=40.0)
     gyro = np.round(truth.gyro / quantum) * quantum if quantum else truth.gyro
     info = inspected(truth, tmp_path / 'a', gyro=gyro)
-    assert 'dead band' not in describe(info) and settings_of(info) == {}
+    assert said in describe(info) and ('gyroscopes round' in describe(info)) == bool(said)
+    assert 'of rounding' not in describe(info) and settings_of(info) == {}
     assert imu_of(info)['angle_random_walk'] == pytest.approx(0.3, rel=0.15)
 
 
@@ -83,7 +89,8 @@ def test_dead_band(tmp_path, quantum):
         gyro = np.round(gyro / quantum) * quantum
     info = inspected(truth, tmp_path / 'a', gyro=gyro)
     assert imu_of(info)['gyroscopes_dead_band'] == pytest.approx(band, abs=quantum + 1e-3)
-    assert 'gyroscopes have a dead band: less than 1 deg/s becomes 0' in describe(info)
+    assert imu_of(info)['gyroscopes_quantum'] == pytest.approx(quantum, rel=0.01)
+    assert 'gyroscopes have a dead band: nothing between 0 and 1 deg/s' in describe(info)
     uniform = 1.0 / math.sqrt(3.0)
     assert float(settings_of(info)['gyro_bias_std']) == pytest.approx(uniform, rel=0.1)
     assert 'end of their range' not in describe(info)
@@ -107,16 +114,85 @@ def test_an_imu_as_good_as_its_grade_needs_no_setting(tmp_path, seed):
     assert settings_of(info) == {}
 
 
+@pytest.mark.parametrize('scenario, arguments', [
+    ('launch', {'lever_arm': (0.0, 0.0, 3.0)}), ('car', {'duration': 100.0, 'outlier_rate': 0.02}),
+    ('flight', {'duration': 120.0}), pytest.param(
+        'car', {'duration': 200.0, 'gnss_rate': 1.0}, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize('delay', [-0.1, 0.3, 0.8])
+def test_delay_of_the_receiver(tmp_path, scenario, arguments, delay):
+    """Whatever the lever arm is, which nobody has stated."""
+    truth = simulate(scenario, seed=4, gnss_delay=max(delay, 0.0),
+                     **{'lever_arm': (1.0, -0.5, 1.5), **arguments})
+    early = round(min(delay, 0.0) * 1e9)
+    info = inspected(truth, tmp_path / 'a', gnss_stamps_ns=truth.gnss_stamps_ns + early)
+    assert info.figures['gnss_delay'] == pytest.approx(delay, abs=0.05)
+    settings = settings_of(info)
+    assert float(settings.pop('gnss_delay')) == pytest.approx(delay, abs=0.05)
+    assert settings == {} and 'drift apart' not in describe(info)
+
+
+def test_clocks_that_drift_apart(tmp_path):
+    """By 0.2 s in 200 s, from 0.1 s on."""
+    truth = drive(seed=2, duration=200.0)
+    stamps = truth.gnss_stamps_ns
+    since = stamps - stamps[0]
+    info = inspected(truth, tmp_path / 'a', gnss_stamps_ns=stamps + 100_000_000 + since // 1000)
+    assert float(settings_of(info)['gnss_delay']) == pytest.approx(0.2, abs=0.05)
+    assert info.figures['gnss_delay_drift'] == pytest.approx(0.1, abs=0.04)
+    assert 'clocks of IMU and GNSS drift apart' in describe(info)
+
+
+@pytest.mark.parametrize('scenario', ['straight', 'static', 'swing', 'car'])
+def test_no_delay_is_told_where_there_is_none_or_no_motion(tmp_path, scenario):
+    """The antenna of a boat that yaws on its course moves, and its heading is open."""
+    info = inspected(simulate(
+        scenario, seed=3, gnss_delay=0.0 if scenario == 'car' else 0.5, imu_grade='tactical',
+        lever_arm=(2.0, -1.0, 1.0)), tmp_path / 'a')
+    assert 'gnss_delay' not in settings_of(info)
+    assert ('gnss_delay' in info.figures) == (scenario == 'car')
+
+
+@pytest.mark.parametrize('scenario', [
+    'car', *(pytest.param(name, marks=pytest.mark.campaign) for name in ('flight', 'static'))])
+@pytest.mark.parametrize('std, vertical', [(0.05, 0.1), (0.3, 0.3), (1.0, 2.0)])
+def test_noise_of_a_velocity_without_covariance(tmp_path, scenario, std, vertical):
+    truth = simulate(scenario, seed=5, velocity_std=std, velocity_std_vertical=vertical,
+                     outlier_rate=0.01)
+    info = inspected(truth, tmp_path / 'a', velocity_covariance=NO_COVARIANCE)
+    settings = settings_of(info)
+    assert 1 / 1.5 < float(settings['velocity_std']) / std < 1.5
+    assert 1 / 1.5 < float(settings['velocity_std_vertical']) / vertical < 1.5
+    assert 'noise of the GNSS velocity' in describe(info)
+    stated = inspected(truth, tmp_path / 'b')
+    assert not [name for name in settings_of(stated) if name.startswith('velocity_std')]
+
+
 def test_everything_at_once_and_its_command_aligns(tmp_path):
-    """A coarse IMU far off its grade beside a receiver that states no covariance."""
-    truth = drive(seed=6, duration=200.0, accel_bias_std=0.0)
+    """A coarse IMU far off its grade beside a receiver that is late and states no covariance."""
+    truth = drive(seed=6, gnss_delay=0.6, duration=200.0, accel_bias_std=0.0)
     info = inspected(
         truth, tmp_path / 'a', gyro=np.round(truth.gyro / QUANTUM) * QUANTUM,
         accel=truth.accel + [0.1, -0.1, 0.4], velocity_covariance=NO_COVARIANCE)
     settings = settings_of(info)
+    assert float(settings['gnss_delay']) == pytest.approx(0.6, abs=0.05)
     assert float(settings['accel_bias_std']) == pytest.approx(0.4, abs=0.05)
-    assert {'gyro_bias_std', 'angle_random_walk'} < set(settings)
+    assert {'gyro_bias_std', 'angle_random_walk', 'velocity_std'} < set(settings)
     assert main([*shlex.split(info.command)[1:], '--set', 'lever_arm=[1,1,1]']) == 0
+
+
+@pytest.mark.parametrize('drift, correlation', [(0.0, 5.0), (0.3, 2.0), (0.3, 5.0)])
+def test_errors_of_the_gnss_that_last_are_told_from_white_noise(tmp_path, drift, correlation):
+    truth = drive(seed=3, velocity_drift_std=drift, gnss_correlation=correlation)
+    info = inspected(truth, tmp_path / 'a')
+    assert ('of it last for' in describe(info)) == bool(drift)
+    if drift:
+        noise, lasting = info.figures['velocity_noise'], info.figures['velocity_lasting']
+        # From an epoch to the next one the errors that last change by little: the rest is white.
+        change = drift * math.sqrt(1.0 - math.exp(-0.2 / correlation))
+        white = math.sqrt(noise ** 2 - lasting ** 2)
+        assert white == pytest.approx(math.hypot(0.1, change), rel=0.1)
+        assert 0.2 * drift < lasting < drift
+        assert 0.2 <= info.figures['velocity_lasting_s'] < correlation
 
 
 @pytest.mark.parametrize('seed', [1, 2])
@@ -141,6 +217,24 @@ def test_a_level_names_a_setting_of_the_accelerometers_alone(gyro, accel):
     said = level_in_words(Rival(gyro=gyro, accel=accel), PRESETS['mems'])
     assert ('gyros look worse' in said) == (gyro > 1) and '_walk' not in said
     assert ('bias_std' in said) == ('accel_bias_std 0.5 ' in said) == (accel > 1 and gyro == 1)
+
+
+REAL = {
+    'uav_thor75': {'gnss_delay': (0.03, 0.1), 'velocity_std': (0.1, 0.25),
+                   'velocity_std_vertical': (0.1, 0.35)},
+    'car_drive0708': {'accel_bias_std': (0.13, 0.15), 'gnss_delay': (0.03, 0.1)},
+    'quad_dot08.bag': {}}
+
+
+@pytest.mark.parametrize('name', REAL)
+def test_real_recordings(name):
+    info = inspect(real_recording(name))
+    settings = settings_of(info)
+    assert set(settings) == set(REAL[name])
+    for parameter, (least, most) in REAL[name].items():
+        assert least < float(settings[parameter]) < most
+    said = describe(info)
+    assert all(word not in said for word in ('end of their range', 'dead band', 'round to'))
 
 
 def test_both_biases_beyond_the_default_are_another_grade(tmp_path):

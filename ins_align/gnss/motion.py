@@ -123,6 +123,13 @@ def velocity_from_positions(positions: Series) -> Series:
     return _finite(times, (after - before) / span)
 
 
+def differences(positions: Series) -> Series:
+    """Return the velocity between each two positions."""
+    times, vectors = positions
+    return EMPTY if times.size < 2 else Series(
+        0.5 * (times[1:] + times[:-1]), np.diff(vectors, axis=0) / np.diff(times)[:, None])
+
+
 def on_grid(velocities: Series) -> Series:
     """Return velocities every GRID s, without single outliers."""
     if velocities.times.size < 3:

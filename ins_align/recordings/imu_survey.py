@@ -11,7 +11,15 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Surveys the samples of an IMU: unit, noise, bias, end of its range, dead band."""
+"""
+Surveys the samples of an IMU: unit, noise, bias, resolution; delay and noise of the GNSS.
+
+The last two are where the motion that the IMU feels fits the velocity of the receiver best. In
+windows of some seconds the velocity integration formula holds with a constant rotation,
+``v_n(t) + g t = v_0 + C_n0 [integral of C_0b f + C_0b (w x l)]``. Rotation, v_0, biases and lever
+arm are fitted in each window by least squares, for one delay after the other. The delay is where
+the likelihood is largest, with a noise of its own in each window; the noise is what is left there.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +29,9 @@ from typing import NamedTuple
 from ins_align.checks import degrees_fault, turn_ratio
 from ins_align.config import Config, ImuNoise, PRESETS
 from ins_align.geometry.earth import EARTH_RATE
-from ins_align.geometry.rotation import Array
+from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, skew
 from ins_align.gnss.motion import GRID, Series
+from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.imu.noise import force_fault, RangeCheck, white_noise
 from ins_align.recordings.topic_survey import rounded, Surveyed
 import numpy as np
@@ -35,9 +44,26 @@ BIAS_SIGMAS = 2.5
 REST_SPEED = 0.3  # m/s below which a vehicle may stand
 REST_RATE, REST_FORCE = math.radians(1.0), 0.3  # rad/s, m/s^2: scatter of half seconds at rest
 MIN_REST = 5.0  # s
+ON_LATTICE = 0.1  # of a quantum: how far a value may be off its multiples
+MIN_REPEATS = 3  # samples for each value: with fewer the digits of a text may be the quantum
 MIN_ZEROS, MIN_ZERO_SHARE = 20, 0.01  # samples that are exactly 0 because of a dead band
 # What a chip reaches in a minute or two of turns, deg.
 CHIP_THRESHOLDS = {'tilt_std_threshold': 1.0, 'heading_std_threshold': 2.0}
+
+CELL = 0.05  # s over which the IMU is integrated at a time
+FIT_WINDOW, MIN_EPOCHS = 10.0, 20  # s and GNSS epochs in a window
+MIN_WINDOWS = 3
+DELAYS = np.arange(-0.5, 1.25, 0.1)  # s
+MAX_DELAY_STD = 0.05  # s: what is known less well is not told
+# 1 sigma before the fit: gyro bias, rad/s, lever arm, m, accelerometer bias, m/s^2, for a
+# velocity noise of VELOCITY_STD, m/s. Rotation and v_0 are free.
+VELOCITY_STD = 0.2
+PRIOR_STD = np.repeat([1e4, 1e4, math.radians(0.5), 3.0, 0.5], 3)
+MOVING = 1.0  # m/s
+MAX_TURN_STD = 0.2  # rad: a rotation that is known less well is open
+OUTLIER = 6.0  # times the median size of residuals
+LASTING = 0.1  # correlation from epoch to epoch; of white noise the fit makes a negative one
+LONGEST = 3600.0  # s from the first motion on that are looked at: memory is bounded
 
 
 class Sensor(NamedTuple):
@@ -106,51 +132,52 @@ def _add_end_of_range(imu: Surveyed, samples: Series) -> None:
 
 def _add_noise(imu: Surveyed, samples: Series, rest: tuple[float, float] | None, gravity: float,
                ) -> None:
-    """Add dead bands, noise, biases and grade, of all or of what is at rest."""
+    """Add resolution, noise, biases and grade, of all or of what is at rest."""
     times, values = samples
     part = slice(None) if rest is None else slice(*np.searchsorted(times, rest))
     rate, force = values[part].mean(axis=0).reshape(2, 3)
     off_gravity = float(np.linalg.norm(force) - gravity)
+    widths = [_add_resolution(imu, sensor, triad)
+              for sensor, triad in zip(SENSORS, np.split(values, 2, axis=1))]
     interval = float(np.median(np.diff(times)))
-    walks, hidden = _walks(times[part], values[part], 0.5 if rest else QUIET).tolist(), [0.0, 0.0]
-    for k, (sensor, triad) in enumerate(zip(SENSORS, np.split(values, 2, axis=1))):
-        band, zeros = _dead_band(triad)
-        # Noise of this size carries smaller values over it.
-        if walks[k] < band * math.sqrt(interval):
-            imu.add(f'{sensor.name} have a dead band: less than {band / sensor.size:.2g} '
-                    f'{sensor.unit} becomes 0, {zeros:.0%} of the samples of an axis',
-                    **{f'{sensor.name}_dead_band': band})
-            hidden[k] = band / math.sqrt(3.0)  # uniform, 1 sigma: an error that lasts
-            walks[k] = max(walks[k], hidden[k] * math.sqrt(interval))
+    walks, lost = _walks(times[part], values[part], 0.5 if rest else QUIET).tolist(), [0.0, 0.0]
+    for k, width in enumerate(widths):
+        # Noise of half a quantum carries small values over it; less leaves an error that lasts.
+        if walks[k] < width * math.sqrt(interval):
+            lost[k] = width / math.sqrt(3.0)  # uniform, 1 sigma
+            walks[k] = max(walks[k], lost[k] * math.sqrt(interval))
     # What the Earth's rate does not explain is bias, in whatever direction.
     bias = abs(float(np.linalg.norm(rate)) - EARTH_RATE) / math.sqrt(3.0)
-    measured = ImuNoise(*walks, *map(math.hypot, hidden, (bias, off_gravity) if rest else (0, 0)))
+    measured = ImuNoise(*walks, *map(math.hypot, lost, (bias, off_gravity) if rest else (0, 0)))
     grade, covers = _grade(measured)
     preset = PRESETS[grade if rest else Config.imu_grade]
-    settings = {}
-    # Noise is measured by the alignment itself; what a dead band hides does not look noisy.
-    if hidden[0] and measured.angle_random_walk > preset.angle_random_walk:
+    settings, biases = {}, {}
+    # Other noise is measured by the alignment itself; what is rounded away does not look noisy.
+    if lost[0] and measured.angle_random_walk > preset.angle_random_walk:
         settings['angle_random_walk'] = rounded(math.degrees(60.0 * measured.angle_random_walk))
-    if measured.gyro_bias_std > preset.gyro_bias_std * (1.0 if hidden[0] else BIAS_SIGMAS):
-        settings['gyro_bias_std'] = rounded(math.degrees(measured.gyro_bias_std))
+    if measured.gyro_bias_std > preset.gyro_bias_std * (1.0 if lost[0] else BIAS_SIGMAS):
+        biases['gyro_bias_std'] = rounded(math.degrees(measured.gyro_bias_std))
     if measured.accel_bias_std > preset.accel_bias_std * BIAS_SIGMAS:
-        settings['accel_bias_std'] = rounded(measured.accel_bias_std)
-    shown = ', '.join(f'{walk / sensor.walk_size:.2g} {sensor.walk_unit}'
-                      for walk, sensor in zip(walks, SENSORS))
-    imu.add(f'noise: {shown}' + ('' if rest else ' at most, measured in motion'),
+        biases['accel_bias_std'] = rounded(measured.accel_bias_std)
+    shown = [f'{walk / sensor.walk_size:.2g} {sensor.walk_unit}' + ' of rounding' * (hidden > 0.0)
+             for walk, hidden, sensor in zip(walks, lost, SENSORS)]
+    imu.add(f'noise: {", ".join(shown)}' + ('' if rest else ' at most, measured in motion'),
+            settings if rest else settings | biases,
             angle_random_walk=math.degrees(60.0 * walks[0]), velocity_random_walk=60.0 * walks[1])
     if rest is None:
         imu.add(f'imu_grade: {Config.imu_grade} is the default; not seen at rest, which would '
                 'show biases' + f'; its noise is no worse than that of {grade}' * covers,
-                settings, imu_grade=grade)
+                imu_grade=grade)
         return
     degrees_s = np.degrees(rate).tolist()
+    within = [f' +- {width / sensor.size:.2g}' * (hidden > 0.0)
+              for width, hidden, sensor in zip(widths, lost, SENSORS)]
     imu.add(f'at rest for {rest[1] - rest[0]:.0f} s: rate '
-            f'({", ".join(f"{each:+.4f}" for each in degrees_s)}) deg/s, specific '
-            f'force {off_gravity:+.3f} m/s^2 off gravity', settings,
+            f'({", ".join(f"{each:+.4f}" for each in degrees_s)}){within[0]} deg/s, specific '
+            f'force {off_gravity:+.3f}{within[1]} m/s^2 off gravity', biases,
             rest_s=rest[1] - rest[0], rest_rate_deg_s=degrees_s, rest_force_error=off_gravity)
-    noisy = any(walk > NOISE_MARGIN * limit and not lost
-                for walk, limit, lost in zip(walks, preset, hidden))
+    noisy = any(walk > NOISE_MARGIN * limit and not hidden
+                for walk, limit, hidden in zip(walks, preset, lost))
     imu.add(f'suits imu_grade {grade}' if covers else f'worse than imu_grade {grade}'
             + ': more noise is measured while aligning' * noisy,
             {} if grade == Config.imu_grade else
@@ -174,25 +201,38 @@ def _grade(measured: ImuNoise) -> tuple[str, bool]:
     return name, all(covered)
 
 
-def _dead_band(values: Array) -> tuple[float, float]:
+def _add_resolution(imu: Surveyed, sensor: Sensor, values: Array) -> float:
     """
-    Return what size is lost since axes read 0 instead, and how often the worst axis does.
+    Add the resolution of a sensor, values of shape (N, 3), of its coarsest axis.
 
-    Of values of shape (N, 3). A filter may do so, and the rounding of a coarse sensor.
+    Returns the largest error of what is rounded to a multiple of the quantum or to 0.
     """
-    band = zeros = 0.0
+    quantum = dead_band = zeros = 0.0
     for axis in values.T:
+        levels = np.unique(axis)
+        steps = np.diff(levels)
+        # Across a dead band there is no step of the quantum.
+        inner = steps[(levels[1:] != 0.0) & (levels[:-1] != 0.0)]
+        if inner.size and axis.size > MIN_REPEATS * levels.size:
+            q = float(np.median(inner[inner < 1.5 * inner.min()]))
+            if np.mean(np.abs(inner / q - np.round(inner / q)) < ON_LATTICE) > 0.99:
+                quantum = max(quantum, q)
         sizes = np.abs(axis[axis != 0.0])
         count = axis.size - sizes.size
+        zeros = max(zeros, count / axis.size)
         if sizes.size and count > max(MIN_ZEROS, MIN_ZERO_SHARE * axis.size):
             smallest = float(sizes.min())
             # Further out there are values as usual: else these zeros are something else.
-            if np.count_nonzero(sizes < 2.0 * smallest) > MIN_ZEROS:
-                # What rounds has nothing between one and two of its steps either, and loses half.
-                rounds = not np.any((sizes > 1.1 * smallest) & (sizes < 1.9 * smallest))
-                band = max(band, smallest * (0.5 if rounds else 1.0))
-                zeros = max(zeros, count / axis.size)
-    return band, zeros
+            if np.count_nonzero(sizes < 2.0 * smallest) > MIN_ZEROS and smallest > dead_band:
+                dead_band = smallest
+    dead_band *= dead_band > 1.5 * quantum
+    exactly = f': {zeros:.0%} of the samples of an axis are exactly 0' * (zeros > 0.01)
+    for figure, text, value in (
+            ('quantum', 'round to multiples of', quantum),
+            ('dead_band', 'have a dead band: nothing between 0 and', dead_band)):
+        line = f'{sensor.name} {text} {value / sensor.size:.2g} {sensor.unit}{exactly}'
+        imu.add(line if value else '', **{f'{sensor.name}_{figure}': value})
+    return max(0.5 * quantum, dead_band)
 
 
 def _walks(times: Array, values: Array, quiet: float) -> Array:
@@ -234,3 +274,185 @@ def _longest_rest(grid: Array, cells: Array, velocities: Series) -> tuple[float,
             first, last = grid[rest][[0, -1]].tolist()
             return first - 0.5 * GRID, last + 0.5 * GRID
     return None
+
+
+class _Imu:
+    """Integrals of an IMU over all of a recording, in the axes of its first sample."""
+
+    def __init__(self, times: Array, gyro: Array, accel: Array) -> None:
+        self.start, self.end = float(times[0]), float(times[-1])
+        edges = np.arange(self.start, self.end, CELL)
+        angle, force = (np.diff(_interpolated_integral(times, values, edges), axis=0)
+                        for values in (gyro, accel))
+        C_0b = np.concatenate([np.eye(3)[None], cumulative_rotations(exp_so3(angle))])
+        middle = C_0b[:-1] @ exp_so3(0.5 * angle)
+        force = (middle @ force[..., None])[..., 0]
+        attitude = _sums(middle * CELL)  # how an accelerometer bias enters
+        rate = np.concatenate([angle[:1], 0.5 * (angle[1:] + angle[:-1]), angle[-1:]]) / CELL
+        # Side by side: velocity (3), how a gyro bias, an accelerometer bias, a lever arm enter it.
+        self._rows = np.concatenate([_sums(force)[..., None], _sums(
+            skew(force) @ (0.5 * (attitude[1:] + attitude[:-1]))), attitude,
+            C_0b @ skew(rate)], axis=2)
+
+    def between(self, start: Array, times: Array) -> tuple[Array, Array, Array, Array]:
+        """
+        Return integrals from the start of M windows, shape (M, 1), to each of n times, (M, n).
+
+        That of the specific force, shape (M, n, 3), and its derivatives to gyro bias,
+        accelerometer bias and lever arm, each of shape (M, n, 3, 3).
+        """
+        before, after = self._at(start), self._at(times)
+        velocity, by_gyro, by_accel = np.split((after - before)[..., :7], [1, 4], axis=3)
+        return (velocity[..., 0], by_gyro - skew(velocity[..., 0]) @ before[..., 4:7], by_accel,
+                after[..., 7:])
+
+    def _at(self, times: Array) -> Array:
+        place = (times - self.start) / CELL
+        cell = np.clip(place.astype(np.int64), 0, self._rows.shape[0] - 2)
+        share = (place - cell)[..., None, None]
+        rows: Array = self._rows[cell] * (1.0 - share) + self._rows[cell + 1] * share
+        return rows
+
+
+def fit_motion(samples: Series, velocities: Series, gravity: float,
+               offsets: tuple[float, ...] = (0.0,)) -> dict[str, float]:
+    """
+    Fit the motion of an IMU to that of a GNSS receiver.
+
+    Samples, shape (N, 6), rad/s and m/s^2, and velocities, ENU, m/s, are on the same clock but for
+    the delay, which is searched from 0.5 s below to 1.2 s above each of the offsets, s.
+
+    Returns figures, s and m/s, as far as motion and data tell them: ``gnss_delay`` (stamps less
+    the times of measurement on the clock of the IMU), ``gnss_delay_std``, ``gnss_delay_drift``
+    (that of the second half less that of the first), ``velocity_noise`` (horizontal, per axis),
+    ``velocity_noise_vertical``; ``velocity_lasting`` is the part of the horizontal noise that is
+    alike in neighbouring epochs and after ``velocity_lasting_s`` no more than 1 / e of that.
+    """
+    delays = np.concatenate([offset + DELAYS for offset in offsets])
+    moving = np.flatnonzero(np.hypot(*velocities.vectors[:, :2].T) > MOVING)
+    start = velocities.times[moving[0]] - 2.0 * FIT_WINDOW if moving.size else 0.0
+    velocities = Series(*(column[(velocities.times >= start) & (
+        velocities.times < start + LONGEST)] for column in velocities))
+    part = slice(*np.searchsorted(samples.times, [
+        start - delays.max() - 1.0, start + LONGEST]).tolist())
+    times, values = samples.times[part], samples.vectors[part]
+    if velocities.times.size < MIN_WINDOWS * MIN_EPOCHS or times.size < 2:
+        return {}
+    windows = _windows(times, velocities.times, delays)
+    if windows.shape[0] < MIN_WINDOWS:
+        return {}
+    imu = _Imu(times, *np.split(values, 2, axis=1))
+    epochs, v_n = velocities.times[windows], velocities.vectors[windows]
+    good = np.ones(windows.shape)
+    costs, _, turn_std = zip(*(_fit(imu, epochs - delay, v_n, good, gravity) for delay in delays))
+    # Steady motion leaves the heading open, and with it tells nothing of the delay.
+    telling = np.median(turn_std, axis=0) < MAX_TURN_STD
+    coarse = -1.5 * windows.shape[1] * np.log(costs)[:, telling]
+    place = int(np.argmax(coarse.sum(axis=1)))
+    size = np.linalg.norm(_fit(imu, epochs - delays[place], v_n, good, gravity)[1], axis=2)
+    good = (size < OUTLIER * np.median(size)).astype(float)
+    # Once more around the best one, without outliers.
+    near = delays[place] + (DELAYS[1] - DELAYS[0]) * np.arange(-1.0, 2.0)
+    costs, left, _ = zip(*(_fit(imu, epochs - delay, v_n, good, gravity) for delay in near))
+    free = np.maximum(3.0 * good.sum(axis=1) - PRIOR_STD.size, 1.0)
+    likelihood = (-0.5 * free * np.log(costs))[:, telling]
+    delay, std = _maximum(near, likelihood.sum(axis=1))
+    odd, even = (_maximum(near, likelihood[:, half::2].sum(axis=1))[0] for half in (1, 0))
+    std = max(std, 0.5 * abs(odd - even))
+    first, second = (_maximum(delays, half.sum(axis=1))[0]
+                     for half in np.array_split(coarse, 2, axis=1))
+    known = (std < MAX_DELAY_STD and np.count_nonzero(telling) >= MIN_WINDOWS
+             and 0 < place % DELAYS.size < DELAYS.size - 1)
+    figures = {'gnss_delay': delay, 'gnss_delay_std': std, 'gnss_delay_drift': second - first}
+    interval = float(np.median(np.diff(velocities.times)))
+    # Of windows in motion, if there are: standing, receivers are better than they are.
+    chosen = np.hypot(v_n[..., 0], v_n[..., 1]).mean(axis=1) > MOVING
+    chosen |= np.count_nonzero(chosen) < MIN_WINDOWS
+    # The fit has taken some of the noise away.
+    return (figures if known else {}) | _noise_left(
+        left[1][chosen], good[chosen], math.sqrt(3.0 * good.sum() / free.sum()), interval)
+
+
+def _noise_left(left: Array, good: Array, scale: float, interval: float) -> dict[str, float]:
+    """Return the noise of velocities, of residuals, shape (M, n, 3), weights (M, n), a factor."""
+    # The median does without the outliers.
+    size = scale / 0.6745 * np.abs(left[good > 0.0])
+    noise, vertical = float(np.median(size[:, :2])), float(np.median(size[:, 2]))
+    figures = {'velocity_noise': noise, 'velocity_noise_vertical': vertical}
+    horizontal, n = left[..., :2] * good[..., None], good.shape[1]
+    alike = np.array([np.sum(horizontal[:, lag:] * horizontal[:, :n - lag])
+                      / max(np.sum(good[:, lag:] * good[:, :n - lag]), 1.0)
+                      for lag in range(n // 2)])
+    if alike[1] > LASTING * alike[0]:
+        figures |= {'velocity_lasting': noise * math.sqrt(alike[1] / alike[0]),
+                    'velocity_lasting_s': interval * int(np.argmax(alike < alike[1] / math.e))}
+    return figures
+
+
+def _windows(times: Array, epochs: Array, delays: Array) -> np.ndarray:
+    """Return the epochs of each window, shape (M, n), without gaps and within the IMU data."""
+    usual = float(np.median(np.diff(epochs)))
+    length = max(round(FIT_WINDOW / usual), MIN_EPOCHS)
+    windows = np.arange(epochs.size // length * length).reshape(-1, length)
+    first, last = epochs[windows[:, 0]], epochs[windows[:, -1]]
+    gaps = np.concatenate([[0], np.cumsum(np.diff(times) > MAX_GAP_NS * 1e-9)])
+    edges = [np.interp(edge, times, gaps) for edge in (first - delays.max(), last - delays.min())]
+    return windows[(last - first < 1.2 * length * usual) & (edges[0] == edges[1])
+                   & (first - delays.max() > times[0]) & (last - delays.min() < times[-1])]
+
+
+def _fit(imu: _Imu, times: Array, v_n: Array, good: Array, gravity: float,
+         ) -> tuple[Array, Array, Array]:
+    """
+    Fit rotation, velocity at the start, biases and lever arm in M windows of n epochs.
+
+    Of the measurements: times on the clock of the IMU, s, and weights, 0 or 1, of shape (M, n),
+    velocities, shape (M, n, 3). Returns the sums of squares, shape (M,), the residuals in ENU,
+    shape (M, n, 3), and how well the rotation is known, 1 sigma, rad, shape (M,).
+    """
+    middle = times.mean(axis=1, keepdims=True)
+    felt, by_gyro, by_accel, by_lever = imu.between(middle, times)
+    seen = v_n + (times - middle)[..., None] * [0.0, 0.0, gravity]
+    weight = (good / np.maximum(good.sum(axis=1, keepdims=True), 1.0))[..., None]
+    centred = [vectors - np.sum(weight * vectors, axis=1, keepdims=True)
+               for vectors in (seen, felt)]
+    U, _, Vt = np.linalg.svd(np.swapaxes(weight * centred[0], 1, 2) @ centred[1])
+    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+    C_n0 = U @ Vt
+    count, epochs = times.shape
+    start = np.broadcast_to(np.eye(3), by_gyro.shape)
+    J = np.concatenate([start, -skew(felt), by_gyro, by_lever, by_accel],
+                       axis=3).reshape(count, 3 * epochs, PRIOR_STD.size)
+    priors = np.square(VELOCITY_STD / PRIOR_STD)
+    weighted = np.swapaxes(J * np.repeat(good, 3, axis=1)[..., None], 1, 2)
+    normal = weighted @ J + np.diag(priors)
+    for _ in range(2):
+        y = (seen @ C_n0 - felt).reshape(count, -1, 1)
+        x = np.linalg.solve(normal, weighted @ y)
+        left = (y - J @ x)[..., 0]
+        cost = np.sum(np.repeat(good, 3, axis=1) * left ** 2, axis=1) + x[..., 0] ** 2 @ priors
+        C_n0, turned = C_n0 @ exp_so3(x[:, 3:6, 0]), C_n0
+    turn = np.trace(np.linalg.inv(normal)[:, 3:6, 3:6], axis1=1, axis2=2) * cost / good.sum(axis=1)
+    return (cost + 1e-12, left.reshape(count, epochs, 3) @ np.swapaxes(turned, 1, 2),
+            np.sqrt(turn / 3.0))
+
+
+def _maximum(delays: Array, likelihood: Array) -> tuple[float, float]:
+    """Return where a parabola around the largest value is largest, and its deviation."""
+    place = min(max(int(np.argmax(likelihood)), 1), delays.size - 2)
+    step = DELAYS[1] - DELAYS[0]
+    before, here, after = likelihood[place - 1:place + 2].tolist()
+    curvature = (2.0 * here - before - after) / step ** 2
+    if curvature <= 0.0:
+        return float(delays[place]), math.inf
+    return float(delays[place] + (after - before) / (2.0 * step * curvature)), curvature ** -0.5
+
+
+def _interpolated_integral(times: Array, values: Array, at: Array) -> Array:
+    """Integrate by the trapezoidal rule."""
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(times)[:, None]
+    return np.column_stack([np.interp(at, times, column) for column in _sums(steps).T])
+
+
+def _sums(steps: Array) -> Array:
+    return np.cumsum(np.concatenate([np.zeros((1, *steps.shape[1:])), steps]), axis=0)

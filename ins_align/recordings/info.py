@@ -30,21 +30,23 @@ from ins_align.geometry.earth import normal_gravity
 from ins_align.gnss.buffer import MAX_AHEAD_NS
 from ins_align.gnss.messages import enu_from_ned
 from ins_align.gnss.motion import (
-    EMPTY, find_manoeuvres, heading_in_words, MANOEUVRE_SPEED, MANOEUVRE_TIME,
+    differences, EMPTY, find_manoeuvres, heading_in_words, MANOEUVRE_SPEED, MANOEUVRE_TIME,
     Manoeuvres, on_grid, Series, track, velocity_frame, velocity_from_positions,
     without_wild_positions)
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings import BagError, printable
 from ins_align.recordings.bag import Bag
-from ins_align.recordings.imu_survey import survey_imu
+from ins_align.recordings.imu_survey import fit_motion, survey_imu
 from ins_align.recordings.reader import choose_topics
-from ins_align.recordings.topic_survey import in_words, read_candidates, Recorded, Surveyed
+from ins_align.recordings.topic_survey import (
+    in_words, read_candidates, Recorded, rounded, Surveyed)
 from ins_align.report import format_table
 import numpy as np
 
 MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
 MIN_AHEAD = 0.3  # s: clocks that differ by less may be jitter
 MAX_AHEAD, MAX_BEHIND = MAX_AHEAD_NS * 1e-9, 10.0  # s: stamps further apart are of two clocks
+MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s and so many sigmas beyond it: a delay to be set
 FRAMES_THAT_FIT = ('enu', 'ned')
 FRAME_FAULTS = {
     'body': 'its speed fits the change of position and its direction does not: it is given in the '
@@ -60,7 +62,7 @@ COLUMNS = {
     'longest_gap_s': ('longest, s', '.1f'), 'longest_gap_start_s': ('at, s', '.1f')}
 NOT_LOOKED_FOR = (
     'not looked for: scale factors and axes of the IMU (gyro_scale_std), biases across gravity, '
-    'delay and slow errors of the GNSS')
+    'slow errors of the GNSS')
 
 
 @dataclass
@@ -91,14 +93,14 @@ def inspect(path: str | os.PathLike[str]) -> Info:
         positions, gravity = _survey_fixes(fixes, velocities)
         for data in velocities:
             _survey_velocity(data, positions)
-        motion = velocity_from_positions(positions)
+        motion, grid = differences(positions), velocity_from_positions(positions)
         if (velocity := _best(velocities)) is not None:
             motion = velocity.series()
             if velocity.figures.get('frame') == 'ned':
                 motion = Series(motion.times, enu_from_ned(motion.vectors))
-            motion = on_grid(motion)
+            grid = on_grid(motion)
         for data in imus:
-            _survey_imu(data, motion, gravity, alone=len(imus) == 1)
+            _survey_imu(data, grid, gravity, alone=len(imus) == 1)
         imu, fix = (_best(of_kind) or next(iter(of_kind), None) for of_kind in (imus, fixes))
         chosen = {'imu': imu, 'fix': fix, 'velocity': velocity}
         # The end of a file that was cut off is known from what could be read of it.
@@ -107,7 +109,7 @@ def inspect(path: str | os.PathLike[str]) -> Info:
         info = Info(str(bag.path), (end_ns - bag.start_ns) * 1e-9, bag.start_ns,
                     tuple(data for of_kind in topics for data in of_kind),
                     {kind: data and data.name for kind, data in chosen.items()})
-        _add_manoeuvres(info, find_manoeuvres(motion))
+        _add_manoeuvres(info, find_manoeuvres(grid))
         obstacles = [f'{data.name} cannot be used: {data.faults[0]}'
                      for data in chosen.values() if data is not None and data.faults]
         if velocity is None:
@@ -118,7 +120,7 @@ def inspect(path: str | os.PathLike[str]) -> Info:
         if imu is not None and gnss:
             obstacles += _different_clocks(imu, gnss)
             if not obstacles:
-                _add_timing(info, imu, gnss)
+                _add_timing(info, imu, gnss, motion, gravity)
         for of_kind in topics:
             good = [data.name for data in of_kind if not data.faults]
             if len(good) > 1:
@@ -218,18 +220,50 @@ def _different_clocks(imu: Recorded, gnss: list[Recorded]) -> list[str]:
             'clocks' for data, age in late if not -MAX_AHEAD < age < MAX_BEHIND]
 
 
-def _add_timing(info: Info, imu: Recorded, gnss: list[Recorded]) -> None:
-    """Add how stamps and arrival of GNSS messages compare with the IMU."""
+def _add_timing(info: Info, imu: Recorded, gnss: list[Recorded], motion: Series, gravity: float,
+                ) -> None:
+    """Add how stamps and arrival of GNSS messages compare with the IMU, and their noise."""
+    source = gnss[-1]
+    apart = imu.age_s - source.age_s
     lateness = _lateness(imu, gnss)
-    info.add('', gnss_lateness=lateness)
+    found = fit_motion(imu.series(), Series(motion.times + apart, motion.vectors), gravity,
+                       (0.0, apart) if abs(apart) >= MIN_AHEAD else (0.0,))
+    info.add('', gnss_lateness=lateness, **found)
     ahead = min(imu.age_s - data.age_s for data in gnss)
-    if ahead >= MIN_AHEAD:
+    if 'gnss_delay' in found:
+        delay, std, drift = (found[f'gnss_delay{name}'] for name in ('', '_std', '_drift'))
+        least = MIN_DELAY + DELAY_SIGMAS * std
+        info.add(f'delay of the GNSS against the IMU: {delay:+.2f} s +- {max(std, 0.01):.2f} s, '
+                 'as the motion of the IMU shows',
+                 {'gnss_delay': round(delay, 2)} if abs(delay) > least else {})
+        if abs(drift) > least + DELAY_SIGMAS * std:
+            info.add(f'the delay of the GNSS changes by {drift:+.2f} s from the first half to the '
+                     'second: the clocks of IMU and GNSS drift apart')
+        if delay < -least:
+            lateness += delay  # a delay above 0 adds to gnss_lateness by itself
+    elif ahead >= MIN_AHEAD:
         info.add(f'the stamps of GNSS messages are {ahead:.1f} s ahead of those of the IMU: their '
                  'clocks differ, which gnss_delay corrects as far as messages were recorded at '
                  'once', {'gnss_delay': round(ahead, 1)})
+    if source.kind == 'velocity' and 'velocity_noise' in found:
+        _add_velocity_noise(info, source)
     if Config.gnss_lateness < lateness < MAX_LATENESS:
         text, value = lateness_advice(lateness)
         info.add(text, {'gnss_lateness': float(value)})
+
+
+def _add_velocity_noise(info: Info, velocity: Recorded) -> None:
+    """Word the noise of velocities, which is set where most come without a covariance."""
+    noise = [info.figures['velocity_noise'], info.figures['velocity_noise_vertical']]
+    names = ['velocity_std', 'velocity_std_vertical']
+    if 'velocity_vertical' in velocity.settings:
+        names.pop()
+    settings = {name: rounded(max(std, 1e-3)) for name, std in zip(names, noise)}
+    info.add(f'noise of the GNSS velocity: {noise[0]:.2g} m/s horizontally, {noise[1]:.2g} m/s '
+             'vertically', settings if velocity.figures['covariance_share'] < 0.5 else {})
+    if (lasting := info.figures.get('velocity_lasting')) is not None:
+        info.add(f'{lasting:.2g} m/s of it last for {info.figures["velocity_lasting_s"]:.1f} s or '
+                 'more: sigmas will be larger than white noise makes them')
 
 
 def _lateness(imu: Recorded, gnss: list[Recorded]) -> float:
