@@ -594,13 +594,11 @@ def test_loops_of_a_walker_are_no_wrong_unit(noise, unit, expected):
     assert frame.speed_ratio == pytest.approx(unit, rel=0.05)
 
 
-@pytest.mark.parametrize('name, rate, frame, rest, first, settings', [
-    ('uav_thor75', 50.0, 'enu', True, 45.0, []),
-    ('car_drive0708', 100.0, 'enu', True, 53.0, ['--set', 'accel_bias_std=0.14']),
-    ('quad_dot08.bag', 120.5, None, False, 2.7, [])])
-def test_real_recordings(name, rate, frame, rest, first, settings):
+@pytest.mark.parametrize('name, rate, frame, rest, first', [
+    ('uav_thor75', 50.0, 'enu', True, 45.0), ('car_drive0708', 100.0, 'enu', True, 53.0),
+    ('quad_dot08.bag', 120.5, None, False, 2.7)])
+def test_real_recordings(name, rate, frame, rest, first):
     info = inspect(real_recording(name))
-    assert command_of(info) == settings
     imu = by_name(info, '/imu/data_raw')
     assert imu.figures['rate_hz'] == pytest.approx(rate, rel=0.01)
     assert imu.faults == [] and imu.figures['imu_grade'] == 'mems'
@@ -609,7 +607,6 @@ def test_real_recordings(name, rate, frame, rest, first, settings):
     if frame:
         assert by_name(info, '/fix_velocity').figures['frame'] == frame
     assert info.figures['manoeuvres_s'][0] == pytest.approx(first, abs=2.0)
-    assert all(word not in describe(info) for word in ('end of their range', 'dead band'))
     lines = describe(info).replace(info.command, '').splitlines()  # has the path, however long
     assert max(map(len, lines)) < 130
 

@@ -25,6 +25,7 @@ from ins_align.recordings.info import describe, inspect
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
 import pytest
+from recordings import real_recording
 
 QUANTUM = math.radians(0.57)
 NO_COVARIANCE = np.zeros((3, 3))
