@@ -16,7 +16,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from functools import partial
 import gc
@@ -30,8 +30,7 @@ from typing import Any, NoReturn, TYPE_CHECKING
 from ins_align.outputs import (
     check_plot, check_writable, labels, Outcome, process, STANDARD_OUTPUT, survey, Task,
     UsageError, with_label, write_whole)
-from ins_align.processes import (
-    ClusterError, keep_to_one, processors, run_all, run_on_cluster)
+from ins_align.processes import keep_to_one, processors, run_all, run_on_cluster
 
 if TYPE_CHECKING:
     from ins_align.config import Config
@@ -126,7 +125,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sentence, status = str(_missing(error)), UNUSABLE
     except BrokenPipeError:  # whoever reads the output has left, as "head" does
         sentence, status = '', NO_READER
-    except (UsageError, ClusterError, OSError) as error:
+    except (UsageError, OSError) as error:
         sentence, status = str(error), UNUSABLE
         if isinstance(error, OSError):
             sentence = f'{error.filename or "output"}: {error.strerror}'
@@ -214,7 +213,7 @@ def _add_replay(commands: Any) -> None:
                        help='skip this many seconds of the recording')
     group.add_argument('--duration', type=_seconds, metavar='S', help='read this many seconds')
     group.add_argument('--jobs', type=_count, metavar='N',
-                       help='processes; two can share a recording (default: one a processor)')
+                       help='recordings at a time (default: one a processor)')
     group.add_argument('--dask', metavar='ADDRESS',
                        help='process the recordings on the Dask cluster with this scheduler')
     group = command.add_argument_group('output')
@@ -289,13 +288,11 @@ def run_info(arguments: argparse.Namespace) -> int:
     """Run ``ins_align info``."""
     if arguments.json:
         check_writable(arguments.json, arguments.bags)
-    return _tell(arguments, map(survey, arguments.bags), print)
+    return _tell(arguments, map(survey, arguments.bags))
 
 
 def run_replay(arguments: argparse.Namespace) -> int:
     """Run ``ins_align replay``."""
-    from tqdm import tqdm
-
     keep_to_one()
     gc.set_threshold(100_000)  # rows and results by the thousand, none of which is garbage
     names = labels(arguments.bags) if len(arguments.bags) > 1 else ['']
@@ -311,11 +308,25 @@ def run_replay(arguments: argparse.Namespace) -> int:
                 'imu_topic', 'fix_topic', 'velocity_topic', 'start', 'duration')}},
         **{option: os.path.abspath(path) for option, path in of_bag.items()})
         for bag, of_bag in zip(arguments.bags, files)]
-    tqdm.monitor_interval = 0  # no thread of it while processes are forked
-    with tqdm(total=len(tasks), leave=False,
-              disable=None if sys.stderr else True,  # None: where that is no terminal
+    found: Iterable[Outcome | Exception]
+    if arguments.dask is not None:
+        found = run_on_cluster(process, tasks, arguments.dask)
+    elif len(tasks) > 1:
+        found = run_all(process, tasks, arguments.jobs or processors())
+    else:
+        found = [_with_a_bar(tasks[0])]
+    return _tell(arguments, (
+        Outcome.lost(task.name, outcome) if isinstance(outcome, Exception) else outcome
+        for task, outcome in zip(tasks, found)))
+
+
+def _with_a_bar(task: Task) -> Outcome:
+    """Process one recording and show on a terminal how much of it has been read."""
+    from tqdm import tqdm
+
+    with tqdm(total=1, leave=False, disable=None if sys.stderr else True,  # None: no terminal
               bar_format='{percentage:3.0f}% |{bar}| {elapsed}, {remaining} left') as bar:
-        return _tell(arguments, _outcomes(tasks, arguments, bar), bar.write)
+        return process(task, lambda part: bar.update(part - bar.n))
 
 
 def _check_outputs(arguments: argparse.Namespace, files: Sequence[dict[str, str]]) -> None:
@@ -335,8 +346,7 @@ def _check_outputs(arguments: argparse.Namespace, files: Sequence[dict[str, str]
             raise UsageError(f'{path} is given for two outputs')
 
 
-def _tell(arguments: argparse.Namespace, outcomes: Iterable[Outcome],
-          say: Callable[..., Any]) -> int:
+def _tell(arguments: argparse.Namespace, outcomes: Iterable[Outcome]) -> int:
     """Print what came of each recording and write ``--json``; return the exit status."""
     several = len(arguments.bags) > 1
     objects, statuses = [], []
@@ -346,13 +356,13 @@ def _tell(arguments: argparse.Namespace, outcomes: Iterable[Outcome],
         if outcome.error:
             if not several:
                 raise UsageError(outcome.error)
-            say(f'ins_align {arguments.command}: {outcome.error}', file=sys.stderr)
+            print(f'ins_align {arguments.command}: {outcome.error}', file=sys.stderr)
             statuses.append(UNUSABLE)
             continue
         for warning in outcome.warnings:
-            say(f'ins_align {arguments.command}: warning: {warning}', file=sys.stderr)
+            print(f'ins_align {arguments.command}: warning: {warning}', file=sys.stderr)
         if arguments.json != STANDARD_OUTPUT:
-            say(outcome.text + '\n')
+            print(outcome.text + '\n', flush=True)
         statuses.append(ALIGNED if outcome.json.get('aligned', True) else NOT_ALIGNED)
     text = json.dumps(objects if several else objects[0], indent=2, allow_nan=False) + '\n'
     if arguments.json == STANDARD_OUTPUT:
@@ -363,20 +373,6 @@ def _tell(arguments: argparse.Namespace, outcomes: Iterable[Outcome],
         except OSError as error:
             raise UsageError(f'cannot write {arguments.json}: {error.strerror}') from None
     return max(statuses)
-
-
-def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace, bar: Any,
-              ) -> Iterator[Outcome]:
-    """Process recordings where the arguments say."""
-
-    def advance(position: float) -> None:
-        bar.update(position - bar.n)
-
-    found = (run_all(process, tasks, arguments.jobs or processors(), advance)
-             if arguments.dask is None else
-             run_on_cluster(process, tasks, arguments.dask, advance))
-    for task, outcome in zip(tasks, found):
-        yield Outcome.lost(task.name, outcome) if isinstance(outcome, Exception) else outcome
 
 
 def _config(arguments: argparse.Namespace) -> Config:

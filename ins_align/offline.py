@@ -25,7 +25,6 @@ from ins_align.config import Config, config_from_mapping
 from ins_align.geometry.rotation import Array, Index, Transform
 from ins_align.gnss import messages
 from ins_align.gnss.messages import Fix, usable, Velocity
-from ins_align.processes import run_ahead
 from ins_align.results import Epoch, in_order_of_time, Reference, Result
 import numpy as np
 
@@ -93,8 +92,7 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
            imu_topic: str | None = None, fix_topic: str | None = None,
            velocity_topic: str | None = None,
            start: float | None = None, duration: float | None = None,
-           progress: Callable[[float], None] | None = None,
-           read_ahead: bool = False) -> Result:
+           progress: Callable[[float], None] | None = None) -> Result:
     """
     Align a recording.
 
@@ -110,8 +108,6 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
         Part of the recording, seconds from its start, by recorded time.
     progress : callable, optional
         Called with how much has been read, 0 to 1.
-    read_ahead : bool
-        Let another process read: the same result in less time.
 
     Returns
     -------
@@ -121,33 +117,30 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
     ------
     BagError
         If the recording cannot be read, lacks a topic, or has no messages in the part asked for.
-    BrokenProcessPool
-        If the other process is killed.
 
     """
-    from ins_align.recordings import reader  # with rosbags, which arrays do not need
+    from ins_align.recordings.reader import read  # with rosbags, which arrays do not need
 
-    request = reader.Request(path, config or Config(), imu_topic, fix_topic, velocity_topic,
-                             start, duration)
     run: _Run | None = None
     fixes: list[tuple[int, float, float]] = []
-    orientations: list[tuple[np.ndarray, np.ndarray]] = []
-    for part in run_ahead(reader.read, request) if read_ahead else reader.read(request):
+    references: list[tuple[np.ndarray, np.ndarray]] = []
+    for part in read(path, config or Config(), imu_topic, fix_topic, velocity_topic, start,
+                     duration):
         run = run or _Run(part.config, part.topics.base)
         run.add(part.imu.stamps_ns, part.imu.gyro, part.imu.accel, part.gnss,
                 int(np.count_nonzero(~part.imu.decoded)))
         fixes += [(message.stamp_ns, message.latitude_deg, message.longitude_deg)
                   for _, message in part.gnss
                   if isinstance(message, Fix) and not usable(message)[1]]
-        orientations.append(part.orientations.known())
+        references.append(part.reference.orientations()[:2])
         if progress is not None:
             progress(part.done)
     assert run is not None
     first_fix_ns = fixes[0][0] if fixes else 0
     return run.result(
         bag=str(path), warnings=part.warnings, topics=part.topics, first_fix_ns=first_fix_ns,
-        reference=Reference(*orientations) if any(
-            stamps_ns.size for stamps_ns, _ in orientations) else None,
+        reference=Reference(*references) if any(
+            stamps_ns.size for stamps_ns, _ in references) else None,
         track=np.array([(stamp_ns - first_fix_ns, *place)
                         for stamp_ns, *place in fixes]).reshape(-1, 3))
 

@@ -16,11 +16,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures.process import BrokenProcessPool
 import dataclasses
 from dataclasses import dataclass
 import errno
 from functools import partial
+from importlib import import_module
 import os
 from pathlib import Path
 from typing import Any, IO
@@ -68,8 +68,7 @@ class Outcome:
                                'want of memory; --jobs 1 takes less')
 
 
-def process(task: Task, read_ahead: bool = False,
-            progress: Callable[[float], None] | None = None) -> Outcome:
+def process(task: Task, progress: Callable[[float], None] | None = None) -> Outcome:
     """Replay one recording and write its files; whatever the user can put right is an error."""
     from ins_align.offline import replay
     from ins_align.recordings import BagError
@@ -79,7 +78,7 @@ def process(task: Task, read_ahead: bool = False,
         return str(error).replace(str(task.arguments['path']), task.name)
 
     try:
-        result = replay(**task.arguments, progress=progress, read_ahead=read_ahead)
+        result = replay(**task.arguments, progress=progress)
         if task.results:
             from ins_align.recordings.results_bag import write_results
             write_results(result, task.results)
@@ -92,8 +91,6 @@ def process(task: Task, read_ahead: bool = False,
                 plot(result).savefig, format=Path(task.plot).suffix[1:].lower(), dpi=120))
     except BagError as error:
         return Outcome.failed(task.name, named(error))
-    except BrokenProcessPool as error:
-        return Outcome.lost(task.name, error)
     except OSError as error:
         return Outcome.failed(task.name, f'cannot write {error.filename}: {error.strerror}')
     warnings = tuple(about(task.name, named(text)) for text in result.warnings)
@@ -191,12 +188,7 @@ def _spoilt(target: Path, inputs: Sequence[str]) -> str:
 
 def check_plot(path: str) -> None:
     """Find out before the work whether a figure can be drawn in the format that is asked for."""
-    from importlib.util import find_spec
-
-    suffix = Path(path).suffix.lower()
-    if suffix not in PLOT_SUFFIXES:
+    if Path(path).suffix.lower() not in PLOT_SUFFIXES:
         raise UsageError(f'cannot draw {path}: its name must end with one of '
                          f'{", ".join(PLOT_SUFFIXES)}')
-    if find_spec('matplotlib') is None:
-        raise UsageError(f'--plot {path} needs matplotlib, which is not installed: '
-                         'pip install matplotlib')
+    import_module('matplotlib')

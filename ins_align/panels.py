@@ -126,9 +126,9 @@ class _Series:
             np.array([epoch.state is State.ALIGNED for epoch, _, _ in pairs], bool), breaks, False)
         self.errors = self.reference = None
         if result.reference is not None:
-            none = (np.full(3, np.nan), np.full(3, np.nan))
-            errors = [result.reference.errors_deg(now) or none for _, _, now in pairs]
-            self.errors = rows([rpy for _, rpy in errors])
+            errors = [result.reference.errors_deg(now) for _, _, now in pairs]
+            self.errors = rows([np.full(3, np.nan) if error is None else error
+                                for error in errors])
             self.reference = np.remainder(self.angles - self.errors + 180.0, 360.0) - 180.0
 
 

@@ -11,34 +11,24 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""
-Processes that work for this one, here or on a Dask cluster.
-
-Tasks by the dozen, in order, and one that is some steps ahead; and the threads each may take.
-"""
+"""Many tasks in processes, here or on a Dask cluster, and the threads that each may take."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
 import multiprocessing
 import os
 import signal
 import threading
 from typing import Any, TypeVar
 
+from ins_align.outputs import UsageError
+
 T = TypeVar('T')
 VARIABLES = ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'OMP_NUM_THREADS')
-# What `run_ahead` produces before it is asked for; more would only take memory.
-AHEAD = 3
 CONNECT_TIMEOUT = 10.0  # s, to the scheduler of a Dask cluster
-
-
-class ClusterError(RuntimeError):
-    """A Dask cluster that cannot be used; the text says why in one sentence."""
 
 
 def processors() -> int:
@@ -76,26 +66,20 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def run_all(function: Callable[..., T], tasks: Sequence[Any], jobs: int,
-            progress: Callable[[float], None]) -> Iterator[T | Exception]:
+def run_all(function: Callable[[Any], T], tasks: Sequence[Any], jobs: int,
+            ) -> Iterator[T | Exception]:
     """
     Do tasks in so many processes; yield in their order what a function returns of each.
 
-    One job is this process; where there are two for each task, one of them reads ahead: the
-    function has the options `read_ahead` and `progress`, which is called with its share. That of
-    all is called with the number of tasks done. Where the process of a task is gone, the
-    exception that says so takes the place of what it should have returned.
+    One job is this process. Where the process of a task is gone, the exception that says so takes
+    the place of what it should have returned.
     """
-    if jobs == 1 or len(tasks) == 1:
-        for index, task in enumerate(tasks):
-            yield function(task, read_ahead=jobs > 1,
-                           progress=lambda part: progress(index + part))
-            progress(index + 1.0)
+    if jobs == 1:
+        yield from map(function, tasks)
         return
     executor = pool(min(jobs, len(tasks)))
     try:
-        yield from _in_order(executor, function, tasks, progress, BrokenProcessPool,
-                             read_ahead=jobs >= 2 * len(tasks))
+        yield from _in_order(executor, function, tasks, BrokenProcessPool)
     except BaseException:
         for child in multiprocessing.active_children():
             child.terminate()
@@ -104,45 +88,40 @@ def run_all(function: Callable[..., T], tasks: Sequence[Any], jobs: int,
         executor.shutdown(cancel_futures=True)
 
 
-def run_on_cluster(function: Callable[..., T], tasks: Sequence[Any], address: str,
-                   progress: Callable[[float], None]) -> Iterator[T | Exception]:
+def run_on_cluster(function: Callable[[Any], T], tasks: Sequence[Any], address: str,
+                   ) -> Iterator[T | Exception]:
     """
-    Do tasks on a Dask cluster, otherwise as `run_all`; a ClusterError says what is missing.
+    Do tasks on a Dask cluster, otherwise as `run_all`; a UsageError says that there is none.
 
     The workers read and write the files: they need the same folders as this machine. What a worker
     that dies had in hand, another one does again; files are replaced as a whole.
     """
     import asyncio
 
-    try:
-        from distributed import Client
-    except ImportError:
-        raise ClusterError('--dask needs Dask, which is not installed: '
-                           'pip install distributed') from None
+    from distributed import Client
+
     try:
         # A client by itself waits for a stranger for ever.
         asyncio.run(asyncio.wait_for(_ask_scheduler(address), CONNECT_TIMEOUT))
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except Exception as error:  # strangers answer all kinds of things
         reason = f'{type(error).__name__}: {error}'.partition('\n')[0].rstrip(': ')
-        raise ClusterError(f'no Dask scheduler answers at {address} ({reason}); an address is '
-                           'like tcp://localhost:8786') from None
+        raise UsageError(f'no Dask scheduler answers at {address} ({reason}); an address is '
+                         'like tcp://localhost:8786') from None
     with client, client.get_executor() as executor:
-        yield from _in_order(executor, function, tasks, progress, Exception)
+        yield from _in_order(executor, function, tasks, Exception)
 
 
-def _in_order(executor: Executor, function: Callable[..., T], tasks: Sequence[Any],
-              progress: Callable[[float], None], lost: type[Exception], **options: Any,
-              ) -> Iterator[T | Exception]:
+def _in_order(executor: Executor, function: Callable[[Any], T], tasks: Sequence[Any],
+              lost: type[Exception]) -> Iterator[T | Exception]:
     """Yield what comes of tasks; `lost` says that whoever worked on one is gone."""
-    futures = [executor.submit(function, task, **options) for task in tasks]
+    futures = [executor.submit(function, task) for task in tasks]
     try:
-        for index, future in enumerate(futures):
+        for future in futures:
             try:
                 yield future.result()
             except lost as error:
                 yield error
-            progress(index + 1.0)
     finally:
         for future in futures:
             future.cancel()
@@ -159,50 +138,3 @@ async def _ask_scheduler(address: str) -> None:
     async with rpc(address, connection_args=arguments) as scheduler:
         if 'workers' not in await scheduler.identity():
             raise OSError('it is no scheduler')
-
-
-def run_ahead(function: Callable[..., Generator[T, None, None]], *arguments: Any) -> Iterator[T]:
-    """
-    Yield what a generator yields in another process, which is some items ahead.
-
-    The function that gives the generator, its arguments and what is yielded must be picklable.
-
-    Raises
-    ------
-    BrokenProcessPool
-        If that process is killed; otherwise whatever the generator raises.
-
-    """
-    with pool(1) as executor:
-        executor.submit(_begin, function, arguments).result()
-        waiting = deque(executor.submit(_next) for _ in range(AHEAD))
-        try:
-            while item := waiting.popleft().result():
-                waiting.append(executor.submit(_next))
-                yield item[0]
-        finally:
-            for future in waiting:
-                future.cancel()
-            with suppress(BrokenProcessPool):
-                executor.submit(_end).result()
-
-
-# In the other process: the generator.
-_items: Generator[Any, None, None] = None  # type: ignore[assignment]
-
-
-def _begin(function: Callable[..., Generator[Any, None, None]],
-           arguments: tuple[Any, ...]) -> None:
-    global _items
-    _items = function(*arguments)
-
-
-def _next() -> tuple[Any, ...]:
-    """Return the next item; nothing at the end."""
-    for item in _items:
-        return (item,)
-    return ()
-
-
-def _end() -> None:
-    _items.close()

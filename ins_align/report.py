@@ -77,7 +77,7 @@ def summary(result: Result) -> str:
         row += [f'{sigma:.3f}' for sigma in attitude.sigma_deg]
         if result.reference is not None:
             errors = result.reference.errors_deg(attitude)
-            row += ['-'] * 3 if errors is None else [f'{error:+.3f}' for error in errors[1]]
+            row += ['-'] * 3 if errors is None else [f'{error:+.3f}' for error in errors]
         rows.append(row)
     if rows:
         header = ['attitude, deg', 'at, s', 'roll', 'pitch', 'yaw', 'heading', 'sigma e',

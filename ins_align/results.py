@@ -80,22 +80,11 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True)
 class Attitude:
-    """
-    An attitude of the IMU frame in ENU.
-
-    Attributes
-    ----------
-    stamp_ns : int
-    C_nb : ndarray, shape (3, 3)
-        Body to ENU.
-    covariance : ndarray, shape (3, 3)
-        Of the small rotation about the axes of ENU, rad^2.
-
-    """
+    """An attitude of the IMU frame in ENU."""
 
     stamp_ns: int
-    C_nb: Array
-    covariance: Array
+    C_nb: Array  #: (3, 3), body to ENU
+    covariance: Array  #: (3, 3), of the small rotation about the axes of ENU, rad^2
 
     @cached_property
     def quaternion_xyzw(self) -> Array:
@@ -134,40 +123,21 @@ class Attitude:
 
 @dataclass(frozen=True)
 class Epoch:
-    """
-    What came of an epoch.
-
-    Attributes
-    ----------
-    stamp_ns : int
-    t_s : float
-        Seconds since the first t0.
-    state : State
-    initial, current : Attitude or None
-    innovation : ndarray, shape (3,)
-        East, north, up: what the measured velocity (or position, where only that is used) did not
-        agree with the estimate before it, over its sigma; nan where nothing was tested.
-    gyro_bias, accel_bias : ndarray, shape (3,)
-        rad/s, m/s^2.
-    dry : bool
-        Whether it is without GNSS, on the way through an outage.
-    reason : str
-        For the state.
-    started_over : str
-        Why the alignment started over since the epoch before; empty where it did not.
-
-    """
+    """What came of an epoch."""
 
     stamp_ns: int
-    t_s: float
+    t_s: float  #: s since the first t0
     state: State
-    initial: Attitude | None
-    current: Attitude | None
+    initial: Attitude | None  #: at t0
+    current: Attitude | None  #: at this epoch
+    #: (3,), east, north, up: what the measured velocity (or position, where only that is used) did
+    #: not agree with the estimate before it, over its sigma; nan where nothing was tested.
     innovation: Array
-    gyro_bias: Array
-    accel_bias: Array
-    dry: bool = False
-    reason: str = ''
+    gyro_bias: Array  #: (3,), rad/s
+    accel_bias: Array  #: (3,), m/s^2
+    dry: bool = False  #: whether it is without GNSS, on the way through an outage
+    reason: str = ''  #: for the state
+    #: Why the alignment started over since the epoch before; empty where it did not.
     started_over: str = ''
 
 
@@ -182,27 +152,15 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class Nuisance:
-    """
-    Estimates beside the attitude, with their sigmas.
+    """Estimates beside the attitude at the last epoch, with their sigmas."""
 
-    Attributes
-    ----------
-    gyro_bias, accel_bias, lever_arm : ndarray, shape (3,)
-        At the last epoch, rad/s; m/s^2; IMU to antenna in the IMU frame, m.
-    gyro_bias_std, accel_bias_std, lever_arm_std : ndarray, shape (3,)
-        So they are of each.
-    gnss_delay, gnss_delay_std : float
-        Of the GNSS behind its stamps, s.
-
-    """
-
-    gyro_bias: Array
+    gyro_bias: Array  #: (3,), rad/s
     gyro_bias_std: Array
-    accel_bias: Array
+    accel_bias: Array  #: (3,), m/s^2
     accel_bias_std: Array
-    lever_arm: Array
+    lever_arm: Array  #: (3,), IMU to antenna in the IMU frame, m
     lever_arm_std: Array
-    gnss_delay: float
+    gnss_delay: float  #: of the GNSS behind its stamps, s
     gnss_delay_std: float
 
     @classmethod
@@ -232,7 +190,7 @@ class Reference:
     """
     The attitude that a recording carries to compare with.
 
-    Made of stamps, ns, and quaternions as from `Orientations.known`, at least one part, in any
+    Made of stamps, ns, and quaternions of `ImuSamples.orientations`, one part or more in any
     order; of one stamp the first counts.
     """
 
@@ -255,52 +213,27 @@ class Reference:
         return exp_so3((stamp_ns - start) / (end - start) * log_so3(C_after @ C_before.T)) \
             @ C_before
 
-    def errors_deg(self, attitude: Attitude) -> tuple[Array, Array] | None:
-        """
-        Return attitude and reference compared, degrees; None where there is no reference.
-
-        The small rotation about east, north, up that takes the attitude to the reference, shape
-        (3,), and the differences of roll, pitch, yaw, attitude less reference, shape (3,).
-        """
+    def errors_deg(self, attitude: Attitude) -> Array | None:
+        """Return roll, pitch, yaw less the reference's, degrees, (3,); None where it is not."""
         C_reference = self.attitude_at(attitude.stamp_ns)
         if C_reference is None:
             return None
-        C_nb = matrix_from_quaternion(attitude.quaternion_xyzw)
-        difference = roll_pitch_yaw(C_nb) - roll_pitch_yaw(C_reference)
-        return (np.degrees(log_so3(C_reference @ C_nb.T)),
-                np.degrees(np.remainder(difference + np.pi, 2.0 * np.pi) - np.pi))
+        difference = roll_pitch_yaw(attitude.C_nb) - roll_pitch_yaw(C_reference)
+        return np.degrees(np.remainder(difference + np.pi, 2.0 * np.pi) - np.pi)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Result:
-    """
-    What came of an alignment of recorded data.
-
-    Attributes
-    ----------
-    config : Config
-    status : Status
-        At the end.
-    epochs : tuple of Epoch
-        Those without GNSS, too.
-    bag : str
-        Path of the recording; empty, as is the rest, where arrays were aligned.
-    warnings : tuple of str
-    reference : Reference or None
-    topics : Topics or None
-    track : ndarray, shape (K, 3)
-        Of usable fixes: stamp, ns since the first; latitude and longitude, degrees.
-    first_fix_ns : int
-
-    """
+    """What came of an alignment of recorded data."""
 
     config: Config
-    status: Status
-    epochs: tuple[Epoch, ...]
-    bag: str = ''
+    status: Status  #: at the end
+    epochs: tuple[Epoch, ...]  #: those without GNSS, too
+    bag: str = ''  #: path of the recording; empty, as is the rest, where arrays were aligned
     warnings: tuple[str, ...] = ()
     reference: Reference | None = None
     topics: Topics | None = None
+    #: (K, 3), of usable fixes: stamp, ns since the first; latitude and longitude, degrees.
     track: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     first_fix_ns: int = 0
 

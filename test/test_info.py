@@ -23,7 +23,6 @@ from ins_align.config import Config
 from ins_align.gnss.motion import (
     find_manoeuvres, Series, track, velocity_frame, without_wild_positions)
 from ins_align.offline import replay
-from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import deserialize
 from ins_align.recordings.info import describe, inspect
@@ -505,13 +504,6 @@ def test_text_of_a_recording_cannot_move_the_cursor(tmp_path):
     assert '\x1b' not in describe(info)
 
 
-@pytest.mark.parametrize('content, message', [(b'', 'is empty'), (b'x' * 100, 'no recording')])
-def test_what_cannot_be_read(tmp_path, content, message):
-    (tmp_path / 'a').write_bytes(content)
-    with pytest.raises(BagError, match=message):
-        inspect(tmp_path / 'a')
-
-
 def test_track_and_manoeuvres_by_hand():
     """A quarter turn at 10 m/s between two straights of 30 s."""
     times = np.arange(0.0, 60.0, 0.5)
@@ -606,9 +598,7 @@ def test_loops_of_a_walker_are_no_wrong_unit(noise, unit, expected):
     ('uav_thor75', 50.0, 'enu', True, 45.0), ('car_drive0708', 100.0, 'enu', True, 53.0),
     ('quad_dot08.bag', 120.5, None, False, 2.7)])
 def test_real_recordings(name, rate, frame, rest, first):
-    path = real_recording(name)
-    info = inspect(path)
-    assert info.command.startswith(f'ins_align replay {shlex.quote(str(path))}')
+    info = inspect(real_recording(name))
     imu = by_name(info, '/imu/data_raw')
     assert imu.figures['rate_hz'] == pytest.approx(rate, rel=0.01)
     assert imu.faults == [] and imu.figures['imu_grade'] == 'mems'

@@ -27,7 +27,7 @@ from ins_align.recordings import bag as bags
 from ins_align.recordings import BagError, Topic
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import (
-    decode_gnss, decode_imu, decode_orientations, deserialize, FIX_TYPE, Refused, VELOCITY_TYPES)
+    decode_gnss, decode_imu, deserialize, FIX_TYPE, Refused, VELOCITY_TYPES)
 from ins_align.recordings.reader import choose_topics
 import numpy as np
 import pytest
@@ -86,8 +86,8 @@ def test_same_messages_in_the_same_order_as_rosbags(recordings, kind):
     assert by_bag(path) == by_bag(storage_file(path)) == (expected, [])
     with Bag(path) as bag:
         assert (bag.start_ns, bag.end_ns) == (expected[0][1], expected[-1][1])
-        assert {(topic.name, topic.msgtype, topic.message_count) for topic in bag.topics} == {
-            ('/imu/data_raw', IMU, 4000), ('/fix', FIX, 200), ('/fix_velocity', TWIST, 200)}
+        assert {(topic.name, topic.msgtype) for topic in bag.topics} == {
+            ('/imu/data_raw', IMU), ('/fix', FIX), ('/fix_velocity', TWIST)}
         assert all('std_msgs/Header' in topic.definition for topic in bag.topics)
         start, stop = START_NS + 10 ** 10, START_NS + 2 * 10 ** 10
         times = [block.times_ns for block in bag.blocks(bag.topics, start, stop)]
@@ -174,8 +174,7 @@ def test_cut_off_mcap_is_read_as_far_as_it_goes(copy, kind, kept, filled):
     lost = 0.1 if kind in ('mcap', 'mcap messages') else 1.0
     assert len(records) > (kept - lost) * 4400
     with Bag(path) as bag:
-        assert sum(topic.message_count for topic in bag.topics) == len(records)
-        assert bag.end_ns == (records[-1][1] if records else None)
+        assert bag.end_ns == (records[-1][1] if records else 0)
 
 
 @pytest.mark.parametrize('chunked', [True, False])
@@ -190,7 +189,7 @@ def test_mcap_without_an_index(tmp_path, chunked, missing):
     assert len(records) >= 30 - (missing or 0) / 30 - bool(missing)
     assert len(warnings) == bool(missing)
     with Bag(tmp_path / 'a') as bag:
-        assert bag.topics[0][:3] == ('/0', IMU, 'cdr') and bag.topics[0][4] == 'definition'
+        assert bag.topics[0] == ('/0', IMU, 'cdr', 'definition')
 
 
 def spoilt(at, piece):
@@ -430,8 +429,9 @@ def serialized(encoding, msgtype=IMU, frame_id='imu_link', little_endian=True, s
 def assert_decoded(raws, encoding):
     """Compare with rosbags; a frame_id is not read."""
     topic = Topic('/imu', IMU, encoding)
-    samples, orientations = decode_imu(raws, topic), decode_orientations(raws, topic)
-    found = zip(*samples[:3], *orientations)
+    samples = decode_imu(raws, topic)
+    found = zip(samples.stamps_ns, samples.gyro, samples.accel, samples.numbers[:, :4],
+                samples.numbers[:, 4:13])
     for raw, decoded in zip(raws, samples.decoded):
         values = next(found) if decoded else None
         try:
@@ -441,7 +441,7 @@ def assert_decoded(raws, encoding):
         assert decoded
         stamp_ns, *vectors = imu_from_msg(message)
         turn = [getattr(message.orientation, axis) for axis in 'xyzw']
-        for mine, other in zip(values, (stamp_ns, *vectors, stamp_ns, turn,
+        for mine, other in zip(values, (stamp_ns, *vectors, turn,
                                         message.orientation_covariance)):
             np.testing.assert_array_equal(mine, other)
     assert next(found, None) is None
@@ -462,7 +462,7 @@ def test_imu_messages_that_are_none_are_left_out():
               b'\0\7' + raws[4][2:]]
     assert assert_decoded(spoilt, 'cdr').nonzero()[0].tolist() == [1, 4]
     nothing = decode_imu([], Topic('/imu', IMU, 'cdr'))
-    assert [array.shape for array in nothing] == [(0,), (0, 3), (0, 3), (0,)]
+    assert [array.shape for array in nothing] == [(0,), (0, 37), (0,)]
 
 
 @settings(max_examples=300, deadline=None)

@@ -294,7 +294,7 @@ def test_figure_shows_every_angle_whole(result):
         roll_deg=epoch.current.roll_deg, pitch_deg=epoch.current.pitch_deg + 80.0,
         yaw_deg=epoch.current.yaw_deg, sigma_deg=epoch.current.sigma_deg))
         for epoch in result.epochs]
-    reference = SimpleNamespace(errors_deg=lambda attitude: (np.zeros(3), np.full(3, 100.0)))
+    reference = SimpleNamespace(errors_deg=lambda attitude: np.full(3, 100.0))
     tilt = plot(dataclasses.replace(result, epochs=tuple(steep), reference=reference)).axes[0]
     low, high = tilt.get_ylim()
     lines = [line.get_ydata() for line in tilt.lines if len(line.get_xdata()) > 10]

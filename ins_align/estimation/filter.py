@@ -488,7 +488,7 @@ class Filters:
         level = np.where(self.counts, self.evidence, -np.inf)
         likely = level > level.max() - NEGLIGIBLE
         use = np.flatnonzero(likely[self.place])
-        of = use if self.single else self.place[use]
+        of = np.arange(len(likely))[self.place][use]
         share = np.exp(level[of] - level.max() + self.weight[use])
         share = share / share.sum()
         C = np.stack([self.C0[use], self.C[use]])

@@ -34,8 +34,8 @@ from ins_align.gnss.messages import Fix, Velocity
 from ins_align.gnss.motion import series_of, track
 from ins_align.offline import align
 from ins_align.recordings import BagError
-from ins_align.recordings.decode import ImuSamples, Orientations
-from ins_align.recordings.reader import read, REFERENCE_TOPIC, Request
+from ins_align.recordings.decode import ImuSamples
+from ins_align.recordings.reader import read, REFERENCE_TOPIC
 from ins_align.results import Epoch, Reference
 import numpy as np
 
@@ -97,20 +97,21 @@ def recordings_in(folder: Path) -> list[Path]:
 @lru_cache(maxsize=3)
 def load(path: Path) -> Recording:
     """Read and decode a recording; the last few are kept."""
-    parts = list(read(Request(path)))
+    parts = list(read(path))
     if parts[0].topics.reference is None:
         raise BagError(f'it has no reference attitude on {REFERENCE_TOPIC}')
     imu = ImuSamples(*map(np.concatenate, zip(*(part.imu for part in parts))))
-    orientations = Orientations(
-        *map(np.concatenate, zip(*(part.orientations for part in parts))))
+    stamps_ns, quaternions, covariances = map(
+        np.concatenate, zip(*(part.reference.orientations() for part in parts)))
     earlier = itertools.accumulate((part.imu.stamps_ns.size for part in parts), initial=0)
     name = path.name.split('.')[0]
-    stated = np.degrees(np.sqrt(np.median(np.abs(orientations.covariances[:, [0, 4, 8]]), axis=0)))
+    stated = np.degrees(np.sqrt(np.median(np.abs(covariances[:, [0, 4, 8]]), axis=0)))
     config, tilt, heading = KNOWN.get(name, ({}, 0.0, 0.0))
     gnss = [(start + before, message) for start, part in zip(earlier, parts)
             for before, message in part.gnss if isinstance(message, (Fix, Velocity))]
-    return Recording(name, config, imu, gnss, Reference(orientations.known()),
+    return Recording(name, config, imu, gnss, Reference((stamps_ns, quaternions)),
                      np.maximum(stated, [tilt, tilt, heading]))
+
 
 
 def windows_of(path: Path, config: JsonDict) -> list[Any]:

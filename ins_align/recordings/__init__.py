@@ -71,7 +71,6 @@ class Topic(NamedTuple):
     name: str
     msgtype: str  # in ROS 2 notation: sensor_msgs/msg/Imu
     encoding: str  # of its messages: cdr or ros1
-    message_count: int = 0  # as the recording says
     definition: str = ''  # of the type, where the recording has it
 
 

@@ -66,18 +66,7 @@ class Bag:
     """
     A recording: a rosbag2 directory, one of its files, a ROS 1 bag or a directory of its parts.
 
-    Attributes
-    ----------
-    topics : tuple of Topic
-        Those whose messages can be decoded.
-    start_ns, end_ns : int or None
-        Times at which the first and the last message were recorded; None: there is none.
-
-    Raises
-    ------
-    BagError
-        If it cannot be read at all. What can be read in part is, with `warnings`.
-
+    A BagError says that it cannot be read at all. What can be read in part is, with `warnings`.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -91,19 +80,16 @@ class Bag:
                 # Of whatever type and size they are in a file, here they fit into 64 bits.
                 times_ns = np.array([(reader.start_time, reader.end_time - 1)
                                      for reader in filled], np.int64).reshape(-1, 2)
-                self.start_ns = int(times_ns[:, 0].min()) if filled else None
-                self.end_ns = int(times_ns[:, 1].max()) if filled else None
-                self.topics = self._listed_topics()
+                # When the first and the last message were recorded; 0 where there is none.
+                self.start_ns = int(times_ns[:, 0].min()) if filled else 0
+                self.end_ns = int(times_ns[:, 1].max()) if filled else 0
+                self.topics = self._listed_topics()  # whose messages can be decoded
             self._stack = stack.pop_all()
 
     def __enter__(self) -> Bag:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the files and delete what was unpacked."""
         self._stack.close()
 
     def warn(self, text: str) -> None:
@@ -163,8 +149,7 @@ class Bag:
                     known.setdefault(key, []).append(connection)
         _check_topics(len(known))
         for key, connections in known.items():
-            count = sum(connection.msgcount for connection in connections)
-            topic = Topic(*key, count, connections[0].msgdef.data)
+            topic = Topic(*key, connections[0].msgdef.data)
             self._topics.update((id(connection), topic) for connection in connections)
         return tuple(dict.fromkeys(self._topics.values()))
 

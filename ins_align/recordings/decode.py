@@ -48,27 +48,33 @@ GYRO, ACCEL = slice(13, 16), slice(25, 28)
 
 
 class ImuSamples(NamedTuple):
-    """Rates and specific forces in the order of their messages."""
+    """Samples of an IMU in the order of their messages."""
 
     stamps_ns: np.ndarray  # (N,) int64
-    gyro: np.ndarray  # (N, 3), rad/s
-    accel: np.ndarray  # (N, 3), m/s^2
+    numbers: np.ndarray  # (N, 37), those of sensor_msgs/Imu; 0 where a driver's message has none
     decoded: np.ndarray  # (M,) bool: which of M messages the N samples come from
 
+    @property
+    def gyro(self) -> np.ndarray:
+        """Angular rates, (N, 3), rad/s."""
+        return self.numbers[:, GYRO]
 
-class Orientations(NamedTuple):
-    """Orientations in the order of their messages."""
+    @property
+    def accel(self) -> np.ndarray:
+        """Specific forces, (N, 3), m/s^2."""
+        return self.numbers[:, ACCEL]
 
-    stamps_ns: np.ndarray  # (N,) int64
-    quaternions: np.ndarray  # (N, 4), (x, y, z, w)
-    covariances: np.ndarray  # (N, 9), rad^2
+    def orientations(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """
+        Return the orientations that are no zeros and whose variance is not negative.
 
-    def known(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return stamps and quaternions that are no zeros and whose variance is not negative."""
-        good = (np.isfinite(self.quaternions).all(axis=1)
-                & (np.abs(self.quaternions).max(axis=1, initial=0.0) > 1e-3)
-                & ~(self.covariances[:, 0] < 0.0))
-        return self.stamps_ns[good], self.quaternions[good]
+        Stamps, (K,), quaternions (x, y, z, w), (K, 4), and covariances, (K, 9), rad^2.
+        """
+        turns = self.numbers[:, ORIENTATION]
+        covariances = self.numbers[:, ORIENTATION_COVARIANCE]
+        known = (np.isfinite(turns).all(axis=1)
+                 & (np.abs(turns).max(axis=1, initial=0.0) > 1e-3) & ~(covariances[:, 0] < 0.0))
+        return self.stamps_ns[known], turns[known], covariances[known]
 
 
 class Refused(NamedTuple):
@@ -83,24 +89,10 @@ Gnss = Union[Fix, Velocity, Refused]
 
 def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
     """Decode messages of an IMU, sensor_msgs/Imu or a driver's own; what is none is left out."""
-    stamps_ns, numbers, decoded = _imu_numbers(messages, topic)
-    return ImuSamples(stamps_ns, numbers[:, GYRO].copy(), numbers[:, ACCEL].copy(), decoded)
-
-
-def decode_orientations(messages: Sequence[bytes], topic: Topic) -> Orientations:
-    """Decode the orientations of sensor_msgs/Imu like `decode_imu`."""
-    stamps_ns, numbers, _ = _imu_numbers(messages, topic)
-    return Orientations(stamps_ns, numbers[:, ORIENTATION].copy(),
-                        numbers[:, ORIENTATION_COVARIANCE].copy())
-
-
-def _imu_numbers(messages: Sequence[bytes], topic: Topic,
-                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return stamps, (N,), numbers, (N, 37), and which of the M messages they come from."""
     if topic.msgtype == IMU_TYPE and len(set(map(len, messages))) == 1:
         rows = np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), -1)
         if (found := _of_one_layout(rows, topic.encoding)) is not None:
-            return (*found, np.ones(len(messages), bool))
+            return ImuSamples(*found, np.ones(len(messages), bool))
     stamps_ns = np.zeros(len(messages), np.int64)
     numbers = np.zeros((len(messages), IMU_NUMBERS))
     decoded = np.zeros(len(messages), bool)
@@ -117,7 +109,7 @@ def _imu_numbers(messages: Sequence[bytes], topic: Topic,
                 stamps_ns[place], numbers[place, GYRO], numbers[place, ACCEL] = imu_from_driver(
                     message, topic.msgtype)
             decoded[place] = True
-    return stamps_ns[decoded], numbers[decoded], decoded
+    return ImuSamples(stamps_ns[decoded], numbers[decoded], decoded)
 
 
 def _of_one_layout(data: np.ndarray, encoding: str) -> tuple[np.ndarray, np.ndarray] | None:

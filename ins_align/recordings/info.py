@@ -39,7 +39,7 @@ from ins_align.recordings.bag import Bag
 from ins_align.recordings.imu_survey import fit_motion, survey_imu
 from ins_align.recordings.reader import choose_topics
 from ins_align.recordings.topic_survey import (
-    in_words, read_candidates, Recorded, rounded, Surveyed, TopicInfo)
+    in_words, read_candidates, Recorded, rounded, Surveyed)
 from ins_align.report import format_table
 import numpy as np
 
@@ -47,8 +47,6 @@ MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
 MIN_AHEAD = 0.3  # s: clocks that differ by less may be jitter
 MAX_AHEAD, MAX_BEHIND = MAX_AHEAD_NS * 1e-9, 10.0  # s: stamps further apart are of two clocks
 MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s and so many sigmas beyond it: a delay to be set
-MIN_APART = 5.0  # s between manoeuvres that are listed
-MAX_LISTED = 8
 FRAMES_THAT_FIT = ('enu', 'ned')
 FRAME_FAULTS = {
     'body': 'its speed fits the change of position and its direction does not: it is given in the '
@@ -74,7 +72,7 @@ class Info(Surveyed):
     bag: str
     duration_s: float
     start_ns: int
-    topics: tuple[TopicInfo, ...]
+    topics: tuple[Recorded, ...]
     chosen: dict[str, str | None]  # topic by kind that the command reads
     obstacles: tuple[str, ...] = ()  # why it cannot be aligned
     command: str | None = None  # to align it, quoted for a shell; None: it cannot be
@@ -106,10 +104,9 @@ def inspect(path: str | os.PathLike[str]) -> Info:
         imu, fix = (_best(of_kind) or next(iter(of_kind), None) for of_kind in (imus, fixes))
         chosen = {'imu': imu, 'fix': fix, 'velocity': velocity}
         # The end of a file that was cut off is known from what could be read of it.
-        start_ns = bag.start_ns or 0
-        end_ns = max([bag.end_ns or start_ns, *(
+        end_ns = max([bag.end_ns, *(
             int(data.recorded_ns.max()) for data in candidates if data.recorded_ns.size)])
-        info = Info(str(bag.path), (end_ns - start_ns) * 1e-9, start_ns,
+        info = Info(str(bag.path), (end_ns - bag.start_ns) * 1e-9, bag.start_ns,
                     tuple(data for of_kind in topics for data in of_kind),
                     {kind: data and data.name for kind, data in chosen.items()})
         _add_manoeuvres(info, find_manoeuvres(grid))
@@ -163,15 +160,15 @@ def _survey_velocity(data: Recorded, positions: Series) -> None:
         return
     frame = velocity_frame(data.series(), positions)
     name = frame.frame
-    if data.refused and name not in FRAMES_THAT_FIT:
-        data.add(data.refused, fault=True)
+    if data.doubt and name not in FRAMES_THAT_FIT:
+        data.add(data.doubt, fault=True)
     if name in FRAME_FAULTS:
         data.add(FRAME_FAULTS[name].format(frame), fault=True)
     text = 'frame: not known, too little motion: it is taken as east-north-up'
     if name in FRAMES_THAT_FIT:
         text = f'frame: {name} (fits the change of position over {frame.windows} distances)'
     data.add('' if name in FRAME_FAULTS else text,
-             {'velocity_frame': name} if name == 'ned' or name == 'enu' and data.refused else {},
+             {'velocity_frame': name} if name == 'ned' or name == 'enu' and data.doubt else {},
              frame=name, speed_ratio=frame.speed_ratio)
     if frame.upside_down:
         data.add('the vertical velocity has the wrong sign')
@@ -182,8 +179,8 @@ def _survey_velocity(data: Recorded, positions: Series) -> None:
 
 def _survey_imu(data: Recorded, motion: Series, gravity: float, alone: bool) -> None:
     """Measure an IMU and find what makes it useless."""
-    if data.unmeasured:
-        data.add(data.unmeasured + '; its numbers are used all the same (covariances that are not '
+    if data.doubt:
+        data.add(data.doubt + '; its numbers are used all the same (covariances that are not '
                  'known are 0)' * alone, fault=not alone)
     rate, gap = (data.figures.get(name) for name in ('rate_hz', 'longest_gap_s'))
     if rate is not None and rate < MIN_RATE:
@@ -211,12 +208,8 @@ def _add_manoeuvres(info: Info, found: Manoeuvres | None) -> None:
     info.add(f'up to {found.max_speed:.1f} m/s; velocity changes by up to '
              f'{found.largest_change:.1f} m/s within {MANOEUVRE_TIME:g} s',
              max_speed=found.max_speed, largest_change=found.largest_change)
-    apart = [start for before, start in zip((-math.inf, *found.starts), found.starts)
-             if start - before > MIN_APART]
-    listing = [f'{start:.0f}' for start in apart[:MAX_LISTED]] + ['...'] * (
-        len(apart) > MAX_LISTED)
-    info.add(f'changes by {MANOEUVRE_SPEED:g} m/s: {len(found.starts)}, at '
-             f'{", ".join(listing)} s' if apart else '', manoeuvres_s=list(found.starts))
+    info.add(f'changes by {MANOEUVRE_SPEED:g} m/s: {len(found.starts)}, the first at '
+             f'{found.starts[0]:.0f} s' if found.starts else '', manoeuvres_s=list(found.starts))
 
 
 def _different_clocks(imu: Recorded, gnss: list[Recorded]) -> list[str]:
@@ -328,7 +321,7 @@ def describe(info: Info) -> str:
     return '\n'.join(printable(line) for text in lines for line in text.split('\n'))
 
 
-def _row(topic: TopicInfo) -> list[str]:
+def _row(topic: Recorded) -> list[str]:
     figures = topic.figures
     return [topic.name, topic.msgtype.rsplit('/', 1)[-1], *(
         '-' if (value := figures.get(name)) is None else format(value, digits)

@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 import dataclasses
-from dataclasses import dataclass
 import itertools
 from operator import attrgetter, itemgetter
 import os
@@ -34,8 +33,8 @@ from ins_align.mounting import find_mounting, FixedFrames, Mounting
 from ins_align.recordings import BagError, listed, Topic
 from ins_align.recordings.bag import Bag, Block
 from ins_align.recordings.decode import (
-    decode_gnss, decode_imu, decode_orientations, deserialize, FIX_TYPE, Gnss, IMU_TYPE,
-    ImuSamples, Orientations, short_name, unmeasured, VECTOR_TYPE, VELOCITY_TYPES)
+    decode_gnss, decode_imu, deserialize, FIX_TYPE, Gnss, IMU_TYPE, ImuSamples, short_name,
+    unmeasured, VECTOR_TYPE, VELOCITY_TYPES)
 from ins_align.results import Severity
 import numpy as np
 
@@ -57,19 +56,6 @@ class Topics(NamedTuple):
     base: Transform | None = None  # from the configured base to the IMU
 
 
-@dataclass(frozen=True)
-class Request:
-    """What to read of which recording: the arguments of `replay`."""
-
-    path: str | os.PathLike[str]
-    config: Config = Config()
-    imu_topic: str | None = None
-    fix_topic: str | None = None
-    velocity_topic: str | None = None
-    start: float | None = None  # s from the start of the recording, by recorded time
-    duration: float | None = None
-
-
 class Part(NamedTuple):
     """Consecutive messages of a recording, decoded."""
 
@@ -77,45 +63,45 @@ class Part(NamedTuple):
     config: Config  # as requested, for the type of velocity that was found
     imu: ImuSamples
     gnss: tuple[tuple[int, Gnss], ...]  # each after how many of the IMU samples
-    orientations: Orientations
+    reference: ImuSamples  # whose orientations are those to compare with
     done: float  # how much of the recording this ends at, 0 to 1
     warnings: tuple[str, ...]  # so far
 
 
-def read(request: Request) -> Iterator[Part]:
+def read(path: str | os.PathLike[str], config: Config = Config(), imu_topic: str | None = None,
+         fix_topic: str | None = None, velocity_topic: str | None = None,
+         start: float | None = None, duration: float | None = None) -> Iterator[Part]:
     """
-    Read a recording; the last part has no messages and all warnings.
+    Read a recording as `replay` does; the last part has no messages and all warnings.
 
     A BagError says that the recording cannot be read or lacks a topic, or that a part was asked
     for that holds no message of these topics.
     """
-    with Bag(request.path) as bag:
+    with Bag(path) as bag:
         try:
-            topics = choose_topics(bag, request.config, request.imu_topic, request.fix_topic,
-                                   request.velocity_topic)
+            topics = choose_topics(bag, config, imu_topic, fix_topic, velocity_topic)
         except BagError as error:
             reasons = f' ({bag.warnings[0]})' if bag.warnings else ''
             raise BagError(f'{error}{reasons}') from None
-        config = request.config
         if topics.velocity is not None and topics.velocity.msgtype in VELOCITY_TYPES:
             config = dataclasses.replace(config, velocity_type=short_name(topics.velocity.msgtype))
         mounting = _mounting(bag, topics, config)
         config, topics = mounting.config, topics._replace(base=mounting.base)
         wanted = list(dict.fromkeys(topic for topic in topics if isinstance(topic, Topic)))
-        first_ns = bag.start_ns or 0
-        start_ns = None if request.start is None else first_ns + round(request.start * 1e9)
-        begin_ns, end_ns = first_ns if start_ns is None else start_ns, bag.end_ns or first_ns
-        stop_ns = None if request.duration is None else begin_ns + round(request.duration * 1e9)
-        length_ns = (end_ns if stop_ns is None else min(end_ns, stop_ns)) - begin_ns
-        done, empty = 0.0, True
-        for block in bag.blocks(wanted, start_ns, stop_ns):
-            if length_ns > 0:
-                done = min(max((int(block.times_ns[-1]) - begin_ns) / length_ns, 0.0), 1.0)
+        begin_ns = bag.start_ns + round((start or 0.0) * 1e9)
+        stop_ns = None if duration is None else begin_ns + round(duration * 1e9)
+        length_ns = (bag.end_ns if stop_ns is None else min(bag.end_ns, stop_ns)) - begin_ns
+        empty = True
+        for block in bag.blocks(wanted, None if start is None else begin_ns, stop_ns):
+            done = float(np.clip((block.times_ns[-1] - begin_ns) / max(length_ns, 1), 0.0, 1.0))
             yield _decoded(block, wanted, topics, config, done, tuple(bag.warnings))
             empty = False
-        if empty and (start_ns, stop_ns) != (None, None):
-            raise BagError(f'{request.path} has no IMU or GNSS messages '
-                           f'{_window(request, ((bag.end_ns or first_ns) - first_ns) * 1e-9)}')
+        if empty and (start, duration) != (None, None):
+            from_s = start or 0.0
+            window = (f'after {from_s:g} s' if duration is None
+                      else f'between {from_s:g} s and {from_s + duration:g} s')
+            raise BagError(f'{path} has no IMU or GNSS messages {window}: it is '
+                           f'{(bag.end_ns - bag.start_ns) * 1e-9:.1f} s long')
         nothing = Block(np.zeros(0, np.int64), np.zeros(0, np.int64), [()] * len(wanted))
         yield _decoded(nothing, wanted, topics, config, 1.0, tuple(bag.warnings))
 
@@ -150,35 +136,27 @@ def _frame_id(bag: Bag, topic: Topic) -> str:
     return ''
 
 
-def _window(request: Request, length_s: float) -> str:
-    """Say which part of a recording was asked for, and how long all of it is."""
-    start = request.start or 0.0
-    window = (f'after {start:g} s' if request.duration is None
-              else f'between {start:g} s and {start + request.duration:g} s')
-    return f'{window}: it is {length_s:.1f} s long'
-
-
 def _decoded(block: Block, wanted: list[Topic], topics: Topics, config: Config, done: float,
              warnings: tuple[str, ...]) -> Part:
     """Decode a block, the messages of a topic all at once."""
-    number_of = {topic: number for number, topic in enumerate(wanted)}
-    samples = decode_imu(block.messages[number_of[topics.imu]], topics.imu)
+    messages = dict(zip(wanted, block.messages))
+    samples = decode_imu(messages[topics.imu], topics.imu)
     before = np.zeros(block.topics.size, np.int64)
-    before[block.topics == number_of[topics.imu]] = samples.decoded
+    before[block.topics == wanted.index(topics.imu)] = samples.decoded
     before = np.cumsum(before)
     gnss: list[tuple[int, Gnss]] = []
     for topic in dict.fromkeys(filter(None, (topics.fix, topics.velocity))):
-        found = decode_gnss(block.messages[number_of[topic]], topic, config)
-        places = np.flatnonzero(block.topics == number_of[topic]).tolist()
+        found = decode_gnss(messages[topic], topic, config)
+        places = np.flatnonzero(block.topics == wanted.index(topic)).tolist()
         for kind, source in (('fix', topics.fix), ('velocity', topics.velocity)):
             if topic is source:
                 gnss += zip(places, found[kind])
     gnss.sort(key=itemgetter(0))
-    reference = topics.reference or topics.imu
-    orientations = block.messages[number_of[reference]] if topics.reference else ()
+    reference = (decode_imu(messages[topics.reference], topics.reference) if topics.reference
+                 else decode_imu((), topics.imu))
     return Part(topics, config, samples,
-                tuple((int(before[place]), message) for place, message in gnss),
-                decode_orientations(orientations, reference), done, warnings)
+                tuple((int(before[place]), message) for place, message in gnss), reference, done,
+                warnings)
 
 
 def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | None = None,
@@ -187,14 +165,8 @@ def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | N
     Find the topics by message type, or by name where one is given.
 
     Velocities that cannot be used, or that are left out for one of another type, are among the
-    warnings of `bag` afterwards.
-
-    Raises
-    ------
-    BagError
-        If a topic is missing or there is more than one candidate: the text lists them and names
-        the option that chooses one.
-
+    warnings of `bag` afterwards. Where a topic is missing, or there is more than one candidate, a
+    BagError lists what there is and names the option that chooses.
     """
     imu_topic = _required(bag, 'IMU', ([IMU_TYPE], [*INERTIAL_UNITS]), imu)
     fix_topic = _required(bag, 'position', (

@@ -53,15 +53,7 @@ def write_results(result: Result, path: str | os.PathLike[str]) -> None:
 
     It makes a directory, whole or not at all, and reads the recording once more for its IMU
     messages. Stamps are those of the input; the recorded time is that of the IMU message which
-    follows.
-
-    Raises
-    ------
-    BagError
-        If the path exists or the recording cannot be read any more.
-    OSError
-        If it cannot be written.
-
+    follows. A BagError says that the path exists or the recording cannot be read any more.
     """
     path = Path(path)
     if path.exists():
@@ -124,9 +116,10 @@ class _Results:
         """Yield recorded time, message, stamp, rate and specific force of the IMU."""
         with Bag(self._result.bag) as bag:
             for block in bag.blocks([self._topic]):
-                stamps_ns, gyro, accel, decoded = decode_imu(block.messages[0], self._topic)
-                for place, *numbers in zip(np.flatnonzero(decoded).tolist(), stamps_ns.tolist(),
-                                           gyro, accel):
+                samples = decode_imu(block.messages[0], self._topic)
+                for place, *numbers in zip(
+                        np.flatnonzero(samples.decoded).tolist(), samples.stamps_ns.tolist(),
+                        samples.gyro, samples.accel):
                     yield int(block.times_ns[place]), block.messages[0][place], *numbers
 
     def _prediction(self, epoch: Epoch, rate: Any) -> Prediction | None:

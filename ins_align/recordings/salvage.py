@@ -15,7 +15,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Iterator
 import mmap
 from pathlib import Path
@@ -43,13 +42,8 @@ class SalvagedMcap:
     """
     An mcap file read record by record, without the index at its end, in the order of its records.
 
-    It offers what a reader of rosbags does. Topics and times are found by reading all of it once.
-
-    Attributes
-    ----------
-    complete : bool
-        Whether the file has an end and no damage was met before it.
-
+    It offers what a reader of rosbags does. Topics and times are found by reading all of it once,
+    and with that whether it is `complete`: has an end and no damage before it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -60,12 +54,10 @@ class SalvagedMcap:
             self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         schemas: dict[int, tuple[str, MessageDefinition]] = {}
         channels: dict[int, tuple[int, str, str]] = {}  # schema, topic, encoding
-        counts: Counter[int] = Counter()
         try:
             for data, kind, begin, end in self._records():
                 if kind == _MESSAGE and end - begin >= _MESSAGE_HEAD.size:
-                    channel, _, time_ns, _ = _MESSAGE_HEAD.unpack_from(data, begin)
-                    counts[channel] += 1
+                    _, _, time_ns, _ = _MESSAGE_HEAD.unpack_from(data, begin)
                     self.start_time = min(self.start_time, time_ns)
                     self.end_time = max(self.end_time, time_ns + 1)
                 elif kind in (_SCHEMA, _CHANNEL) and end - begin <= MAX_DEFINITION_BYTES:
@@ -82,7 +74,7 @@ class SalvagedMcap:
             raise
         for channel, (schema, topic, encoding) in channels.items():
             self.connections.append(Connection(
-                channel, topic, *schemas.get(schema, _NOTHING), '', counts[channel],
+                channel, topic, *schemas.get(schema, _NOTHING), '', 0,
                 ConnectionExtRosbag2(encoding, []), self))
 
     def close(self) -> None:

@@ -51,26 +51,13 @@ def in_words(settings: Mapping[str, Any]) -> list[str]:
 
 @dataclass(kw_only=True)
 class Surveyed:
-    """
-    What has been found out about a recording or a topic.
+    """What has been found out about a recording or a topic."""
 
-    Attributes
-    ----------
-    lines : list of str
-        Sentences, which ``ins_align info`` prints.
-    figures : dict
-        Numbers by name, in SI units where the name has no other.
-    settings : dict
-        Parameters that an alignment needs, with their values.
-    faults : list of str
-        Why it is useless as it is.
-
-    """
-
-    lines: list[str] = field(default_factory=list)
+    lines: list[str] = field(default_factory=list)  # sentences, which ``ins_align info`` prints
+    # Numbers by name, in SI units where the name has no other.
     figures: dict[str, Any] = field(default_factory=dict)
-    settings: dict[str, Any] = field(default_factory=dict)
-    faults: list[str] = field(default_factory=list)
+    settings: dict[str, Any] = field(default_factory=dict)  # parameters that an alignment needs
+    faults: list[str] = field(default_factory=list)  # why it is useless as it is
 
     def add(self, text: str, settings: Mapping[str, Any] | None = None, *, fault: bool = False,
             **figures: Any) -> None:
@@ -84,10 +71,10 @@ class Surveyed:
         self.figures |= figures
 
 
-@dataclass
-class TopicInfo(Surveyed):
+@dataclass(init=False)
+class Recorded(Surveyed):
     """
-    A topic that an alignment could read.
+    A topic that an alignment could read, with all its messages in recorded order.
 
     Figures of all are ``messages``, ``rate_hz``, ``first_s`` and ``last_s`` (recorded),
     ``stamp_age_s`` (recorded time less the header's stamp, median), ``stamp_age_spread_s`` (98
@@ -99,33 +86,18 @@ class TopicInfo(Surveyed):
     msgtype: str
     kind: str  # imu, fix or velocity
 
-
-class Recorded(TopicInfo):
-    """
-    A topic with all its messages, in recorded order.
-
-    Attributes
-    ----------
-    recorded_ns, stamps_ns : ndarray of int, shape (N,)
-    values : ndarray, shape (N, 6) or (N, 3)
-        Rate and specific force; latitude, longitude, degrees, and altitude, m; or velocity as if
-        it were ENU, m/s.
-    usable : ndarray of bool, shape (N,)
-        Finite, with a stamp near the others and, of fixes, with a fix.
-    refused : str
-        Why velocities are refused for their frame_id, in words; empty: they are not.
-    unmeasured : str
-        That an IMU says that it does not measure what is needed, in words.
-
-    """
-
     def __init__(self, topic: Topic, kind: str, bag_start_ns: int) -> None:
-        super().__init__(topic.name, type_in_words(topic.msgtype), kind)
+        super().__init__()
+        self.name, self.msgtype, self.kind = topic.name, type_in_words(topic.msgtype), kind
         self.topic, self._start_ns, self._age_ns = topic, bag_start_ns, 0
         self.recorded_ns = self.stamps_ns = np.zeros(0, np.int64)
+        # (N, 6), rate and specific force; or (N, 3), latitude, longitude, degrees, and altitude,
+        # m, or velocity as if it were ENU, m/s.
         self.values: Array = np.zeros((0, 6 if kind == 'imu' else 3))
-        self.usable = np.zeros(0, bool)
-        self.refused = self.unmeasured = self._why = ''
+        self.usable = np.zeros(0, bool)  # finite, with a stamp near the others and with a fix
+        # In words: why velocities would be refused for their frame_id, or what an IMU says it does
+        # not measure; why messages cannot be decoded.
+        self.doubt = self._why = ''
         self._undecodable = self._without_fix = 0
         self._sigmas: list[tuple[float, float]] = []  # of messages that state a covariance
         self._parts: list[tuple[Any, ...]] = []  # recorded_ns, stamps_ns, values, usable
@@ -138,10 +110,11 @@ class Recorded(TopicInfo):
         if not self._parts:
             self._look_at(first)
         if isinstance(decoded, ImuSamples):
-            stamps_ns, gyro, accel, good = decoded
+            gyro, accel, good = decoded.gyro, decoded.accel, decoded.decoded
             usable = ((np.abs(gyro) < MAX_RATE) & (np.abs(accel) < MAX_ACCELERATION)).all(axis=1)
             self._undecodable += int(np.count_nonzero(~good))
-            self._parts.append((times_ns[good], stamps_ns, np.hstack([gyro, accel]), usable))
+            self._parts.append((times_ns[good], decoded.stamps_ns, np.hstack([gyro, accel]),
+                                usable))
             return
         rows = []
         for time_ns, message in zip(times_ns.tolist(), decoded):
@@ -162,12 +135,12 @@ class Recorded(TopicInfo):
         """See what a message says that it does not measure, or in what frame it is."""
         if self.topic.msgtype in VELOCITY_TYPES:
             message, = decode_gnss([data], self.topic, Config())['velocity']
-            self.refused = message.why if isinstance(message, Refused) else ''
+            self.doubt = message.why if isinstance(message, Refused) else ''
         if self.topic.msgtype == IMU_TYPE:
             with suppress(MessageError):
                 what = ' and '.join(unmeasured(deserialize(data, self.topic)))
-                self.unmeasured = what and (f'its messages say that it does not measure {what} '
-                                            '(covariance -1)')
+                self.doubt = what and (f'its messages say that it does not measure {what} '
+                                       '(covariance -1)')
 
     def finish(self) -> None:
         """Put together what has been taken, and say what it tells of itself."""
@@ -249,7 +222,7 @@ def read_candidates(bag: Bag) -> list[Recorded]:
     """Read every topic that an alignment could read, sorted by name."""
     topics = sorted(topic for topic in bag.topics if topic.msgtype in KINDS
                     and may_be_velocity(topic) and REFERENCE_NAMESPACE not in topic.name)
-    recorded = {topic: [Recorded(topic, kind, bag.start_ns or 0) for kind in KINDS[topic.msgtype]]
+    recorded = {topic: [Recorded(topic, kind, bag.start_ns) for kind in KINDS[topic.msgtype]]
                 for topic in topics}
     for block in bag.blocks(topics):
         for number, (topic, messages) in enumerate(zip(topics, block.messages)):
