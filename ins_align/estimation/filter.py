@@ -44,9 +44,9 @@ GATE = 25.0
 # Log likelihood ratio of a motion that fits a vehicle, to one whose slips are so much larger that
 # a normalised innovation squared of twice this, of two rows, is as likely.
 FITS = 3.0
-# A rival that is less likely than the best by this (log) is no part of a mixture. Its mean is found
-# when all attitudes are so close to it (rad) that rotations add up like vectors, or it moves no
-# more (rad).
+# A rival that is less likely than the best by this (log) is no part of a mixture, whose mean is
+# found when all attitudes are so close to it (rad) that rotations add up like vectors, or it moves
+# no more (rad).
 NEGLIGIBLE, CLOSE, SETTLED = 12.0, 0.01, 1e-8
 # Corrections so small (rad) leave the axes of the errors as they are.
 NO_TURN = 1e-3

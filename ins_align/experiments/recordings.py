@@ -113,7 +113,6 @@ def load(path: Path) -> Recording:
                      np.maximum(stated, [tilt, tilt, heading]))
 
 
-
 def windows_of(path: Path, config: JsonDict) -> list[Any]:
     """Return tasks for `run_window`, one every `STEP`."""
     starts = np.arange(0.0, max(load(path).duration - SHORTEST, 0.0) + 1e-6, STEP)
