@@ -85,7 +85,7 @@ def run_all(function: Callable[[Any], T], tasks: Sequence[Any], jobs: int,
             child.terminate()
         raise
     finally:
-        executor.shutdown(cancel_futures=True)
+        executor.shutdown()
 
 
 def run_on_cluster(function: Callable[[Any], T], tasks: Sequence[Any], address: str,
@@ -109,22 +109,20 @@ def run_on_cluster(function: Callable[[Any], T], tasks: Sequence[Any], address: 
         raise UsageError(f'no Dask scheduler answers at {address} ({reason}); an address is '
                          'like tcp://localhost:8786') from None
     with client, client.get_executor() as executor:
-        yield from _in_order(executor, function, tasks, Exception)
+        try:
+            yield from _in_order(executor, function, tasks, Exception)
+        finally:
+            executor.shutdown(wait=False)       # nobody asks for what has not begun
 
 
 def _in_order(executor: Executor, function: Callable[[Any], T], tasks: Sequence[Any],
               lost: type[Exception]) -> Iterator[T | Exception]:
     """Yield what comes of tasks; `lost` says that whoever worked on one is gone."""
-    futures = [executor.submit(function, task) for task in tasks]
-    try:
-        for future in futures:
-            try:
-                yield future.result()
-            except lost as error:
-                yield error
-    finally:
-        for future in futures:
-            future.cancel()
+    for future in [executor.submit(function, task) for task in tasks]:
+        try:
+            yield future.result()
+        except lost as error:
+            yield error
 
 
 async def _ask_scheduler(address: str) -> None:
