@@ -4,8 +4,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OLDEST := .venv-oldest
-# A worker for each core; whoever has nothing left to do takes tests from another.
-PARALLEL := -n auto --maxprocesses 8 --dist worksteal
+# One worker more than cores, for tests of the node wait; whoever has nothing left to do takes tests
+# from another.
+PARALLEL := -n $(shell echo $$(($$(nproc 2>/dev/null || echo 2) + 1))) --maxprocesses 8 \
+    --dist worksteal
 
 # A ROS installation that is sourced in this shell must not mix with the wheels in .venv.
 unexport PYTHONPATH AMENT_PREFIX_PATH LD_LIBRARY_PATH RMW_IMPLEMENTATION

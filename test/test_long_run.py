@@ -72,6 +72,7 @@ def size_of(thing, seen=None):
     return 1 + sum(size_of(part, seen) for part in inside)
 
 
+@pytest.mark.campaign
 def test_an_aligner_of_two_hours_holds_no_more_and_knows_no_less():
     """
     Seven thousand epochs in streets.
