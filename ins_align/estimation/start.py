@@ -42,9 +42,9 @@ UNCERTAIN = 10.0
 # One epoch is an outlier if the residuals of the others are so many times smaller without it.
 OUTLYING = 10.0
 # Headings, every five degrees, and their sigma (rad): the sum of such normal densities is flat to
-# 2e-6.
+# a tenth, and the narrower they are, the less is lost to linearisation.
 HEADINGS = 72
-STEP_STD = 0.6 * 2 * math.pi / HEADINGS
+STEP_STD = 0.4 * 2 * math.pi / HEADINGS
 TILT_STD = math.radians(10.0)
 # What is not known of velocity and position at first (m/s, m); of a velocity whose horizontal
 # part is measured, the vertical is known better.
