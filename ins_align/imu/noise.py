@@ -14,8 +14,8 @@
 """
 What makes IMU samples miss the motion, and how much noise that is.
 
-Spikes, samples that repeat, the end of the sensors' range, lost samples, stamps that jitter,
-white noise as it is measured, and units that cannot be right.
+Spikes, samples that repeat, the end of the sensors' range, dead bands, lost samples, stamps that
+jitter, white noise as it is measured, and units that cannot be right.
 """
 
 import math
