@@ -152,9 +152,9 @@ def test_the_end_of_the_range_is_noise_of_the_steps_before():
 
 @pytest.mark.parametrize('sent, hidden', [(0.0, 0.02 / np.sqrt(3.0)), (1e-9, 0.0)])
 def test_a_dead_band_is_noise_as_large_as_the_band(sent, hidden):
-    """A rate that is sent as 0 may be any within the band, and lasts: the angle grows with time."""
+    """A rate that is sent as 0 may be any within the band, and lasts: an angle grows with time."""
     stamps, samples = steady()
-    samples[:, 0] = np.linspace(0.02, 0.03, stamps.size)
+    samples[:, 0] = np.linspace(0.02, 0.04, stamps.size)
     silent = (stamps > 3.4 * SECOND) & (stamps < 3.7 * SECOND)
     samples[silent, 0] = sent
     imu, counts = cut(stamps, samples)

@@ -43,8 +43,8 @@ END_RATE, END_FORCE = 0.5, 15.0
 END_TIMES, END_CHANGING, PILED_UP = 5, 3, 4
 BEYOND_END = 0.5
 # A sensor that sends small values as 0 has none closer to 0: how small it can tell is known from
-# so many values that are less than twice as large as the smallest.
-NEAR_ZERO = 20
+# so many values that are so many times as large as the smallest. What rounds has none there.
+NEAR_ZERO, NEAR = 20, (1.1, 1.9)
 # What gyros and accelerometers miss beyond their range and within a dead band lasts as long as
 # they are there, but at most so long (s).
 LASTS = np.array([np.inf, np.inf, 1.0, 1.0])
@@ -125,7 +125,7 @@ class RangeCheck:
         # The largest value below the end, and how often it came.
         self._below, self._times_below = self._ends.copy(), self._times.copy()
         self._last = np.zeros(6)
-        # The smallest value of each axis that is not 0, and how many are less than twice as large.
+        # The smallest value of each axis that is not 0, and how many are near it.
         self._smallest, self._near = np.full(6, np.inf), np.zeros(6, int)
         # The last sample of gyros and accelerometers within their range, and the last of each that
         # is not within a dead band, ns.
@@ -137,21 +137,21 @@ class RangeCheck:
         # Where the gyros may have missed another `BLIND_ANGLE` since they were within it, ns.
         self.blind: list[int] = []
 
-    def add(self, stamps: Index, samples: Array) -> int:
+    def add(self, stamps: Index, samples: Array) -> Index:
         """
         Take samples, stamps in ns, shape (N,), and values, (N, 6), that follow the last.
 
-        Returns how many are at the end of the range.
+        Returns how many of gyros and accelerometers are at the end of the range, (2,).
         """
         if not stamps.size:
-            return 0
+            return np.zeros(2, int)
         beyond = BEYOND_END * np.abs(samples) * self._at_end(samples)
         self._last = samples[-1]
         missed = np.hstack([beyond, self._hidden(samples)]).reshape(-1, 4, 3).max(axis=2)
         k = np.flatnonzero(missed.any(axis=1))
         if not k.size:
             self._within_ns[:] = stamps[-1]
-            return 0
+            return np.zeros(2, int)
         within = np.maximum.accumulate(np.where(missed > 0, self._within_ns, stamps[:, None]))
         self._within_ns = within[-1]
         missed, seconds = missed[k], (stamps[k, None] - within[k]) * 1e-9
@@ -163,7 +163,7 @@ class RangeCheck:
         angles = np.concatenate([[self._angles], missed[end, 0] * seconds[end, 0] // BLIND_ANGLE])
         self.blind += stamps[k[end[angles[1:] > angles[:-1]]]].tolist()
         self._angles = angles[-1]
-        return end.size
+        return np.count_nonzero(missed[:, :2], axis=0)
 
     def _hidden(self, samples: Array) -> Array:
         """Return how large, 1 sigma, values may be that are sent as 0, shape (N, 6)."""
@@ -174,7 +174,8 @@ class RangeCheck:
         smallest: Array = np.minimum(self._smallest, sizes.min(axis=0))
         self._near[smallest < self._smallest] = 0
         self._smallest = smallest
-        self._near += np.count_nonzero(sizes < 2 * smallest, axis=0)
+        self._near += np.count_nonzero(
+            (sizes > NEAR[0] * smallest) & (sizes < NEAR[1] * smallest), axis=0)
         return np.where(zero & (self._near >= NEAR_ZERO), smallest / math.sqrt(3.0), 0.0)
 
     def beyond(self, stamps: Index, ends_ns: Index, dt: Array) -> Array:
