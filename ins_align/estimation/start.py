@@ -42,8 +42,8 @@ UNCERTAIN = 10.0
 # One epoch is an outlier if the residuals of the others are so many times smaller without it.
 OUTLYING = 10.0
 # Headings, every five degrees, and their sigma (rad): the sum of such normal densities is flat to
-# 2e-6. With 0.4 instead of 0.6 less is lost to linearisation (MEMS car, tilt at t0 after 100 s: 1.18
-# of the bound instead of 1.27), but noise says more of a heading before the tilt is known.
+# 2e-6. Narrower ones lose less to linearisation, but noise says more of a heading before the tilt
+# is known.
 HEADINGS = 72
 STEP_STD = 0.6 * 2 * math.pi / HEADINGS
 TILT_STD = math.radians(10.0)
