@@ -235,6 +235,15 @@ def test_quantum_and_dead_band():
         np.testing.assert_array_equal(getattr(silent, name), np.where(small, 0.0, exact))
 
 
+def test_accelerometer_bias_that_is_given():
+    bias = [0.5, -0.3, 0.2]
+    s, drawn = simulate('car', duration=5.0, accel_bias=bias), simulate('car', duration=5.0)
+    np.testing.assert_array_equal(s.accel_bias, bias)
+    np.testing.assert_allclose(s.accel - drawn.accel, np.tile(bias - drawn.accel_bias, (501, 1)),
+                               atol=1e-12)
+    np.testing.assert_array_equal(s.gyro, drawn.gyro)
+
+
 def test_a_chip_has_the_errors_that_its_preset_states():
     sim = [simulate('static', imu_grade='chip', seed=seed, duration=1.0, latitude_deg=0.0)
            for seed in range(200)]
@@ -535,6 +544,7 @@ def test_bag_is_written_whole_or_not_at_all(tmp_path):
     ({'accel_sign': 0}, 'accel_sign must be'),
     ({'quantum': 0.01}, 'quantum must be 2 finite numbers in rad/s and m/s.2, 0 or above'),
     ({'dead_band': (0.01, -1.0)}, 'dead_band must be 2 finite numbers'),
+    ({'accel_bias': 0.5}, 'accel_bias must be 3 finite numbers in m/s.2'),
     ({'gnss_correlation': 0.0}, 'gnss_correlation must be a finite number in s, 0.001 or above'),
 ])
 def test_bad_arguments_get_a_sentence(options, sentence):

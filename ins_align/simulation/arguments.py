@@ -90,6 +90,9 @@ class Arguments:
         None, "gyroscope bias, 1 sigma per axis; default: the grade's", 'rad/s')
     accel_bias_std: float | None = _imu(
         None, "accelerometer bias, 1 sigma per axis; default: the grade's", 'm/s^2')
+    accel_bias: Sequence[float] | None = _imu(
+        None, 'accelerometer bias itself, instead of a drawn one', 'm/s^2', -math.inf,
+        names=('X', 'Y', 'Z'))
     gyro_scale_std: float | None = _imu(
         None, 'scale factor error of each gyroscope, 1 sigma, 0.01 is one percent; default: 0, '
         'of a chip what its grade states', '1', 0.0, _MOST['gyro_scale_std'])

@@ -182,6 +182,10 @@ def _imu(asked: Arguments, trajectory: Trajectory, C_vb: Array,
     truth_gyro, truth_accel = trajectory.gyro @ C_vb, trajectory.accel @ C_vb
     gyro_bias = scale * noise.gyro_bias_std * streams[0].standard_normal(3)
     accel_bias = scale * noise.accel_bias_std * streams[0].standard_normal(3)
+    if asked.accel_bias is not None:
+        accel_bias = scale * np.array(asked.accel_bias, dtype=float)
+        noise = noise._replace(accel_bias_std=max(
+            noise.accel_bias_std, float(np.sqrt(np.mean(np.square(asked.accel_bias))))))
     gyro_matrix, accel_matrix = (
         np.eye(3) + scale * scale_std * np.diag(streams[0].standard_normal(3))
         + scale * misalignment_std * (1 - np.eye(3)) * streams[0].standard_normal((3, 3))
