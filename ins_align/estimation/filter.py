@@ -174,15 +174,9 @@ class Filters:
 
     def _weigh(self, log_likelihood: Array, real: 'Array | float' = 1.0) -> Array:
         """
-        Weigh means within rivals; return the log likelihood of these, shape (M,).
+        Weigh means by a log likelihood, shape (B,); return that of the rivals, shape (M,).
 
-        Parameters
-        ----------
-        log_likelihood : ndarray, shape (B,)
-            Of the means.
-        real : ndarray, shape (B,), or float
-            The share of it that counts within rivals.
-
+        Of the former the share `real` counts within rivals.
         """
         if self.single:
             return self.weight + log_likelihood
@@ -233,21 +227,9 @@ class Filters:
     def update(self, model: Linearised, k: int, kind: int, measured: Measured,
                noise: Array) -> Innovation:
         """
-        Take the velocity (kind 0) or the position (1) of epoch k.
+        Take the velocity (kind 0) or the position (1) of epoch k of a model's K epochs.
 
-        Parameters
-        ----------
-        model : Linearised
-            Of K epochs.
-        k : int
-            Which of them.
-        kind : int
-            0 or 1.
-        measured : Measured
-            Of the same epochs.
-        noise : ndarray, shape (3,)
-            Factors on the sigmas that the receiver states, east, north and up.
-
+        `noise`, shape (3,), has factors on the sigmas that the receiver states, east, north, up.
         """
         q, lead, C = self.place, self.lead, self.C
         H = model.H[k, kind]
@@ -273,23 +255,11 @@ class Filters:
     def hold(self, held: np.ndarray, H: Array, variance: Array, innovation: Array,
              backwards: Array, tumbled: np.ndarray) -> None:
         """
-        Hold rivals to a motion along x of a vehicle's base; see `vehicle`.
+        Hold some of the rivals, shape (M,), to motion along x of a vehicle's base; see `vehicle`.
 
-        Parameters
-        ----------
-        held : ndarray of bool, shape (M,)
-            Which of the rivals have to.
-        H : ndarray, shape (M, 2, n)
-            Derivatives of the innovation, sideways and upwards, to the errors.
-        variance : ndarray, shape (M,)
-            Of its noise, (m/s)^2.
-        innovation : ndarray, shape (B, 2)
-            m/s.
-        backwards : ndarray, shape (B,)
-            Speed the wrong way, m/s.
-        tumbled : ndarray of bool, shape (B,)
-            Whether z of the base points down.
-
+        The innovation, (B, 2), m/s, is sideways and upwards, with derivatives H, (M, 2, n), and
+        noise, (M,), (m/s)^2. For each mean, (B,), the speed the wrong way, m/s, and whether z of
+        the base points down.
         """
         q, lead = self.place, self.lead
         test = self._test(H, variance[q][:, None, None] * np.eye(2), innovation)
@@ -337,13 +307,8 @@ class Filters:
         against the heading (errors in variables). By chance an epoch says up to ``tr(W - W^2)``,
         W being the receiver's share of an innovation (docs, "Theory").
 
-        Returns
-        -------
-        feigned : ndarray, shape (M,)
-            Share of what was said of the heading that may be chance.
-        back : ndarray, shape (M, n), or None
-            What of a correction goes back again for each radian that it turns the heading.
-
+        Returns the share of what was said of the heading that may be chance, shape (M,), and what
+        of a correction goes back for each radian that it turns the heading, (M, n) or None.
         """
         lead, before = self.lead, self.P
         up = self.C[lead][:, 2]
