@@ -44,46 +44,22 @@ RECENT = 25
 
 @dataclass(frozen=True)
 class Fit:
-    """
-    How well the data fit the model of a method.
+    """How well the data fit the model of a method."""
 
-    Attributes
-    ----------
-    offered : int
-        Epochs with a measurement, rejected ones included.
-    rows : int
-        Redundant rows; 0 before there is a solution.
-    misfit : float
-        Mean square of normalised residuals.
-    nis : float
-        Normalised innovation squared of the last epoch, per row; nan where nothing was tested.
-    innovation : ndarray, shape (3,)
-        Of the velocity (of the position where only that is used) over its sigma.
-    rejected_velocity, rejected_position, rejected : int
-        Measurements, and epochs with any of them, that were refused as outliers.
-    delay : float
-        Of the GNSS, seconds; the configured one where none is estimated.
-    objection : str
-        What the data say against the configuration, in words.
-    doubt : str
-        What speaks against declaring a heading, in words.
-    remarks : str
-        How the sensors are others than configured, as the end of a sentence.
-
-    """
-
-    offered: int
-    rows: int = 0
-    misfit: float = math.nan
+    offered: int  #: epochs with a measurement, rejected ones included
+    rows: int = 0  #: redundant rows; 0 before there is a solution
+    misfit: float = math.nan  #: mean square of normalised residuals
+    #: Normalised innovation squared of the last epoch, per row; nan where nothing was tested.
     nis: float = math.nan
+    #: (3,), of the velocity (of the position where only that is used) over its sigma.
     innovation: Array = field(default_factory=lambda: np.full(3, math.nan))
-    rejected_velocity: int = 0
+    rejected_velocity: int = 0  #: measurements that were refused as outliers
     rejected_position: int = 0
-    rejected: int = 0
-    delay: float = 0.0
-    objection: str = ''
-    doubt: str = ''
-    remarks: str = ''
+    rejected: int = 0  #: epochs with any of them
+    delay: float = 0.0  #: of the GNSS, s; the configured one where none is estimated
+    objection: str = ''  #: what the data say against the configuration, in words
+    doubt: str = ''  #: what speaks against declaring a heading, in words
+    remarks: str = ''  #: how the sensors are others than configured, as the end of a sentence
 
 
 class Declaration:

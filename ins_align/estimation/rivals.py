@@ -53,42 +53,23 @@ SHARE = 1 / 27
 
 @dataclass(frozen=True)
 class Rival:
-    """
-    Another assumption about the body.
+    """Another assumption about the body."""
 
-    Attributes
-    ----------
-    better : str
-        What the data fit better with, in words, where the body's parameters can be put in; empty:
-        a level of the configuration.
-    advice : str
-        What to do then.
-    signs : tuple of float
-        Of the gyros x, y, z and of the accelerometers.
-    gyro : float
-        Factor on the gyros' errors, and on their rate random walk.
-    accel : float
-        Factor on the accelerometers' errors.
-    lever_arm_std, gnss_delay_std, gyro_bias_std, accel_bias_std : float
-        At least so much (SI).
-    along : int
-        Of a vehicle: 1 forwards, -1 backwards along its x axis; 0: it moves as it likes.
-    prior : float
-        Log of how likely it is before the data, over the configuration.
-
-    """
-
+    #: What the data fit better with, in words, where the body's parameters can be put in; empty: a
+    #: level of the configuration.
     better: str = ''
-    advice: str = 'check the IMU axes'
+    advice: str = 'check the IMU axes'  #: what to do then
+    #: Of the gyros x, y, z and of the accelerometers.
     signs: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
-    gyro: float = 1.0
-    accel: float = 1.0
-    lever_arm_std: float = 0.0
+    gyro: float = 1.0  #: factor on the gyros' errors, and on their rate random walk
+    accel: float = 1.0  #: factor on the accelerometers' errors
+    lever_arm_std: float = 0.0  #: at least so much (SI), as the next three
     gnss_delay_std: float = 0.0
     gyro_bias_std: float = 0.0
     accel_bias_std: float = 0.0
+    #: Of a vehicle: 1 forwards, -1 backwards along its x axis; 0: it moves as it likes.
     along: int = 0
-    prior: float = 0.0
+    prior: float = 0.0  #: log of how likely it is before the data, over the configuration
 
     @property
     def wrong(self) -> bool:
@@ -242,21 +223,11 @@ class Rivals:
 
 @dataclass
 class Parameters:
-    """
-    What is known of the body's parameters before the data, under a rival.
+    """What is known of the body's parameters before the data, under a rival."""
 
-    Attributes
-    ----------
-    x : ndarray, shape (m,)
-    P : ndarray, shape (m, m)
-    walk : ndarray, shape (m,)
-        What a second adds to the diagonal of P.
-
-    """
-
-    x: Array
-    P: Array
-    walk: Array
+    x: Array  #: (m,)
+    P: Array  #: (m, m)
+    walk: Array  #: (m,), what a second adds to the diagonal of P
 
     @staticmethod
     def of(config: Config, rival: Rival, force: Array) -> 'Parameters':

@@ -53,26 +53,12 @@ OPEN_VELOCITY, OPEN_POSITION, STEADY_VELOCITY = 1e3, 1e4, 10.0
 
 
 class RoughAttitude(NamedTuple):
-    """
-    Attitude from the note's formula.
+    """Attitude from the note's formula."""
 
-    Attributes
-    ----------
-    C : ndarray, shape (3, 3)
-        At t0, but for a rotation about the axis.
-    axis : ndarray, shape (3,)
-        In the body at t0.
-    kind : int
-        0 from velocities, 1 from positions.
-    noise : float
-        Factor on the receiver's variances.
-
-    """
-
-    C: Array
-    axis: Array
-    kind: int
-    noise: float
+    C: Array  #: (3, 3), at t0, but for a rotation about the axis
+    axis: Array  #: (3,), in the body at t0
+    kind: int  #: 0 from velocities, 1 from positions
+    noise: float  #: factor on the receiver's variances
 
 
 class Start:

@@ -46,69 +46,29 @@ def biases(m: int) -> tuple[slice, slice]:
 
 @dataclass
 class Linearised:
-    """
-    Motion and measurements of K epochs, linearised at the parameters of each of M rivals.
+    """Motion and measurements of K epochs, linearised at the parameters of each of M rivals."""
 
-    Attributes
-    ----------
-    point : ndarray, shape (M, m)
-        The parameters x.
-    duration : list of float
-        Seconds.
-    R : ndarray, shape (K, M, 3, 3)
-        Rotation over the interval before each epoch, corrected for the point's sensor errors.
-    moved : ndarray, shape (K, M, 6)
-        Velocity and position gained in it.
-    J : ndarray, shape (K, M, 9, m)
-        Derivatives of rotation, velocity and position to x.
-    F : ndarray, shape (K, M, 9, n)
-        Transition of phi, xi, rho.
-    Q : ndarray, shape (K, M, 9, 9)
-        What the noise of the IMU adds to their covariance.
-    H : ndarray, shape (K, 2, M, 3, n)
-        Derivatives of velocity and position, in the body frame, to the errors.
-    expected : ndarray, shape (K, 2, M, 3)
-        What C u and C w lack, in the body frame, of the measurements.
-    base : tuple of ndarray or None
-        Of the velocity of the vehicle's base: derivatives, shape (K, M, 3, n); what C u lacks of
-        it, (K, M, 3); rotation to the body frame from that at the moment of the measurement,
-        (K, M, 3, 3).
-
-    """
-
-    point: Array
-    duration: list[float]
+    point: Array  #: (M, m), the parameters x
+    duration: list[float]  #: s
+    #: (K, M, 3, 3), rotation over the interval before each epoch, without the errors of the point.
     R: Array
-    moved: Array
-    J: Array
-    F: Array
-    Q: Array
-    H: Array
-    expected: Array
+    moved: Array  #: (K, M, 6), velocity and position gained in it
+    J: Array  #: (K, M, 9, m), derivatives of rotation, velocity and position to x
+    F: Array  #: (K, M, 9, n), transition of phi, xi, rho
+    Q: Array  #: (K, M, 9, 9), what the noise of the IMU adds to their covariance
+    H: Array  #: (K, 2, M, 3, n), derivatives of velocity and position, in the body, to the errors
+    expected: Array  #: (K, 2, M, 3), what C u and C w lack, in the body, of the measurements
+    #: Of the velocity of the vehicle's base: derivatives, (K, M, 3, n); what C u lacks of it,
+    #: (K, M, 3); rotation to the body frame from that when it was measured, (K, M, 3, 3).
     base: tuple[Array, Array, Array] | None = None
 
 
 @dataclass
 class Measured:
-    """
-    What the GNSS measures of K epochs, in n0; see `track.InertialTrack`.
+    """What the GNSS measures of K epochs, in n0; see `track.InertialTrack`."""
 
-    Attributes
-    ----------
-    s : ndarray, shape (K, 2, 3)
-        s_v and s_p.
-    covariance : ndarray, shape (K, 2, 3, 3)
-    present : list of (bool, bool)
-        Whether there is a velocity, a position.
-    stated : list of (bool, bool)
-        Whether the receiver states its noise.
-    still : ndarray, shape (K, 3)
-        s_v of what rests.
-
-    """
-
-    s: Array
-    covariance: Array
-    present: list[tuple[bool, bool]]
-    stated: list[tuple[bool, bool]]
-    still: Array
+    s: Array  #: (K, 2, 3), s_v and s_p
+    covariance: Array  #: (K, 2, 3, 3)
+    present: list[tuple[bool, bool]]  #: whether there is a velocity, a position
+    stated: list[tuple[bool, bool]]  #: whether the receiver states its noise
+    still: Array  #: (K, 3), s_v of what rests

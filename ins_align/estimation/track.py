@@ -33,35 +33,18 @@ class InertialTrack:
     the integrated forms of `NavigationIntegrals` by a constant and a term in t, which a free
     start takes out; nothing between epochs has to be interpolated but gravitation, so gaps do no
     harm. Both are kept relative to a point that is fixed in the Earth at t0, against rounding.
-
-    Attributes
-    ----------
-    n0 : LocalLevel
-    time : ndarray, shape (...)
-        Seconds since t0.
-    C_n0n : ndarray, shape (..., 3, 3)
-    still_v : ndarray, shape (..., 3)
-        s_v of an antenna that rests on the Earth here, m/s.
-    s_p : ndarray, shape (..., 3)
-        Metres.
-    gravity, gravitation : ndarray, shape (..., 3)
-        In n0 axes, m/s^2.
-    int_gravitation, int_int_gravitation : ndarray, shape (..., 3)
-    origin_r, origin_v : ndarray, shape (3,)
-        Position and ground velocity at t0.
-
     """
 
     n0: LocalLevel
-    time: Array
-    C_n0n: Array
-    still_v: Array
-    s_p: Array
-    gravity: Array
+    time: Array  #: (...), s since t0
+    C_n0n: Array  #: (..., 3, 3)
+    still_v: Array  #: (..., 3), s_v of an antenna that rests on the Earth here, m/s
+    s_p: Array  #: (..., 3), m
+    gravity: Array  #: (..., 3), in n0 axes, m/s^2, as the next
     gravitation: Array
-    int_gravitation: Array
+    int_gravitation: Array  #: (..., 3), m/s; and twice, m
     int_int_gravitation: Array
-    origin_r: Array
+    origin_r: Array  #: (3,), position and ground velocity at t0
     origin_v: Array
 
     @staticmethod
