@@ -63,31 +63,16 @@ class Fit:
 
 
 class Declaration:
-    """
-    Decides from epoch to epoch.
-
-    Parameters
-    ----------
-    config : Config
-        ``heading_std_threshold``, ``tilt_std_threshold`` and ``hold_time``.
-
-    Attributes
-    ----------
-    levelled, aligned : bool
-        What is declared.
-    move_t0 : bool
-        Whether t0 had better move.
-
-    """
+    """Decides from epoch to epoch, by two thresholds and the hold time of the configuration."""
 
     def __init__(self, config: Config) -> None:
         """Start with nothing declared."""
         self.config = config
         self._level_since_s: float | None = None
         self._heading_since_s: float | None = None
-        self.levelled = False
+        self.levelled = False               # what is declared
         self.aligned = False
-        self.move_t0 = False
+        self.move_t0 = False                # whether t0 had better move
         self._against = ''                  # what spoke against it when it was judged last
         self._contradiction = ''            # when there was redundancy last
         self._offered = 0                   # epochs until then
@@ -96,22 +81,11 @@ class Declaration:
 
     def update(self, time_s: float, initial: Array, current: Array, fit: Fit) -> Verdict:
         """
-        Judge an epoch.
+        Judge an epoch, so many seconds after the first t0.
 
-        Parameters
-        ----------
-        time_s : float
-            Seconds since the first t0.
-        initial, current : ndarray, shape (3, 3)
-            Covariances of the attitude at t0 and of the one now, in ENU. Both must be good enough;
-            where only the present one is, `move_t0` says that t0 had better move.
-        fit : Fit
-            How well the data fit the model.
-
-        Returns
-        -------
-        Verdict
-
+        `initial` and `current`, (3, 3), are covariances of the attitude at t0 and of the one now,
+        in ENU. Both must be good enough; where only the present one is, `move_t0` says that t0 had
+        better move.
         """
         if math.isfinite(fit.nis):
             self._recent_nis += (min(fit.nis, 10.0) - self._recent_nis) / RECENT
@@ -148,17 +122,7 @@ class Declaration:
         """
         Judge an epoch without a measurement: nothing is declared, and what gets lost withdrawn.
 
-        Parameters
-        ----------
-        silent_s : float
-            Seconds since the last measurement.
-        initial, current, fit
-            As for `update`.
-
-        Returns
-        -------
-        Verdict
-
+        `silent_s` are the seconds since the last measurement, the others are as for `update`.
         """
         if silent_s > MAX_SILENCE:
             self._level_since_s = self._heading_since_s = None

@@ -37,20 +37,10 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool,
     """
     Linearise K epochs.
 
-    Parameters
-    ----------
-    point : ndarray, shape (M, m)
-        Parameters to linearise at; their delays are alike, and within `MIN_DELAY` and
-        `MAX_DELAY`.
-    interval : Intervals
-        Before each epoch, as each of the rivals has them: leading axes (K, M).
-    Q : ndarray, shape (K, 1, 9, 9)
-        Covariance of (rotation, velocity, position), in the frame at the start.
-    use_position : bool
-        Whether positions are measurements.
-    base : ndarray, shape (3,), or None
-        Position of the vehicle's base in the frame of the IMU, m.
-
+    It is done at parameters `point`, (M, m), whose delays are alike, and within `MIN_DELAY` and
+    `MAX_DELAY`. Intervals before each epoch are as each of the rivals has them, with leading axes
+    (K, M), and Q, (K, 1, 9, 9), is their covariance of (rotation, velocity, position) in the frame
+    at the start. `base` is the position of the vehicle's base in the frame of the IMU, (3,), m.
     """
     M, m = point.shape
     K = interval.duration.size

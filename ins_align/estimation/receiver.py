@@ -61,17 +61,8 @@ class ReceiverNoise:
         """
         Follow an innovation.
 
-        Parameters
-        ----------
-        kind : int
-            0: of a velocity, 1: of a position.
-        square : float
-            Normalised and squared, per row.
-        normalised : ndarray, shape (3,)
-            Over its sigmas, east, north, up.
-        stated : bool
-            Whether the receiver states its noise.
-
+        It is of a velocity (kind 0) or a position (1), normalised and squared, per row, and over
+        its sigmas, east, north, up, (3,); `stated`: whether the receiver states its noise.
         """
         east, north, up = np.square(normalised).tolist()
         noise = self._noise[kind]

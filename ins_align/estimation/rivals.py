@@ -124,22 +124,10 @@ def rivals_of(config: Config) -> tuple[Rival, ...]:
 
 class Rivals:
     """
-    The table of a configuration, and what becomes of its lines.
+    The table of a configuration, its columns as arrays, and what becomes of its lines.
 
-    Parameters
-    ----------
-    config : Config
-
-    Attributes
-    ----------
-    table : tuple of Rival
-    signs : ndarray, shape (R, 4)
-    prior : ndarray, shape (R,)
-    along : ndarray of int, shape (R,)
-    counts : ndarray of bool, shape (R,)
-        Whether a line is a part of results: levels that are wrong are not, nor those that are no
-        vehicle, which are there to contradict it.
-
+    `counts`, (R,), says whether a line is a part of results: those that are wrong are not, nor
+    those without a vehicle where there is one, which are there to contradict it.
     """
 
     def __init__(self, config: Config) -> None:
@@ -173,24 +161,10 @@ class Rivals:
 
     def doubt(self, filters: Filters, mean: Array, P: Array, misfit: float) -> tuple[str, bool]:
         """
-        Hear the rivals that are wrong.
+        Hear the rivals that are wrong, in filters of the same table with their mixture.
 
-        Parameters
-        ----------
-        filters : Filters
-            Of the same table.
-        mean, P : ndarray, shape (2, 3, 3)
-            Their mixture.
-        misfit : float
-            Mean square of normalised innovations.
-
-        Returns
-        -------
-        words : str
-            Why a heading is not to be declared, or ''.
-        contradicted : bool
-            Whether the data fit better with one of them.
-
+        `misfit` is the mean square of normalised innovations. Returns why a heading is not to be
+        declared, or '', and whether the data fit better with one of them.
         """
         wrong = self._wrong[filters.ids]
         if not wrong.any():

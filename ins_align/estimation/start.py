@@ -62,28 +62,14 @@ class RoughAttitude(NamedTuple):
 
 
 class Start:
-    """
-    Epochs that wait until there are enough to start with.
-
-    Parameters
-    ----------
-    config : Config
-
-    Attributes
-    ----------
-    epochs : list of AntennaEpoch
-        The first one is t0.
-    rejected : list of int
-        Velocities and positions that were left out as outliers.
-
-    """
+    """Epochs that wait until there are enough to start with; the first one is t0."""
 
     def __init__(self, config: Config) -> None:
         """Wait for the first epoch."""
         self._lever = np.array(config.lever_arm)
         self.epochs: list[AntennaEpoch] = []
         self._imu: list[Intervals] = []
-        self.rejected = [0, 0]
+        self.rejected = [0, 0]      # velocities and positions that were left out as outliers
 
     def add(self, epoch: AntennaEpoch, imu: Intervals) -> None:
         """Take an epoch and the interval before it."""
@@ -186,19 +172,9 @@ class Start:
 
     def covariance(self, rough: RoughAttitude, known: Array) -> Array:
         """
-        Return the covariance of each rival's errors at t0.
+        Return the covariance of each rival's errors at t0, shape (M, n, n).
 
-        Parameters
-        ----------
-        rough : RoughAttitude
-            As `solve` returned it.
-        known : ndarray, shape (M, m, m)
-            Covariance of the parameters.
-
-        Returns
-        -------
-        ndarray, shape (M, n, n)
-
+        `rough` is what `solve` returned, `known`, (M, m, m), the covariance of the parameters.
         """
         along = np.outer(rough.axis, rough.axis)
         attitude = TILT_STD ** 2 * (np.eye(3) - along) + STEP_STD ** 2 * along

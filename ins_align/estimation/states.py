@@ -50,7 +50,7 @@ class Linearised:
 
     point: Array  #: (M, m), the parameters x
     duration: list[float]  #: s
-    #: (K, M, 3, 3), rotation over the interval before each epoch, without the errors of the point.
+    #: (K, M, 3, 3), rotation over the interval before each, the errors at the point taken off.
     R: Array
     moved: Array  #: (K, M, 6), velocity and position gained in it
     J: Array  #: (K, M, 9, m), derivatives of rotation, velocity and position to x

@@ -57,21 +57,9 @@ class Vehicle:
     """
     Looks at the motion of a vehicle, once a second.
 
-    Parameters
-    ----------
-    config : Config
-    base : Transform
-        From the base to the IMU.
-    along : ndarray of int, shape (R,)
-        Where each rival sets out: 1 forwards, -1 backwards, 0 anywhere.
-    std : ndarray, shape (4,)
-        Sigmas of mounting and drift.
-
-    Attributes
-    ----------
-    position : ndarray, shape (3,)
-        Of the base, in the frame of the IMU, m.
-
+    `base` leads from the base to the IMU, where the base is at `position`, (3,), m. `along`, (R,),
+    says where each rival sets out: 1 forwards, -1 backwards, 0 anywhere; `std`, (4,), are sigmas
+    of mounting and drift.
     """
 
     def __init__(self, config: Config, base: Transform, along: Index, std: Array) -> None:
