@@ -125,7 +125,8 @@ class RangeCheck:
         # The largest value below the end, and how often it came.
         self._below, self._times_below = self._ends.copy(), self._times.copy()
         self._last = np.zeros(6)
-        # The smallest value of each axis that is not 0, and how many are near it.
+        # From the first 0 on: the smallest other value of each axis, and how many are near it.
+        self._sends_zero = False
         self._smallest, self._near = np.full(6, np.inf), np.zeros(6, int)
         # The last sample of gyros and accelerometers within their range, and the last of each that
         # is not within a dead band, ns.
@@ -168,15 +169,21 @@ class RangeCheck:
     def _hidden(self, samples: Array) -> Array:
         """Return how large, 1 sigma, values may be that are sent as 0, shape (N, 6)."""
         zero = samples == 0.0
-        if not zero.any():
+        if not (self._sends_zero or zero.any()):
             return np.zeros(samples.shape)
         sizes = np.where(zero, np.inf, np.abs(samples))
-        smallest: Array = np.minimum(self._smallest, sizes.min(axis=0))
-        self._near[smallest < self._smallest] = 0
-        self._smallest = smallest
-        self._near += np.count_nonzero(
+        if not self._sends_zero:
+            # From the first 0 on: it must not matter how many samples come at a time.
+            sizes[:np.argmax(zero.any(axis=1))] = np.inf
+            self._sends_zero = True
+        before = np.minimum.accumulate(np.vstack([self._smallest, sizes]))
+        smallest = before[1:]
+        near = self._near + np.cumsum(
             (sizes > NEAR[0] * smallest) & (sizes < NEAR[1] * smallest), axis=0)
-        return np.where(zero & (self._near >= NEAR_ZERO), smallest / math.sqrt(3.0), 0.0)
+        # They are counted anew where there is a smaller one.
+        near -= np.maximum.accumulate(np.where(smallest < before[:-1], near, 0))
+        self._smallest, self._near = smallest[-1], near[-1]
+        return np.where(zero & (near >= NEAR_ZERO), smallest / math.sqrt(3.0), 0.0)
 
     def beyond(self, stamps: Index, ends_ns: Index, dt: Array) -> Array:
         """Return densities, shape (2, K, n), of the steps `dt` between ends, of samples so far."""
