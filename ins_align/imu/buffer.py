@@ -274,8 +274,9 @@ class ImuBuffer:
         context = max(first - IMU_BEFORE, 0)
         around = slice(context, last + 1)
         samples, _ = without_spikes(stamps[around], self.samples[around])
-        self._counts['imu_saturated'] += int(np.max(self._range.add(
-            stamps[first:last], samples[first - context:last - context])))
+        before = self._range.stamps.size
+        self._range.add(stamps[first:last], samples[first - context:last - context])
+        self._counts['imu_saturated'] += self._range.stamps.size - before
         self._checked_ns = max(self._checked_ns, upto_ns)
         gaps = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
         self._silences = [Silence(start, end, 'imu_gap', NO_SAMPLE) for start, end in

@@ -14,8 +14,8 @@
 """
 What makes IMU samples miss the motion, and how much noise that is.
 
-Spikes, samples that repeat, the end of the sensors' range, dead bands, lost samples, stamps that
-jitter, white noise as it is measured, and units that cannot be right.
+Spikes, samples that repeat, the end of the sensors' range, lost samples, stamps that jitter,
+white noise as it is measured, and units that cannot be right.
 """
 
 import math
@@ -42,12 +42,6 @@ STUCK_SAMPLES, STUCK_NS = 8, 250_000_000
 END_RATE, END_FORCE = 0.5, 15.0
 END_TIMES, END_CHANGING, PILED_UP = 5, 3, 4
 BEYOND_END = 0.5
-# A sensor that sends small values as 0 has none closer to 0: how small it can tell is known from
-# so many values that are so many times as large as the smallest. What rounds has none there.
-NEAR_ZERO, NEAR = 20, (1.1, 1.9)
-# What gyros and accelerometers miss beyond their range and within a dead band lasts as long as
-# they are there, but at most so long (s).
-LASTS = np.array([np.inf, np.inf, 1.0, 1.0])
 # An attitude is lost when the gyros may have missed this angle (rad).
 BLIND_ANGLE = 0.35
 # Samples that both checks want to see before those that they judge.
@@ -110,12 +104,7 @@ def stuck(stamps: Index, samples: Array) -> list[tuple[int, int, int]]:
 
 
 class RangeCheck:
-    """
-    Notices what an IMU does not tell.
-
-    It is at the end of its range where an extreme comes again and again, and within a dead band
-    where it sends 0.
-    """
+    """Notices that an IMU is at the end of its range: an extreme comes again and again."""
 
     def __init__(self) -> None:
         """Start with no samples."""
@@ -125,65 +114,37 @@ class RangeCheck:
         # The largest value below the end, and how often it came.
         self._below, self._times_below = self._ends.copy(), self._times.copy()
         self._last = np.zeros(6)
-        # From the first 0 on: the smallest other value of each axis, and how many are near it.
-        self._sends_zero = False
-        self._smallest, self._near = np.full(6, np.inf), np.zeros(6, int)
-        # The last sample of gyros and accelerometers within their range, and the last of each that
-        # is not within a dead band, ns.
-        self._within_ns = np.zeros(4, np.int64)
+        # The last sample within the range, of gyros and accelerometers, ns.
+        self._within_ns = np.zeros(2, np.int64)
         self._angles = 0.0                  # so many times the blind angle
-        # Of M samples that do not, ns, and what the motion may have been beside them from each to
-        # the next, (M, 2), as noise of gyros and accelerometers, rad/sqrt(s) and m/s/sqrt(s).
+        # Of M samples at the end of the range, ns, and what the motion may have been beyond it
+        # from each to the next, (M, 2), as noise of gyros and accelerometers, rad/sqrt(s) and
+        # m/s/sqrt(s).
         self.stamps, self.densities = np.zeros(0, np.int64), np.zeros((0, 2))
         # Where the gyros may have missed another `BLIND_ANGLE` since they were within it, ns.
         self.blind: list[int] = []
 
-    def add(self, stamps: Index, samples: Array) -> Index:
-        """
-        Take samples, stamps in ns, shape (N,), and values, (N, 6), that follow the last.
-
-        Returns how many of gyros and accelerometers are at the end of the range, (2,).
-        """
+    def add(self, stamps: Index, samples: Array) -> None:
+        """Take samples, stamps in ns, shape (N,), and values, (N, 6), that follow the last."""
         if not stamps.size:
-            return np.zeros(2, int)
-        beyond = BEYOND_END * np.abs(samples) * self._at_end(samples)
+            return
+        at_end = self._at_end(samples).reshape(-1, 2, 3)
         self._last = samples[-1]
-        missed = np.hstack([beyond, self._hidden(samples)]).reshape(-1, 4, 3).max(axis=2)
-        k = np.flatnonzero(missed.any(axis=1))
-        if not k.size:
+        if not at_end.any():
             self._within_ns[:] = stamps[-1]
-            return np.zeros(2, int)
-        within = np.maximum.accumulate(np.where(missed > 0, self._within_ns, stamps[:, None]))
+            return
+        beyond = np.any(at_end, axis=2)
+        within = np.maximum.accumulate(np.where(beyond, self._within_ns, stamps[:, None]))
         self._within_ns = within[-1]
-        missed, seconds = missed[k], (stamps[k, None] - within[k]) * 1e-9
-        # The error lasts: the angle or velocity grows with the time, not with its root.
-        density = missed * np.sqrt(2 * np.minimum(seconds, LASTS))
+        k = np.flatnonzero(np.any(beyond, axis=1))
+        missed = BEYOND_END * np.max(np.abs(samples[k].reshape(-1, 2, 3)) * at_end[k], axis=2)
+        seconds = (stamps[k, None] - within[k]) * 1e-9
         self.stamps = np.concatenate([self.stamps, stamps[k]])
-        self.densities = np.concatenate([self.densities, np.hypot(density[:, :2], density[:, 2:])])
-        end = np.flatnonzero(missed[:, :2].any(axis=1))
-        angles = np.concatenate([[self._angles], missed[end, 0] * seconds[end, 0] // BLIND_ANGLE])
-        self.blind += stamps[k[end[angles[1:] > angles[:-1]]]].tolist()
+        # The error lasts: the angle or velocity grows with the time, not with its root.
+        self.densities = np.concatenate([self.densities, missed * np.sqrt(2 * seconds)])
+        angles = np.concatenate([[self._angles], missed[:, 0] * seconds[:, 0] // BLIND_ANGLE])
+        self.blind += stamps[k[angles[1:] > angles[:-1]]].tolist()
         self._angles = angles[-1]
-        return np.count_nonzero(missed[:, :2], axis=0)
-
-    def _hidden(self, samples: Array) -> Array:
-        """Return how large, 1 sigma, values may be that are sent as 0, shape (N, 6)."""
-        zero = samples == 0.0
-        if not (self._sends_zero or zero.any()):
-            return np.zeros(samples.shape)
-        sizes = np.where(zero, np.inf, np.abs(samples))
-        if not self._sends_zero:
-            # From the first 0 on: it must not matter how many samples come at a time.
-            sizes[:np.argmax(zero.any(axis=1))] = np.inf
-            self._sends_zero = True
-        before = np.minimum.accumulate(np.vstack([self._smallest, sizes]))
-        smallest = before[1:]
-        near = self._near + np.cumsum(
-            (sizes > NEAR[0] * smallest) & (sizes < NEAR[1] * smallest), axis=0)
-        # They are counted anew where there is a smaller one.
-        near -= np.maximum.accumulate(np.where(smallest < before[:-1], near, 0))
-        self._smallest, self._near = smallest[-1], near[-1]
-        return np.where(zero & (near >= NEAR_ZERO), smallest / math.sqrt(3.0), 0.0)
 
     def beyond(self, stamps: Index, ends_ns: Index, dt: Array) -> Array:
         """Return densities, shape (2, K, n), of the steps `dt` between ends, of samples so far."""

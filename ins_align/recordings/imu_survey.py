@@ -121,9 +121,10 @@ def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: floa
 
 def _add_end_of_range(imu: Surveyed, samples: Series) -> None:
     """Say which sensors were at the end of their range, and where that is."""
-    counts = RangeCheck().add((samples.times * 1e9).astype(np.int64), samples.vectors)
+    check = RangeCheck()
+    check.add((samples.times * 1e9).astype(np.int64), samples.vectors)
     largest = np.abs(samples.vectors).reshape(-1, 2, 3).max(axis=(0, 2))
-    for sensor, value, count in zip(SENSORS, largest, counts.tolist()):
+    for sensor, value, count in zip(SENSORS, largest, np.count_nonzero(check.densities, axis=0)):
         if count:
             imu.add(f'{sensor.name} at the end of their range, {value / sensor.size:.4g} '
                     f'{sensor.unit}, in {count} samples: let the driver set a larger one')
