@@ -24,8 +24,8 @@ from ins_align.config import Config, PRESETS, STANDARD_GRAVITY
 from ins_align.estimation.bank import Bank, RESOLVED_STD
 from ins_align.estimation.filter import Filters
 from ins_align.estimation.linearised import linearised
-from ins_align.estimation.rivals import SIGNS
-from ins_align.estimation.states import DELAY, FIRST, GYRO, PHI, PHI0
+from ins_align.estimation.rivals import Parameters, Rival, SIGNS
+from ins_align.estimation.states import DELAY, FIRST, GYRO, PHI, PHI0, triads
 from ins_align.experiments.common import error_of
 from ins_align.experiments.dense import bound
 from ins_align.geometry.rotation import exp_so3, log_so3, skew
@@ -455,6 +455,17 @@ def test_a_heading_that_nothing_shows_is_not_declared(headless):
 
 def test_a_heading_that_nothing_shows_is_any(headless):
     assert min(epoch.current.sigma_deg[2] for epoch in headless[1] if epoch.current) > 100.0
+
+
+@pytest.mark.parametrize('gyro, accel, scales', [
+    (1.0, 1.0, (1.0, 1.0)), (3.0, 1.0, (3.0, 1.0)), (10.0, 10.0, (3.0, 3.0))])
+def test_a_worse_imu_has_scale_factors_at_most_three_times_as_large(gyro, accel, scales):
+    """One percent is what MEMS gyros have, three tenths of that the accelerometers."""
+    known = Parameters.of(Config(imu_grade='mems'), Rival(gyro=gyro, accel=accel),
+                          np.array([0.0, 0.0, STANDARD_GRAVITY]))
+    stds = np.sqrt(np.diag(known.P))
+    for triad, std, scale in zip(triads(known.x.size), (0.01, 0.003), scales):
+        assert stds[triad][3] == pytest.approx(scale * std)
 
 
 def test_a_chip_at_rest_is_no_surer_of_its_tilt_than_of_its_accelerometers():

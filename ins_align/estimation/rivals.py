@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import math
 
 from ins_align.config import Config, ImuNoise, PRESETS
-from ins_align.estimation.filter import Filters, log_sum
+from ins_align.estimation.filter import Filters, log_sum, NEGLIGIBLE
 from ins_align.estimation.states import (
     biases, DELAY, DRIFT, FIRST, GYRO, LEVER_ARM, MARGIN, MOUNT, OF_VEHICLE, triads)
 from ins_align.geometry.rotation import Array, log_so3
@@ -36,8 +36,8 @@ GYRO_MISALIGNMENT, ACCEL_ERRORS = 0.3, 0.3
 # temperatures do, and the delay by the second: clocks of IMU and GNSS that nothing keeps together.
 WANDER_TIME, ACCEL_WANDER, DELAY_WANDER = 100.0, 0.1, 0.1
 # Means whose log weight is so much below the likeliest's are dropped, and so are rivals that are
-# wrong; levels stay, for what they assume may become true.
-UNLIKELY, HOPELESS, LEAST = 14.0, 25.0, 13.0
+# wrong; levels stay, for what they assume may become true, but have no part in a mixture.
+UNLIKELY, HOPELESS, LEAST = 14.0, 25.0, NEGLIGIBLE + 1.0
 # Means of a rival that agree to so many sigmas are merged.
 ALIKE = 2.0
 # A wrong rival that is likely has to give the same attitude, to so many sigmas.

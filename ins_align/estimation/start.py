@@ -42,7 +42,7 @@ UNCERTAIN = 10.0
 # One epoch is an outlier if the residuals of the others are so many times smaller without it.
 OUTLYING = 10.0
 # Headings, every five degrees, and their sigma (rad): the sum of such normal densities is flat to
-# 2e-6. Narrower ones lose less to linearisation, but noise says more of a heading before the tilt
+# 2e-3. Narrower ones lose less to linearisation, but noise says more of a heading before the tilt
 # is known.
 HEADINGS = 72
 STEP_STD = 0.6 * 2 * math.pi / HEADINGS
