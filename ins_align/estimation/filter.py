@@ -53,9 +53,10 @@ NO_TURN = 1e-3
 # A rate that is not known turns biases of the accelerometers against the tilt that they look like:
 # an error of second order. What is known of them is lost at the rate's variance times this (s).
 TURNING = 30.0
-# An epoch speaks of the heading alone where the tilt's sigma is so many times smaller. Less
-# information on it (1/rad^2) than the second is none.
-TILT_KNOWN, NO_NEWS = 0.35, 1e-9
+# An epoch speaks of the heading alone where the tilt's sigma is at most this share of the heading's.
+# Information on it (1/rad^2) that is less than the second is none; what epochs say less than
+# chance, the next ones may say more, at most the third.
+TILT_KNOWN, NO_NEWS, MOST_OWED = 0.5, 1e-9, 2.0
 # Headings all round whose log weights differ by less than the first are as likely; they are drawn
 # anew when each has become as uncertain as the second (rad).
 EVEN, BLURRED = 1.0, 0.2
@@ -114,6 +115,9 @@ class Filters:
         Log of how likely each rival is after the data, but for a constant.
     ids : ndarray of int, shape (M,)
         The rivals that are left.
+    owed : ndarray, shape (M,)
+        Information on the heading, 1/rad^2, that epochs to come may give by chance, beyond their
+        own.
     at_start : ndarray, shape (M, 3)
         The variances of the accelerometers' biases, (m/s^2)^2, as they were at the start.
     place : ndarray of int, shape (B,), or slice
@@ -124,7 +128,7 @@ class Filters:
     """
 
     _OF_MEANS = 'C', 'u', 'w', 'x', 'C0', 'rival', 'weight'
-    _OF_RIVALS = 'P', 'walk', 'at_start', 'evidence', 'counts', 'ids'
+    _OF_RIVALS = 'P', 'walk', 'owed', 'at_start', 'evidence', 'counts', 'ids'
 
     def __init__(self, C: Array, u: Array, x: Array, rival: Index, P: Array, walk: Array,
                  prior: Array, counts: np.ndarray) -> None:
@@ -135,7 +139,7 @@ class Filters:
         self.rival, self.ids = rival, np.arange(M)
         self.weight = -np.log(np.bincount(rival))[rival]
         self.evidence, self.counts = prior, counts
-        self.P, self.walk = P, walk
+        self.P, self.walk, self.owed = P, walk, np.zeros(M)
         self.at_start = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, biases(x.size)[1]].copy()
         self._find_places()
 
@@ -304,8 +308,8 @@ class Filters:
         Reduce the covariances, but not by what noise may have said of the heading.
 
         Noise looks like motion, and motion that the GNSS does not see in this direction speaks
-        against the heading (errors in variables). By chance an epoch says up to ``tr(W - W^2)``,
-        W being the receiver's share of an innovation (docs, "Theory").
+        against the heading (errors in variables). By chance epochs say ``tr(W - W^2)`` in the
+        mean, or less, W being the receiver's share of an innovation (docs, "Theory").
 
         Returns the share of what was said of the heading that may be chance, shape (M,), and what
         of a correction goes back for each radian that it turns the heading, (M, n) or None.
@@ -319,9 +323,10 @@ class Filters:
         if not heard.any():
             return np.zeros(len(lead)), None
         W = test.inverse[lead] @ noise[lead]
-        chance = heard * np.trace(W - W @ W, axis1=1, axis2=2)
+        chance = self.owed + np.trace(W - W @ W, axis1=1, axis2=2)
         said = np.maximum(1 / variance - 1 / _of_heading(before, up)[1], NO_NEWS)
-        gone = np.clip(chance, 0.0, said)
+        gone = heard * np.clip(chance, 0.0, said)
+        self.owed = np.where(heard, np.minimum(chance - gone, MOST_OWED), self.owed)
         self.P += (gone / (1 - gone * variance))[:, None, None] * (
             column[:, :, None] * column[:, None])
         feigned = gone / said

@@ -41,11 +41,10 @@ START_RATIO = 20.0
 UNCERTAIN = 10.0
 # One epoch is an outlier if the residuals of the others are so many times smaller without it.
 OUTLYING = 10.0
-# Headings, every five degrees, and their sigma (rad): the sum of such normal densities is flat to
-# 2e-3. Narrower ones lose less to linearisation, but noise says more of a heading before the tilt
-# is known.
+# Headings, every five degrees, and their sigma (rad): wide enough for the sum of their densities to
+# be flat to a tenth, and narrow, for errors of a heading are linearised.
 HEADINGS = 72
-STEP_STD = 0.6 * 2 * math.pi / HEADINGS
+STEP_STD = 0.4 * 2 * math.pi / HEADINGS
 TILT_STD = math.radians(10.0)
 # What is not known of velocity and position at first (m/s, m); of a velocity whose horizontal
 # part is measured, the vertical is known better.
