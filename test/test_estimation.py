@@ -391,11 +391,17 @@ def mirrored(s, signs):
     return replace(s, gyro=s.gyro * signs[:3], accel=s.accel * signs[3])
 
 
-@pytest.mark.parametrize('rival', SIGNS, ids=lambda rival: rival.better)
-@pytest.mark.parametrize('scenario', ('flight', 'car'))
-def test_wrong_signs_are_named_and_not_declared(scenario, rival):
-    s = simulated(scenario, imu_grade='mems', duration=40.0, seed=5)
+@pytest.fixture(scope='module', params=('flight', 'car'))
+def turning(request):
+    """Simulate an IMU that is aligned where its signs are right."""
+    s = simulated(request.param, imu_grade='mems', duration=40.0, seed=5)
     assert aligned(s)[0].status().state is State.ALIGNED
+    return request.param, s
+
+
+@pytest.mark.parametrize('rival', SIGNS, ids=lambda rival: rival.better)
+def test_wrong_signs_are_named_and_not_declared(turning, rival):
+    scenario, s = turning
     aligner, epochs = aligned(mirrored(s, rival.signs))
     for epoch in epochs:                            # before it has turned about that axis
         # A car that hardly turns is believed for a second in some runs (weak-spots).
@@ -418,7 +424,7 @@ def test_coarse_gyros_are_no_wrong_axes(coarse):
     ({'gnss_delay': 0.2}, {'gnss_delay': 0.0}, 's late: check the clocks')])
 def test_what_is_configured_for_certain_and_wrong_is_not_believed(scenario, options, changes,
                                                                   words):
-    s = simulated(scenario, imu_grade='mems', duration=60.0, seed=3, **options)
+    s = simulated(scenario, imu_grade='mems', duration=40.0, seed=3, **options)
     aligner, epochs = aligned(s, **changes)
     for epoch in epochs:
         if epoch.state is State.ALIGNED:

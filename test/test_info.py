@@ -362,7 +362,7 @@ def test_silence_after_which_an_alignment_starts_over(changed, drive, silence, w
     start = drive[1][0][1]
     path = changed(lambda name, time, message: [] if name == '/imu/data_raw' and (
         30.0 < (time - start) * 1e-9 < 30.0 + silence) else [(name, time, message)])
-    epochs = replay(path).epochs
+    epochs = replay(path, start=20.0, duration=20.0).epochs
     lost = [now for before, now in zip(epochs, epochs[1:]) if before.initial and not now.initial]
     imu = by_name(inspect(path), '/imu/data_raw')
     notes = [line for line in imu.lines if 'starts over' in line]
@@ -392,7 +392,8 @@ def test_clocks_some_seconds_apart(changed, ahead):
     name, value = command_of(info)[3].split('=')
     assert name == 'gnss_delay' and float(value) == pytest.approx(ahead, abs=0.05)
     assert len(command_of(info)) == 4 and 'gnss_lateness' not in describe(info)
-    assert replay(path, Config(imu_grade='tactical', gnss_delay=float(value))).aligned
+    assert replay(path, Config(imu_grade='tactical', gnss_delay=float(value)),
+                  duration=45.0).aligned
 
 
 @pytest.mark.parametrize('ahead, setting', [(3, 'gnss_delay=3.0'), (-3, 'gnss_lateness=3.5')])
@@ -433,7 +434,7 @@ def test_an_imu_that_says_it_does_not_measure(changed):
     info = inspect(path)
     assert command_of(info) == ['--set', 'imu_grade=tactical']
     assert 'does not measure angular rate (covariance -1)' in describe(info)
-    assert replay(path).aligned
+    assert replay(path, duration=45.0).aligned
     two = inspect(changed(with_another, name='two', topics={**TOPICS, '/imu': IMU}))
     assert two.chosen['imu'] == '/imu'
     assert 'does not measure' in by_name(two, '/imu/data_raw').faults[0]
@@ -631,5 +632,6 @@ def test_command_line(drive, tmp_path, capsys):
 def test_proposed_command_runs(changed, capsys):
     """A recording that does not align by itself does with what is proposed."""
     path = changed(velocity_changed(lambda e, n, u: (n, e, -u)))
-    assert main(['replay', str(path)]) == 1
-    assert main([*shlex.split(inspect(path).command)[1:], '--set', 'lever_arm=[1,1,1]']) == 0
+    part = '--duration', '45'
+    assert main(['replay', str(path), *part]) == 1
+    assert main([*shlex.split(inspect(path).command)[1:], *part, '--set', 'lever_arm=[1,1,1]']) == 0

@@ -52,7 +52,10 @@ def test_straight_road_gives_a_heading_as_good_as_mounting_and_drift(mount_std, 
     first = next(epoch for epoch in epochs if epoch.state is State.ALIGNED)
     assert (first.stamp_ns - epochs[0].stamp_ns) * 1e-9 < 5.0
     assert known < aligner.status().current.sigma_deg[2] < 1.25 * known
-    without = aligned(simulation, vehicle='none')[0].status()
+
+
+def test_straight_road_gives_no_heading_without_a_vehicle():
+    without = aligned(simulate('highway', seed=1, duration=20.0), vehicle='none')[0].status()
     assert without.state is State.LEVELLED and without.current.sigma_deg[2] > 10.0
 
 
