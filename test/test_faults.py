@@ -29,7 +29,7 @@ pytest.importorskip('pyins')
 @pytest.fixture
 def short(monkeypatch):
     """Make runs short."""
-    monkeypatch.setattr(faults, 'DURATION', 16.0)
+    monkeypatch.setattr(faults, 'DURATION', 12.0)
 
 
 def kind_of(case):
