@@ -92,7 +92,8 @@ def test_parameter_file_of_the_simulation(flight, capsys):
 def test_parameter_file_covers_scale_factors(tmp_path, capsys):
     """With the preset alone, which has none, the residuals contradict the stated noise."""
     path = tmp_path / 'flight'
-    assert main(['simulate', str(path), '--imu', 'navigation', '--gyro-scale-std', '0.01']) == 0
+    assert main(['simulate', str(path), '--imu', 'navigation', '--gyro-scale-std', '0.01',
+                 '--duration', '40']) == 0
     assert main(['replay', str(path), '--set', 'imu_grade=navigation']) == 1
     assert main(['replay', str(path), '--params', str(path / 'ins_align.yaml')]) == 0
 

@@ -14,6 +14,7 @@
 """Replay of several recordings on a Dask cluster, one worker of which dies on the way."""
 
 import contextlib
+from importlib.util import find_spec
 import json
 import os
 import signal
@@ -26,7 +27,7 @@ from ins_align.cli import main
 from ins_align.simulation.simulate import simulate, write_bag
 import pytest
 
-distributed = pytest.importorskip('distributed')
+pytestmark = pytest.mark.skipif(find_spec('distributed') is None, reason='no distributed')
 
 
 @pytest.fixture(scope='module')
@@ -38,14 +39,16 @@ def flight(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def cluster():
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True,
-                                  dashboard_address=None) as local:
+    from distributed import LocalCluster
+    with LocalCluster(n_workers=2, threads_per_worker=1, processes=True,
+                      dashboard_address=None) as local:
         yield local
 
 
 def kill_a_busy_worker(cluster, killed):
     """Kill a worker process that works on a recording."""
-    with distributed.Client(cluster) as client:
+    from distributed import Client
+    with Client(cluster) as client:
         deadline = time.monotonic() + 60.0
         while time.monotonic() < deadline and not killed:
             time.sleep(0.05)

@@ -414,7 +414,7 @@ def test_wrong_signs_are_named_and_not_declared(turning, rival):
 
 @pytest.mark.parametrize('coarse', [{'quantum': (0.01, 0.0)}, {'dead_band': (0.0087, 0.0)}])
 def test_coarse_gyros_are_no_wrong_axes(coarse):
-    _, epochs = aligned(simulated('flight', seed=7, duration=60.0, stand_still=20.0, **coarse))
+    _, epochs = aligned(simulated('flight', seed=7, duration=45.0, stand_still=20.0, **coarse))
     assert not [epoch for epoch in epochs if 'reversed' in epoch.reason]
 
 

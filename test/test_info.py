@@ -636,4 +636,5 @@ def test_proposed_command_runs(changed, capsys):
     path = changed(velocity_changed(lambda e, n, u: (n, e, -u)))
     part = '--start', '12', '--duration', '30'
     assert main(['replay', str(path), *part]) == 1
-    assert main([*shlex.split(inspect(path).command)[1:], *part, '--set', 'lever_arm=[1,1,1]']) == 0
+    proposed = shlex.split(inspect(path).command)[1:]
+    assert main([*proposed, *part, '--set', 'lever_arm=[1,1,1]']) == 0
