@@ -41,7 +41,7 @@ def flight(tmp_path_factory):
     """Make a simulated flight with the command itself."""
     path = tmp_path_factory.mktemp('cli') / 'flight'
     assert main(['simulate', str(path), '--scenario', 'flight', '--imu', 'mems', '--seed', '1',
-                 '--lever-arm', '1', '1', '1', '--duration', '25', '--gnss-rate', '5']) == 0
+                 '--lever-arm', '1', '1', '1', '--duration', '25', '--gnss-rate', '2.5']) == 0
     return path
 
 

@@ -394,7 +394,7 @@ def mirrored(s, signs):
 @pytest.fixture(scope='module', params=('flight', 'car'))
 def turning(request):
     """Simulate an IMU that is aligned where its signs are right."""
-    s = simulated(request.param, imu_grade='mems', duration=30.0, seed=5)
+    s = simulated(request.param, imu_grade='mems', duration=30.0, seed=5, gnss_rate=2.5)
     assert aligned(s)[0].status().state is State.ALIGNED
     return request.param, s
 
@@ -424,7 +424,7 @@ def test_coarse_gyros_are_no_wrong_axes(coarse):
     ({'gnss_delay': 0.2}, {'gnss_delay': 0.0}, 's late: check the clocks')])
 def test_what_is_configured_for_certain_and_wrong_is_not_believed(scenario, options, changes,
                                                                   words):
-    s = simulated(scenario, imu_grade='mems', duration=40.0, seed=3, **options)
+    s = simulated(scenario, imu_grade='mems', duration=40.0, seed=3, gnss_rate=2.5, **options)
     aligner, epochs = aligned(s, **changes)
     for epoch in epochs:
         if epoch.state is State.ALIGNED:

@@ -38,7 +38,7 @@ import numpy as np
 import pytest
 from recordings import indexed_mcap, mcap_chunk, mcap_of, ros1_records, write_recording
 
-EXAMPLES = int(os.environ.get('FUZZ_EXAMPLES', '300'))
+EXAMPLES = int(os.environ.get('FUZZ_EXAMPLES', '100'))
 FUZZ = settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
 MIB = 1 << 20
 MEMORY = 1500 * MIB  # address space of a process that must get along with bounded memory
