@@ -1071,7 +1071,8 @@ def test_wrong_set_up_is_never_declared_wrong(seed, wrong, scenario):
 def test_a_told_lever_arm_with_the_wrong_signs_is_named_where_it_does_harm(scenario):
     """What is declared in spite of it is right; told rightly it is declared."""
     told = (0.9, -0.6, 1.2)
-    s = simulated(scenario, imu_grade='tactical', seed=3, duration=40.0, lever_arm=told)
+    s = simulated(scenario, imu_grade='tactical', seed=3, duration=40.0, gnss_rate=2.5,
+                  lever_arm=told)
     assert aligned(s, lever_arm_std=0.02)[1][-1].state is State.ALIGNED
     wrong = tuple(-metres for metres in told)
     aligner, epochs = aligned(s, lever_arm=wrong, lever_arm_std=0.02)
@@ -1201,7 +1202,7 @@ def test_sharp_gnss_that_is_late_sees_the_lever_arm_swing(seed, kind):
 
 @pytest.mark.parametrize('delay', [0.3, 0.6])
 def test_delay_is_followed_as_far_as_its_sigma_allows(delay):
-    s = simulated('flight', duration=60.0, gnss_delay=delay, seed=5)
+    s = simulated('flight', duration=40.0, gnss_delay=delay, seed=5)
     aligner, _ = aligned(s, gnss_delay=0.0, gnss_delay_std=0.5, gnss_lateness=2.0)
     status = aligner.status()
     assert status.state is State.ALIGNED
@@ -1239,7 +1240,7 @@ def test_noise_that_the_receiver_does_not_state_is_found(true_std):
 @pytest.mark.parametrize('scenario', ['car', 'flight', 'static'])
 def test_accelerometers_ten_times_worse_than_configured_are_noticed(scenario):
     # Along gravity, so that those who stand see it too.
-    s = simulated(scenario, imu_grade='mems', duration=40.0, seed=2)
+    s = simulated(scenario, imu_grade='mems', duration=40.0, seed=2, gnss_rate=2.5)
     f_b = np.mean(s.truth_accel[:100], axis=0)
     bias = 0.5 * (f_b / np.linalg.norm(f_b) + [0.6, -0.6, 0.0])
     aligner, epochs = aligned(replace(s, accel=s.accel + bias), imu_grade='mems')
