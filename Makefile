@@ -45,7 +45,8 @@ test: $(VENV)/ready
 
 #: make test-all               all tests, the long campaigns too, with their coverage; then test-oldest
 test-all: $(VENV)/ready
-	@$(BIN)/python -m pytest -q $(PARALLEL) --cov --cov-report=term $(ARGS) \
+	@FUZZ_EXAMPLES=$${FUZZ_EXAMPLES:-300} \
+	    $(BIN)/python -m pytest -q $(PARALLEL) --cov --cov-report=term $(ARGS) \
 	    || { echo 'make test-all: FAILED'; exit 1; }
 	@$(MAKE) -s --no-print-directory test-oldest
 	@echo 'make test-all: passed'

@@ -13,6 +13,7 @@
 # limitations under the License.
 """Writes small recordings of every format and finds the real ones."""
 
+from functools import cache
 import os
 from pathlib import Path
 import struct
@@ -38,7 +39,9 @@ def real_recording(name):
     return folder / name
 
 
+@cache
 def typestore(ros1=False):
+    """Return the types; what one has compiled to write a type it keeps."""
     from rosbags.typesys import get_typestore, Stores
     return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
 

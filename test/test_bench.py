@@ -42,6 +42,6 @@ def test_every_epoch_is_timed(monkeypatch):
 
 def test_bare_pass_counts_the_recording(tmp_path, monkeypatch):
     monkeypatch.setattr(bench, 'REPEATS', 1)
-    row = bench.replay_against_bare_pass(tmp_path, 'mcap', 1)
-    assert row['name'] == 'replay of 1 min, mcap; bare pass'
+    row = bench.replay_against_bare_pass(tmp_path, 'mcap', 0.25)
+    assert row['name'] == 'replay of 0.25 min, mcap; bare pass'
     assert all(float(row[cell].split()[0]) > 0.0 for cell in ('ours', 'other', 'ratio'))

@@ -14,6 +14,7 @@
 """Replay of several recordings on a Dask cluster, one worker of which dies on the way."""
 
 import contextlib
+from importlib.util import find_spec
 import json
 import os
 import signal
@@ -26,7 +27,7 @@ from ins_align.cli import main
 from ins_align.simulation.simulate import simulate, write_bag
 import pytest
 
-distributed = pytest.importorskip('distributed')
+pytestmark = pytest.mark.skipif(find_spec('distributed') is None, reason='no distributed')
 
 
 @pytest.fixture(scope='module')
@@ -36,16 +37,18 @@ def flight(tmp_path_factory):
     return path
 
 
-@pytest.fixture
+@pytest.fixture(scope='module')
 def cluster():
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True,
-                                  dashboard_address=None) as local:
+    from distributed import LocalCluster
+    with LocalCluster(n_workers=2, threads_per_worker=1, processes=True,
+                      dashboard_address=None) as local:
         yield local
 
 
 def kill_a_busy_worker(cluster, killed):
     """Kill a worker process that works on a recording."""
-    with distributed.Client(cluster) as client:
+    from distributed import Client
+    with Client(cluster) as client:
         deadline = time.monotonic() + 60.0
         while time.monotonic() < deadline and not killed:
             time.sleep(0.05)
@@ -57,9 +60,15 @@ def kill_a_busy_worker(cluster, killed):
                 killed.append(pid)
 
 
+def test_a_worker_is_no_scheduler(cluster, flight, capsys):
+    worker = next(iter(cluster.scheduler_info['workers']))
+    assert main(['replay', str(flight), '--dask', worker]) == 2
+    assert f'no Dask scheduler answers at {worker} (OSError: it is no' in capsys.readouterr().err
+
+
 def test_a_worker_dies(cluster, flight, tmp_path, capsys, monkeypatch):
     bags = []
-    for number in range(8):
+    for number in range(6):
         bags.append(f'flight_{number}')
         (tmp_path / bags[-1]).symlink_to(flight)
     bags.insert(3, 'missing')
@@ -85,7 +94,7 @@ def test_a_worker_dies(cluster, flight, tmp_path, capsys, monkeypatch):
     assert (tmp_path / 'there.json').read_text() == (tmp_path / 'here.json').read_text()
     assert there.out == alone.out
     assert 'missing does not exist' in there.err
-    assert len(tables) == 8
+    assert len(tables) == 6
     assert {path.name: path.read_text('ascii') for path in tmp_path.glob('rows_*.csv')} == tables
     assert not list(tmp_path.glob('.*.part'))
 
@@ -120,12 +129,6 @@ def test_something_else_is_there(flight, capsys, monkeypatch, greeting):
     assert error.count('\n') == 1
     for caller in callers:
         caller.close()
-
-
-def test_a_worker_is_no_scheduler(cluster, flight, capsys):
-    worker = next(iter(cluster.scheduler_info['workers']))
-    assert main(['replay', str(flight), '--dask', worker]) == 2
-    assert f'no Dask scheduler answers at {worker} (OSError: it is no' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('address', ['localhost', 'tcp://127.0.0.1', 'x://localhost:1', ''])

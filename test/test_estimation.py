@@ -256,7 +256,7 @@ def test_errors_are_as_large_as_stated_and_sigmas_those_of_the_bound(options):
     seeds, velocity = range(20), not options
     squares, ratios = np.zeros(2), []
     for seed in seeds:
-        s = simulated('flight', imu_grade='mems', duration=20.2, seed=100 + seed, gnss_rate=4.0,
+        s = simulated('flight', imu_grade='mems', duration=20.2, seed=100 + seed, gnss_rate=2.0,
                       heading_deg=18.0 * seed, **options)
         bank, epochs, imu = prepared(s, velocity=velocity)
         list(went(bank, epochs, imu, 50))
@@ -391,11 +391,17 @@ def mirrored(s, signs):
     return replace(s, gyro=s.gyro * signs[:3], accel=s.accel * signs[3])
 
 
-@pytest.mark.parametrize('rival', SIGNS, ids=lambda rival: rival.better)
-@pytest.mark.parametrize('scenario', ('flight', 'car'))
-def test_wrong_signs_are_named_and_not_declared(scenario, rival):
-    s = simulated(scenario, imu_grade='mems', duration=40.0, seed=5)
+@pytest.fixture(scope='module', params=('flight', 'car'))
+def turning(request):
+    """Simulate an IMU that is aligned where its signs are right."""
+    s = simulated(request.param, imu_grade='mems', duration=30.0, seed=5, gnss_rate=2.5)
     assert aligned(s)[0].status().state is State.ALIGNED
+    return request.param, s
+
+
+@pytest.mark.parametrize('rival', SIGNS, ids=lambda rival: rival.better)
+def test_wrong_signs_are_named_and_not_declared(turning, rival):
+    scenario, s = turning
     aligner, epochs = aligned(mirrored(s, rival.signs))
     for epoch in epochs:                            # before it has turned about that axis
         # A car that hardly turns is believed for a second in some runs (weak-spots).
@@ -408,7 +414,7 @@ def test_wrong_signs_are_named_and_not_declared(scenario, rival):
 
 @pytest.mark.parametrize('coarse', [{'quantum': (0.01, 0.0)}, {'dead_band': (0.0087, 0.0)}])
 def test_coarse_gyros_are_no_wrong_axes(coarse):
-    _, epochs = aligned(simulated('flight', seed=7, duration=60.0, stand_still=20.0, **coarse))
+    _, epochs = aligned(simulated('flight', seed=7, duration=45.0, stand_still=20.0, **coarse))
     assert not [epoch for epoch in epochs if 'reversed' in epoch.reason]
 
 
@@ -418,7 +424,7 @@ def test_coarse_gyros_are_no_wrong_axes(coarse):
     ({'gnss_delay': 0.2}, {'gnss_delay': 0.0}, 's late: check the clocks')])
 def test_what_is_configured_for_certain_and_wrong_is_not_believed(scenario, options, changes,
                                                                   words):
-    s = simulated(scenario, imu_grade='mems', duration=60.0, seed=3, **options)
+    s = simulated(scenario, imu_grade='mems', duration=40.0, seed=3, gnss_rate=2.5, **options)
     aligner, epochs = aligned(s, **changes)
     for epoch in epochs:
         if epoch.state is State.ALIGNED:
@@ -436,11 +442,13 @@ def test_what_is_configured_for_certain_is_named_while_the_motion_does_not_confi
                for reason in reasons)
 
 
-@pytest.fixture(scope='module', params=(
-    'static', pytest.param('straight', marks=pytest.mark.campaign)))
+@pytest.fixture(scope='module', params=(('static', 120.0), *(
+    pytest.param((scenario, 240.0), marks=pytest.mark.campaign)
+    for scenario in ('static', 'straight'))))
 def headless(request):
-    """Align a MEMS IMU that rests or holds its course, for four minutes."""
-    s = simulated(request.param, imu_grade='mems', duration=240.0, seed=2, gnss_rate=2.0,
+    """Align a MEMS IMU that rests or holds its course for minutes."""
+    scenario, duration = request.param
+    s = simulated(scenario, imu_grade='mems', duration=duration, seed=2, gnss_rate=2.0,
                   imu_rate=50.0)
     return aligned(s, **{name: getattr(Config(), name)
                          for name in ('lever_arm_std', 'gnss_delay_std')})
@@ -476,11 +484,12 @@ def test_a_chip_at_rest_is_no_surer_of_its_tilt_than_of_its_accelerometers():
     assert least > 0.8 * np.degrees(PRESETS['chip'].accel_bias_std / STANDARD_GRAVITY)
 
 
-@pytest.mark.parametrize('seed', (1, pytest.param(3, marks=pytest.mark.campaign)))
-def test_five_minutes_at_rest_do_not_spoil_the_drive_after_them(seed):
+@pytest.mark.parametrize('gnss_rate, seed', (
+    (1.0, 1), *(pytest.param(2.0, seed, marks=pytest.mark.campaign) for seed in (1, 3))))
+def test_five_minutes_at_rest_do_not_spoil_the_drive_after_them(gnss_rate, seed):
     """What noise seems to say of heading and biases at rest must not be believed for good."""
     s = simulated('car', imu_grade='mems', duration=330.0, stand_still=300.0, seed=seed,
-                  gnss_rate=2.0, imu_rate=50.0)
+                  gnss_rate=gnss_rate, imu_rate=50.0)
     epochs = feed(Aligner(Config(lever_arm=tuple(s.lever_arm), gnss_lateness=1.0)), s)
     declared = [epoch for epoch in epochs if epoch.state is State.ALIGNED]
     errors = [error_of(epoch.current, s.attitude_at(epoch.stamp_ns)) for epoch in declared]

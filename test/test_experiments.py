@@ -189,7 +189,9 @@ def test_window_of_a_recording_against_its_reference(folder):
 
 
 def test_recordings_and_their_files(folder, tmp_path, capsys):
-    experiments.run('recordings', tmp_path, data_dir=folder, jobs=1)
+    (tmp_path / 'data').mkdir()
+    (tmp_path / 'data' / 'driven').symlink_to(folder / 'driven')
+    experiments.run('recordings', tmp_path, data_dir=tmp_path / 'data', jobs=1)
     text = (tmp_path / 'recordings.md').read_text('utf-8')
     assert 'ins_align experiment recordings --out DIR --data DIR' in text
     assert 'driven, bank' in text

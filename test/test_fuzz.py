@@ -18,6 +18,7 @@ Whatever they are: a result or a sentence, in bounded memory. ``FUZZ_EXAMPLES=30
 """
 
 import bz2
+from functools import cache
 import importlib
 import os
 from pathlib import Path
@@ -37,7 +38,7 @@ import numpy as np
 import pytest
 from recordings import indexed_mcap, mcap_chunk, mcap_of, ros1_records, write_recording
 
-EXAMPLES = int(os.environ.get('FUZZ_EXAMPLES', '300'))
+EXAMPLES = int(os.environ.get('FUZZ_EXAMPLES', '100'))
 FUZZ = settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
 MIB = 1 << 20
 MEMORY = 1500 * MIB  # address space of a process that must get along with bounded memory
@@ -133,6 +134,7 @@ def refusal(path):
     return sentence
 
 
+@cache
 def packed_zeros(compression, size):
     """Return zeros that take a thousandth of their size, or less."""
     piece = bytes(MIB)
@@ -186,10 +188,19 @@ def test_row_that_holds_a_huge_message(recordings, tmp_path):
     assert 'too big' in refusal(path)
 
 
+@pytest.mark.campaign
 def test_zip_bomb_of_a_whole_file(tmp_path):
     path = tmp_path / 'bomb.db3.zstd'
     path.write_bytes(packed_zeros('zstd', 1025 * MIB))
     assert 'unpacks to more than 1024 MiB' in refusal(path)
+
+
+def test_a_whole_file_that_unpacks_to_too_much(tmp_path, monkeypatch):
+    monkeypatch.setattr('ins_align.recordings.UNPACKED_BYTES_FREE', 2 * MIB)
+    path = tmp_path / 'bomb.db3.zstd'
+    path.write_bytes(packed_zeros('zstd', 3 * MIB))
+    with pytest.raises(BagError, match='unpacks to more than 2 MiB'):
+        Bag(path)
 
 
 def test_reading_leaves_nothing_behind(recordings, tmp_path, monkeypatch):

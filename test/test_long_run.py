@@ -38,6 +38,7 @@ def attitude(time):
     return exp_so3(turns[0]) @ exp_so3(turns[1])
 
 
+@pytest.mark.campaign
 def test_chained_intervals_of_a_day():
     step = 0.2
     C = np.eye(3)
@@ -105,6 +106,7 @@ def test_an_aligner_of_two_hours_holds_no_more_and_knows_no_less():
     assert np.mean(errors[-part:]) < 6.0 and max(errors) < chi2.ppf(1 - 1e-6, 3)
 
 
+@pytest.mark.campaign
 def test_attitude_carried_through_a_day():
     """Two million samples at a rate that stays, against the angle in closed form."""
     rate, period_ns, lot = np.array([0.3, -0.2, 0.5]), 50_000_000, 172_800

@@ -30,7 +30,7 @@ SPAN_NS = 25_000_000_000  # that is looked at after the declaration
 
 @pytest.fixture(scope='module')
 def flight():
-    return simulate('flight', imu_grade='mems', seed=0, duration=60.0)
+    return simulate('flight', imu_grade='mems', seed=0, duration=50.0)
 
 
 def test_flight(flight, tmp_path):

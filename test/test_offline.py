@@ -172,7 +172,7 @@ def test_result_is_told_in_some_words(flight, result):
 
 
 def test_units_that_are_wrong_are_named():
-    car = simulated('car', duration=60.0, seed=2)
+    car = simulated('car', duration=30.0, seed=2)
     stamps, gyro, accel = imu(car)
     wrong = ins_align.align(stamps, np.degrees(gyro), accel, *tables(car, 'std'), **LEVER)
     assert not wrong.aligned and 'deg/s' in wrong.status.reason

@@ -108,12 +108,9 @@ def test_time_shift_changes_stamps_only(reference, shift_ns):
     aligner = Aligner(config_for(s))
     epochs = []
     for kind, payload in s.messages():
-        if kind == 'imu':
-            aligner.add_imu(payload[0] + shift_ns, *payload[1:])
-            epochs += aligner.update()
-        else:
-            moved = payload._replace(stamp_ns=payload.stamp_ns + shift_ns)
-            (aligner.add_fix if kind == 'fix' else aligner.add_velocity)(moved)
+        give(aligner, kind, (payload[0] + shift_ns, *payload[1:]) if kind == 'imu' else
+             payload._replace(stamp_ns=payload.stamp_ns + shift_ns))
+        epochs += aligner.update()
     epochs += aligner.flush()
     for row, other in zip(numbers(epochs), expected):
         assert row[0] == other[0] + shift_ns
@@ -138,12 +135,8 @@ def test_relabelling_the_body_axes_relabels_the_answer(reference, name, method):
     aligner = Aligner(config_for(s, method=method, lever_arm=lever))
     for kind, payload in s.messages():
         if kind == 'imu':
-            aligner.add_imu(payload[0], payload[1] @ R.T, payload[2] @ R.T)
-            aligner.update()
-        elif kind == 'fix':
-            aligner.add_fix(payload)
-        else:
-            aligner.add_velocity(payload)
+            payload = payload[0], payload[1] @ R.T, payload[2] @ R.T
+        give(aligner, kind, payload)
     aligner.flush()
     turned = aligner.status().initial
     # Sums of numbers in another order, amplified by how poorly a short flight tells the heading.
