@@ -1053,7 +1053,7 @@ WRONG = {
 
 @pytest.mark.parametrize('scenario', ('flight', 'car'))
 @pytest.mark.parametrize('wrong', WRONG)
-@pytest.mark.parametrize('seed', (0, pytest.param(1, marks=pytest.mark.campaign)))
+@pytest.mark.parametrize('seed', (1, pytest.param(0, marks=pytest.mark.campaign)))
 def test_wrong_set_up_is_never_declared_wrong(seed, wrong, scenario):
     """The default configuration: what is declared is right, or nothing is."""
     options, changes = WRONG[wrong]
@@ -1170,7 +1170,7 @@ def test_sharp_positions_of_a_car_that_pulls_away_at_once(seed, delay):
         assert np.all(np.abs(error_of(attitude, s)) <= 4 * np.sqrt(np.diag(attitude.covariance)))
 
 
-@pytest.mark.parametrize('seed', (0, pytest.param(1, marks=pytest.mark.campaign)))
+@pytest.mark.parametrize('seed', (1, pytest.param(0, marks=pytest.mark.campaign)))
 @pytest.mark.parametrize('scenario', ('hover', 'static'))
 def test_wild_gnss_from_the_start_is_found_out(scenario, seed):
     s = simulated(scenario, imu_grade='navigation', seed=seed, duration=60.0, outlier_rate=0.09,
