@@ -14,6 +14,7 @@
 """The aligner as a whole: states, faults of messages, outputs, wrong set-ups."""
 
 from dataclasses import replace
+import itertools
 import math
 import re
 
@@ -942,6 +943,22 @@ def test_covariances_of_any_size_break_nothing(flight):
     initial = aligner.status().initial
     assert np.all(np.isfinite(initial.quaternion_xyzw))
     assert np.all(np.linalg.eigvalsh(initial.covariance) > 0)
+
+
+@pytest.mark.parametrize('none', (
+    np.zeros((3, 3)), -np.eye(3), np.diag([1.0, np.nan, 1.0]),
+    np.eye(3) + 2.0 * np.eye(3)[[1, 0, 2]]), ids=('zero', 'negative', 'nan', 'indefinite'))
+def test_a_covariance_that_is_none_is_not_known(flight, none):
+    attitudes = []
+    for covariance in (none, None):
+        aligner = Aligner(config_for(flight))
+        for kind, payload in itertools.islice(flight.messages(), 1500):
+            give(aligner, kind, payload if kind == 'imu'
+                 else payload._replace(covariance=covariance))
+        aligner.flush()
+        attitudes.append(aligner.status().current)
+    assert np.array_equal(attitudes[0].covariance, attitudes[1].covariance)
+    assert np.array_equal(attitudes[0].quaternion_xyzw, attitudes[1].quaternion_xyzw)
 
 
 def test_position_that_jumps_for_good_starts_over(flight):

@@ -53,9 +53,9 @@ NO_TURN = 1e-3
 # A rate that is not known turns biases of the accelerometers against the tilt that they look like:
 # an error of second order. What is known of them is lost at the rate's variance times this (s).
 TURNING = 30.0
-# An epoch speaks of the heading alone where the tilt's sigma is at most this share of the heading's.
-# Information on it (1/rad^2) that is less than the second is none; what epochs say less than
-# chance, the next ones may say more, at most the third.
+# An epoch speaks of the heading alone where the tilt's sigma is at most this share of the
+# heading's. Information on it (1/rad^2) that is less than the second is none; what epochs say less
+# than chance, the next ones may say more, at most the third.
 TILT_KNOWN, NO_NEWS, MOST_OWED = 0.5, 1e-9, 2.0
 # Headings all round whose log weights differ by less than the first are as likely; they are drawn
 # anew when each has become as uncertain as the second (rad).

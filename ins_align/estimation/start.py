@@ -41,8 +41,8 @@ START_RATIO = 20.0
 UNCERTAIN = 10.0
 # One epoch is an outlier if the residuals of the others are so many times smaller without it.
 OUTLYING = 10.0
-# Headings, every five degrees, and their sigma (rad): wide enough for the sum of their densities to
-# be flat to a tenth, and narrow, for errors of a heading are linearised.
+# Headings, every five degrees, and their sigma (rad): wide enough for the sum of their densities
+# to be flat to a tenth, and narrow, for errors of a heading are linearised.
 HEADINGS = 72
 STEP_STD = 0.4 * 2 * math.pi / HEADINGS
 TILT_STD = math.radians(10.0)

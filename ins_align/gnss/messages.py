@@ -105,8 +105,10 @@ def usable(message: Fix | Velocity) -> tuple[Fix | Velocity, str]:
     Return what can be used of a message, and as what it is counted if nothing can be.
 
     That is ``no_fix``, ``nan`` or ''. A vertical that is nan, as in a 2D fix, becomes 0 and is
-    then not measured.
+    then not measured; a covariance that is none is not known.
     """
+    if message.covariance is not None and not _is_covariance(message.covariance):
+        message = message._replace(covariance=None)
     if isinstance(message, Velocity):
         east, north, up = message.velocity.tolist()
         if math.isnan(up):
@@ -122,6 +124,13 @@ def usable(message: Fix | Velocity) -> tuple[Fix | Velocity, str]:
     # What is not finite is not within a bound either.
     good = abs(latitude) <= 90.0 and abs(longitude) <= 360.0 and abs(altitude) < MAX_ALTITUDE
     return message, '' if good else 'nan'
+
+
+def _is_covariance(matrix: Array) -> bool:
+    """Return whether a matrix, (3, 3), is positive definite (Sylvester's criterion)."""
+    (ee, en, eu), (_, nn, nu), (_, _, uu) = matrix.tolist()
+    return bool(min(ee, nn, uu) >= SMALLEST_VARIANCE and ee * nn > en * en and (
+        ee * (nn * uu - nu * nu) - en * (en * uu - eu * nu) + eu * (en * nu - eu * nn) > 0.0))
 
 
 def numbers_of(message: Fix | Velocity) -> tuple[list[float], str]:
