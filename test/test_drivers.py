@@ -153,7 +153,7 @@ def write(path, simulation, gnss_type, imu_type=IMU, change=None, defined=True):
 
 @pytest.fixture(scope='module')
 def simulation():
-    return simulate('car', seed=3, duration=30.0, imu_grade='tactical')
+    return simulate('car', seed=3, duration=40.0, imu_grade='tactical')
 
 
 @pytest.fixture(scope='module')
@@ -177,7 +177,7 @@ def test_same_numbers_as_with_standard_messages(simulation, expected, tmp_path, 
     path = write(tmp_path / 'bag', simulation, gnss_type, imu_type)
     # The messages say what axes they have: a configured frame is not for them.
     result = replay(path, replace(CONFIG, velocity_frame='ned'))
-    assert result.aligned and len(result.epochs) == len(expected.epochs) == 150
+    assert result.aligned and len(result.epochs) == len(expected.epochs) == 200
     assert result.track == pytest.approx(expected.track, abs=1e-7)
     for found, wanted in ((result.status.initial, expected.status.initial),
                           (result.status.current, expected.status.current)):
@@ -191,7 +191,7 @@ def test_same_numbers_as_with_standard_messages(simulation, expected, tmp_path, 
 def test_info_knows_them(simulation, tmp_path):
     info = inspect(write(tmp_path / 'bag', simulation, SENSOR_GPS, COMBINED))
     assert [(topic.name, topic.kind, topic.figures['messages']) for topic in info.topics] == [
-        ('/imu', 'imu', 3001), ('/gnss', 'fix', 150), ('/gnss', 'velocity', 150)]
+        ('/imu', 'imu', 4001), ('/gnss', 'fix', 200), ('/gnss', 'velocity', 200)]
     assert all(topic.faults == [] for topic in info.topics)
     assert info.topics[2].figures['frame'] == 'enu'
     assert info.topics[1].figures['sigma'] == pytest.approx((2.5, 5))
