@@ -15,6 +15,8 @@
 
 import ast
 import configparser
+from importlib import import_module
+import math
 from pathlib import Path
 import re
 import subprocess
@@ -22,6 +24,7 @@ import sys
 
 from catkin_pkg.package import parse_package
 from ins_align.config import parameters
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -160,3 +163,22 @@ def test_api_page_has_every_module():
         {module.removesuffix('.__init__') for module in modules
          if module == 'experiments.__init__' or not module.startswith('experiments.')}
         - {'__init__'})
+
+
+def test_constants_are_those_of_their_page():
+    """All numbers of the estimation; places in arrays, sentences and tables are none."""
+    others = set('LEVER_ARM DELAY GYRO MOUNT DRIFT OF_VEHICLE NOTHING_NEW NOT_USED UNCONFIRMED '
+                 'AMBIGUOUS LEVELS SIGNS TOLD'.split())
+    written, found = {}, {}
+    for row in re.findall(r'^\| (`.*?`) \| (`.*?`) \|', read('docs/constants.md'), re.MULTILINE):
+        names, values = (re.findall('`(.*?)`', cell) for cell in row)
+        values = [eval(value, vars(math)) for value in values]
+        written.update(zip(names, values if len(values) == len(names) else values[0]))
+    for path in (ROOT / 'ins_align/estimation').glob('*.py'):
+        module = import_module(f'ins_align.estimation.{path.stem}')
+        for names in re.findall('^([A-Z][A-Z_, ]*) = ', path.read_text('utf-8'), re.MULTILINE):
+            found.update((name, getattr(module, name)) for name in names.split(', '))
+    assert set(written) == set(found) - others
+    for name, value in written.items():
+        assert found[name] == pytest.approx(value if isinstance(value, dict)
+                                            else np.array(value, float)), name

@@ -43,7 +43,7 @@ import numpy as np
 
 # Parameters are linearised anew when the likeliest mean has gone so far from the point: lever arm
 # (m), delay (s), bias and matrix of the gyros (rad/s, 1) and of the accelerometers (m/s^2, 1).
-_REACH = np.array([0.2] * 3 + [0.01] + [3e-3] * 3 + [0.02] * 9 + [0.1] * 3 + [0.02] * 9)
+REACH = np.array([0.2] * 3 + [0.01] + [3e-3] * 3 + [0.02] * 9 + [0.1] * 3 + [0.02] * 9)
 MAX_SPAN = 64
 # Beside velocities positions gain little and hurt when their errors wander: where the bank may
 # choose, it takes them when no velocity came for this long (ns), and leaves them out again when
@@ -112,7 +112,7 @@ class Bank:
         gyro, accel = triads(self._known[0].x.size)
         errors = gyro.stop - gyro.start
         self._reach = np.full(self._known[0].x.size, np.inf)      # of a vehicle: linear
-        self._reach[:accel.stop] = np.concatenate([_REACH[:gyro.stop], _REACH[16:16 + errors]])
+        self._reach[:accel.stop] = np.concatenate([REACH[:gyro.stop], REACH[16:16 + errors]])
         self._filters: Filters | None = None
         self._mixture: tuple[Array, Array] | None = None
         self._doubt, self._contradicted = '', False

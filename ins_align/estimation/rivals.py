@@ -45,7 +45,7 @@ HARMLESS = 1.0
 # Velocity of a vehicle sideways and upwards that lasts (m/s: tyres' slip, leeway and current,
 # wind); it changes by its sigma in this time (s), as the wind does where an aeroplane turns.
 DRIFTS = {'car': 0.1, 'boat': 1.0, 'aeroplane': 10.0}
-LASTING = 30.0
+DRIFT_TIME = 30.0
 # Share of the IMU's measured noise beyond the stated one that is believed at first: vibration
 # looks white from sample to sample and is less than that over seconds.
 SHARE = 1 / 27
@@ -227,7 +227,7 @@ class Parameters:
         if vehicle:
             drift = config.vehicle_velocity_std or DRIFTS[config.vehicle]
             std[MOUNT], std[DRIFT] = math.radians(config.mount_yaw_std), drift
-            walk[DRIFT] = drift ** 2 / LASTING
+            walk[DRIFT] = drift ** 2 / DRIFT_TIME
         x[LEVER_ARM] = config.lever_arm
         std[LEVER_ARM] = max(config.lever_arm_std, rival.lever_arm_std)
         std[DELAY] = max(config.gnss_delay_std, rival.gnss_delay_std)
