@@ -242,7 +242,7 @@ class Filters:
         missing = measured.s[k, kind] - (self.w if kind else self.u)
         innovation = (apply(C.swapaxes(1, 2), missing) + model.expected[k, kind][q]
                       - apply(H[q][..., FIRST:], self.x - model.point[q]))
-        test = self._second_look(self._test(H, stated, innovation), H, stated, innovation)
+        test = self._second_look(self._test(H, stated, innovation), stated, innovation)
         good = test.nis < GATE
         # By the means before the measurement, which an outlier must not choose.
         taken = self._by_most(good)
@@ -278,7 +278,7 @@ class Filters:
         self._reduce(test, taken, lead)
         self._move(test, good & taken[q], lead)
 
-    def _second_look(self, test: _Test, H: Array, noise: Array, innovation: Array) -> _Test:
+    def _second_look(self, test: _Test, noise: Array, innovation: Array) -> _Test:
         """
         Test an innovation again to second order, unless the noise hides it.
 
@@ -290,12 +290,15 @@ class Filters:
                   <= BENT ** 2 * np.trace(noise, axis1=1, axis2=2)):
             return test
         more = -0.5 * skew(m)
-        H = H[self.place].copy()
-        H[..., PHI] += more
-        return _tested(H, test.HP + more @ self.P[:, PHI][self.place], noise, innovation, True)
+        HP = test.HP + more @ self.P[:, PHI][self.place]
+        S = test.S + more @ test.HP[..., PHI].swapaxes(1, 2) + HP[..., PHI] @ more.swapaxes(1, 2)
+        return _tested(HP, S, innovation, True)
 
     def _test(self, H: Array, noise: Array, innovation: Array) -> _Test:
-        return _tested(H[self.place], (H @ self.P)[self.place], noise, innovation, False)
+        """Test an innovation, (B, r), with the derivatives of the rivals, (M, r, n)."""
+        HP = H @ self.P
+        S = (HP @ H.swapaxes(1, 2))[self.place] + noise
+        return _tested(HP[self.place], S, innovation, False)
 
     def _reduce(self, test: _Test, taken: np.ndarray, lead: Index) -> None:
         """Take off the covariances what was measured of the means that lead."""
@@ -425,14 +428,14 @@ class Filters:
         leads, place = self.lead, self.place
         lead = leads[place]
         C, C0 = self.C[lead].swapaxes(1, 2), self.C0[lead].swapaxes(1, 2)
-        away = np.hstack([log_so3(C @ self.C), apply(C, self.u - self.u[lead]),
-                          apply(C, self.w - self.w[lead]), log_so3(C0 @ self.C0),
-                          self.x - self.x[lead]])
-        variance = np.diagonal(self.P, axis1=1, axis2=2)[place]
-        near = np.all(away[:, PHI] ** 2 < alike ** 2 * variance[:, PHI], axis=1)
+        turned = log_so3(C @ self.C)
+        variance = np.diagonal(self.P[:, PHI, PHI], axis1=1, axis2=2)[place]
+        near = np.all(turned ** 2 < alike ** 2 * variance, axis=1)
         near = np.minimum.reduceat(near, self.first) & (np.bincount(self.rival)[self.ids] > 1)
         if not near.any():
             return
+        away = np.hstack([turned, apply(C, self.u - self.u[lead]), apply(C, self.w - self.w[lead]),
+                          log_so3(C0 @ self.C0), self.x - self.x[lead]])
         share = np.exp(self.weight)[:, None]
         mean = np.add.reduceat(share * away, self.first)
         spread = away - mean[place]
@@ -483,9 +486,8 @@ def _of_heading(P: Array, up: Array) -> tuple[Array, Array]:
     return column, np.einsum('ij,ij->i', up, column[:, PHI])
 
 
-def _tested(H: Array, HP: Array, noise: Array, innovation: Array, second_order: bool) -> _Test:
-    """Test innovations with the derivatives of each mean, shape (B, r, n)."""
-    S: Array = HP @ H.swapaxes(1, 2) + noise
+def _tested(HP: Array, S: Array, innovation: Array, second_order: bool) -> _Test:
+    """Test innovations of a covariance, (B, r, r)."""
     inverse = np.asarray(np.linalg.inv(S), float)
     weighted = apply(inverse, innovation)
     return _Test(HP, S, inverse, weighted, np.einsum('ij,ij->i', innovation, weighted),
