@@ -91,7 +91,7 @@ examples:
 
 SIMULATE_EPILOG = """\
 The recording holds /imu/data_raw, /fix, /fix_velocity and the true attitude on /reference/imu.
-Beside it lies ins_align.yaml with the parameters that suit it.
+In its folder is ins_align.yaml with the parameters that suit it.
 
 example:
   ins_align simulate flight --scenario flight --imu mems --seed 1 --lever-arm 1 1 1

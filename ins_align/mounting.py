@@ -106,7 +106,7 @@ def _with_lever_arm(config: Config, found: Array, frames: tuple[str, str],
                     words: list[Event]) -> Config:
     """Return the configuration with the lever arm of TF where it is to be used."""
     is_set = config.lever_arm != Config.lever_arm
-    numbers = ', '.join(f'{number:.4g}' for number in found)
+    numbers = ', '.join(f'{number:.4g}' for number in np.round(found, 4) + 0.0)     # no -0
     in_tf = f'[{numbers}] m (from {frames[0]} to {frames[1]})'
     use = config.lever_arm_from_tf is True or not is_set
     try:

@@ -87,6 +87,8 @@ def test_aligned(flight, tmp_path, capsys):
 
 def test_parameter_file_of_the_simulation(flight, capsys):
     assert main(['replay', str(flight), '--params', str(flight / 'ins_align.yaml')]) == 0
+    text = (flight / 'ins_align.yaml').read_text()
+    assert text.startswith('/**:')              # of a node in any namespace
 
 
 def test_parameter_file_covers_scale_factors(tmp_path, capsys):

@@ -316,7 +316,8 @@ def describe(info: Info) -> str:
         lines += ['', '  it cannot be aligned', *(f'    - {text}' for text in info.obstacles)]
     else:
         lines += [f'    {NOT_LOOKED_FOR}', '',
-                  '  to align it, with the lever arm added: --lever-arm X Y Z',
+                  '  to align it, with the lever arm added unless /tf_static has it: '
+                  '--lever-arm X Y Z',
                   f'    {info.command}']
     return '\n'.join(printable(line) for text in lines for line in text.split('\n'))
 

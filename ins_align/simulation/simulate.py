@@ -404,5 +404,5 @@ def _parameter_file(simulation: Simulation) -> str:
     covered = noise_parameters(PRESETS.get(grade, ImuNoise(0.0, 0.0, 0.0, 0.0)))
     values |= {name: value for name, value in noise_parameters(simulation.imu_noise).items()
                if value > covered[name]}
-    return ''.join(['ins_align:\n  ros__parameters:\n',
+    return ''.join(['/**:\n  ros__parameters:\n',
                     *(f'    {name}: {value}\n' for name, value in values.items())])
