@@ -166,10 +166,13 @@ class Aligner:
         self._start_over(reason)
 
     def _clock_jumped(self) -> None:
+        first = self._imu.suspect
         self._process()                             # what could have been asked for before
         self._counts['clock_jumps'] += 1
         # A recording that is played again says nothing new: what it said before is no prior.
         self._start_over('the clock of the IMU jumped back')
+        if first is not None:
+            self._imu.add(*first)
 
     def _start_over(self, why: str) -> None:
         self._say_start_over(why)

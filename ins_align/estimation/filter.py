@@ -116,8 +116,7 @@ class Filters:
     ids : ndarray of int, shape (M,)
         The rivals that are left.
     owed : ndarray, shape (M,)
-        Information on the heading, 1/rad^2, that epochs to come may give by chance, beyond their
-        own.
+        Information on the heading, 1/rad^2, that epochs to come may give by chance besides.
     at_start : ndarray, shape (M, 3)
         The variances of the accelerometers' biases, (m/s^2)^2, as they were at the start.
     place : ndarray of int, shape (B,), or slice

@@ -103,7 +103,8 @@ class ImuBuffer:
         # What is not sorted into these yet: stamps and samples, of one sample or of many.
         self._new: list[tuple[ArrayLike, ArrayLike]] = []
         self.newest_ns: int | None = None           # that has come
-        self._suspect_ns: int | None = None
+        # A sample from long ago, until the next one shows whether the clock was set back there.
+        self.suspect: tuple[int, Array, Array] | None = None
         # A sample far ahead of the others, until the next one shows whether time goes on there.
         self._ahead: tuple[int, Array, Array] | None = None
         # The samples in a row behind the newest one: that one, the first, the last, how many.
@@ -132,14 +133,14 @@ class ImuBuffer:
         newest = self.newest_ns
         if newest is not None and stamp_ns < newest - self._lateness_ns:
             # One sample from long ago is late; a second one after it means a clock set back.
-            suspect = self._suspect_ns
-            if suspect is not None and 0 <= stamp_ns - suspect < 1_000_000_000:
+            if self.suspect is not None and 0 <= stamp_ns - self.suspect[0] < 1_000_000_000:
+                self._counts['imu_late'] -= 1
                 self.jumped_to_ns = stamp_ns
             else:
-                self._suspect_ns = stamp_ns
+                self.suspect = stamp_ns, gyro, accel
                 self._counts['imu_late'] += 1
             return
-        self._suspect_ns = None
+        self.suspect = None
         if newest is None or stamp_ns > newest:
             self.newest_ns = stamp_ns
         elif stamp_ns < newest:
@@ -167,7 +168,7 @@ class ImuBuffer:
                 if self.jumped_to_ns is not None:
                     return k
             return int(stamps_ns.size)
-        self._suspect_ns = None
+        self.suspect = None
         self._new.append((stamps_ns, np.hstack([gyro, accel])))
         self.newest_ns = int(stamps_ns[-1])
         return int(stamps_ns.size)
