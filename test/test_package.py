@@ -172,7 +172,7 @@ def test_constants_are_those_of_their_page():
     written, found = {}, {}
     for row in re.findall(r'^\| (`.*?`) \| (`.*?`) \|', read('docs/constants.md'), re.MULTILINE):
         names, values = (re.findall('`(.*?)`', cell) for cell in row)
-        values = [eval(value, vars(math)) for value in values]
+        values = [eval(value, {**vars(math)}) for value in values]
         written.update(zip(names, values if len(values) == len(names) else values[0]))
     for path in (ROOT / 'ins_align/estimation').glob('*.py'):
         module = import_module(f'ins_align.estimation.{path.stem}')
