@@ -288,7 +288,7 @@ class Filters:
         if np.all(variance * np.einsum('bi,bi->b', m, m)
                   <= BENT ** 2 * np.trace(noise, axis1=1, axis2=2)):
             return test
-        more = -0.5 * skew(m)
+        more = -0.5 * skew(m)       # in the derivative to phi, which S has on both sides
         HP = test.HP + more @ self.P[:, PHI][self.place]
         S = test.S + more @ test.HP[..., PHI].swapaxes(1, 2) + HP[..., PHI] @ more.swapaxes(1, 2)
         return _tested(HP, S, innovation, True)
