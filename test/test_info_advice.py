@@ -21,6 +21,7 @@ import shlex
 from ins_align.cli import main
 from ins_align.config import PRESETS
 from ins_align.estimation.rivals import level_in_words, Rival
+from ins_align.estimation.states import biases, GYRO
 from ins_align.recordings.info import describe, inspect
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
@@ -213,13 +214,18 @@ def test_of_rates_in_degrees_nothing_is_told_in_degrees(tmp_path):
     assert not {'max_rate_deg_s', 'rest_rate_deg_s', 'angle_random_walk'} & set(imu_of(info))
 
 
-@pytest.mark.parametrize('gyro', [1.0, 3.0])
-@pytest.mark.parametrize('accel', [1.0, 10.0])
-def test_a_level_names_a_setting_of_the_accelerometers_alone(gyro, accel):
-    """Whatever makes the gyros look worse: larger biases configured make nothing better."""
-    said = level_in_words(Rival(gyro=gyro, accel=accel), PRESETS['mems'])
-    assert ('gyros look worse' in said) == (gyro > 1) and '_walk' not in said
-    assert ('bias_std' in said) == ('accel_bias_std 0.5 ' in said) == (accel > 1 and gyro == 1)
+@pytest.mark.parametrize('gyro_bias', [0.0, 0.05, 0.8])  # deg/s, where mems has 0.1
+@pytest.mark.parametrize('accel_bias', [0.0, 0.04, 0.3])  # m/s^2, where mems has 0.05
+def test_a_level_names_the_setting_that_a_bias_asks_for(gyro_bias, accel_bias):
+    """What looks worse for other reasons gets no better with larger biases configured."""
+    x = np.zeros(GYRO + 6)
+    gyro, accel = biases(x.size)
+    x[gyro], x[accel] = [0.0, -np.radians(gyro_bias), 0.0], [accel_bias, 0.0, 0.0]
+    said = level_in_words(Rival(gyro=3.0), PRESETS['mems'], x)
+    assert ('gyro_bias_std=0.8' in said) == (gyro_bias == 0.8)
+    assert ('accel_bias_std=0.3' in said) == (accel_bias == 0.3)
+    assert ('gyros look worse' in said) != ('_std=' in said)
+    assert level_in_words(Rival(), PRESETS['mems'], x) == ''
 
 
 REAL = {

@@ -339,7 +339,8 @@ class Bank:
         velocity, position, either = self._rejected
         best = filters.best
         remarks = receiver.in_words() + self._not_used + level_in_words(
-            self._rivals.table[filters.ids[best]], self._config.imu_noise)
+            self._rivals.table[filters.ids[best]], self._config.imu_noise,
+            filters.x[filters.lead[best]])
         if self._vehicle is not None:
             remarks += self._vehicle.in_words(filters)
         return Fit(self._offered, 3 * (self._offered - either), receiver.misfit, self._nis,

@@ -42,6 +42,8 @@ UNLIKELY, HOPELESS, LEAST = 14.0, 25.0, NEGLIGIBLE + 1.0
 ALIKE = 2.0
 # A wrong rival that is likely has to give the same attitude, to so many sigmas.
 HARMLESS = 1.0
+# A bias that is found to be so many times its sigma asks for a larger one.
+LARGE_BIAS = 2.0
 # Velocity of a vehicle sideways and upwards that lasts (m/s: tyres' slip, leeway and current,
 # wind); it changes by its sigma in this time (s), as the wind does where an aeroplane turns.
 DRIFTS = {'car': 0.1, 'boat': 1.0, 'aeroplane': 10.0}
@@ -264,21 +266,27 @@ def in_words(rival: Rival, x: Array, gnss_delay: float) -> str:
     return f'the data fit better with {better}: {rival.advice}'
 
 
-def level_in_words(level: Rival, noise: ImuNoise) -> str:
+def level_in_words(level: Rival, noise: ImuNoise, x: Array) -> str:
     """
-    Return how a level is worse than the configured noise, as the end of a sentence, or ''.
+    Return how a level with parameters x is worse than the configured noise, or ''.
 
-    A setting is named only for the accelerometers alone. What makes the gyros look worse is seldom
-    their bias, and with a larger one configured it takes longer and gets no better.
+    It is the end of a sentence. A setting is named where a bias is found that asks for it: what
+    looks worse for other reasons gets no better with larger biases configured, and takes longer.
     """
-    if level.gyro > 1:
-        return (f'; the gyros look worse than configured, as with {level.gyro:g} times the bias '
-                '(coarse readings, scale factors, vibration and GNSS errors that last look like '
-                'that too): sigmas allow for it')
-    if level.accel > 1:
-        return ('; the accelerometers look worse than configured: accel_bias_std '
-                f'{level.accel * noise.accel_bias_std:.2g} fits better')
-    return ''
+    if level.gyro == level.accel == 1:
+        return ''
+    gyro, accel = (float(np.abs(x[places]).max()) for places in biases(x.size))
+    settings = [f'{name}={found:.2g}' for name, found, std in (
+        ('gyro_bias_std', math.degrees(gyro), math.degrees(noise.gyro_bias_std)),
+        ('accel_bias_std', accel, noise.accel_bias_std)) if found > LARGE_BIAS * std]
+    if settings:
+        return ('; the biases of the IMU are larger than configured, which sigmas allow for: set '
+                + ' and '.join(settings))
+    sensors, factor = (('gyros', level.gyro) if level.gyro > 1 else
+                       ('accelerometers', level.accel))
+    return (f'; the {sensors} look worse than configured, as with {factor:g} times the bias, '
+            'which sigmas allow for: coarse readings, scale factors, vibration or GNSS errors '
+            'that last')
 
 
 def gyro_matrix_std(scale_std: float) -> Array:
