@@ -26,7 +26,6 @@ from ins_align.config import Config
 from ins_align.estimation.declaration import Fit
 from ins_align.estimation.moments import AttitudeMoments
 from ins_align.estimation.track import InertialTrack
-from ins_align.geometry.earth import earth_rate_n, gravity_n, LocalLevel
 from ins_align.geometry.rotation import Array, cross, orthonormalized
 from ins_align.gnss.messages import AntennaEpoch
 from ins_align.imu.preintegration import Intervals, SensorErrors
@@ -94,74 +93,41 @@ class BodyIntegrals:
                 - self.time * cross(self.omega_ib_b0, self.lever_b))
 
 
-class NavigationIntegrals:
+class NavigationSide:
     """
-    The navigation side of the note's formulas, from GNSS velocity, taken linear between epochs.
+    The navigation side of the formulas, from velocities: s_v, and s_p as its integral.
 
-    The integrals carry the note's terms: `int_omega_v` is ``int C_n0n (omega_ie x v_n)``,
-    `int_g` is ``int C_n0n g_n``, `int_v` is ``int C_n0n v_n``; `int_int_...` one more integral.
-    C_n0n is known in closed form at both ends of an interval, so that the trapezoidal rule on the
-    n0 vectors replaces the first-order expansions in ``omega_in T``.
-
-    Parameters
+    Attributes
     ----------
-    latitude, longitude, altitude : float
-        Of the antenna at t0, radians and metres.
-    v_n : array_like, shape (3,)
+    time : float
+        Seconds since t0.
+    v_n0 : ndarray, shape (3,)
         Antenna velocity at t0, ENU, m/s.
+    s_v : ndarray, shape (3,)
+        Free-start velocity, ``C_n0n v_n + int C_n0n (omega_ie x v_n) - int C_n0n g_n``, which is
+        `InertialTrack.s_v`.
+    s_p : ndarray, shape (3,)
+        Free-start position, one more integral.
 
     """
 
-    def __init__(self, latitude: float, longitude: float, altitude: float, v_n: Array) -> None:
+    def __init__(self, v_n0: Array) -> None:
         """Start at t0."""
-        self._n0 = LocalLevel(latitude, longitude)
         self.time = 0.0
-        self.C_n0n = np.eye(3)
-        self.v_n0 = self.v_n = np.asarray(v_n, dtype=float)
-        self._integrands = self._vectors(latitude, altitude)
+        self.v_n0 = self.s_v = v_n0
+        self.s_p = np.zeros(3)
         self._before: tuple[float, Array] | None = None
-        self.int_omega_v, self.int_int_omega_v = np.zeros(3), np.zeros(3)
-        self.int_g, self.int_int_g = np.zeros(3), np.zeros(3)
-        self.int_v = np.zeros(3)
 
-    def _vectors(self, latitude: float, altitude: float) -> tuple[Array, Array, Array]:
-        return (self.C_n0n @ cross(earth_rate_n(latitude), self.v_n),
-                self.C_n0n @ gravity_n(latitude, altitude),
-                self.C_n0n @ self.v_n)
-
-    def advance(self, time: float, latitude: float, longitude: float, altitude: float,
-                v_n: Array) -> None:
-        """Append the GNSS epoch `time` seconds after t0."""
-        h = time - self.time
-        self.time, self.v_n = time, np.asarray(v_n, dtype=float)
-        self.C_n0n = self._n0.matrix(time, latitude, longitude)
-        omega_v0, g0, v0 = self._integrands
-        self._integrands = omega_v1, g1, v1 = self._vectors(latitude, altitude)
-        self.int_int_omega_v = (self.int_int_omega_v + h * self.int_omega_v
-                                + h * h / 6 * (2 * omega_v0 + omega_v1))
-        self.int_omega_v = self.int_omega_v + h / 2 * (omega_v0 + omega_v1)
-        self.int_int_g = self.int_int_g + h * self.int_g + h * h / 6 * (2 * g0 + g1)
-        self.int_g = self.int_g + h / 2 * (g0 + g1)
-        self.int_v = self.int_v + self._area(h, v0, v1)
-        self._before = (h, v0)
-
-    def _area(self, h: float, v0: Array, v1: Array) -> Array:
-        """Integral of the last interval under the parabola through the last three epochs."""
-        if self._before is None or not 0.5 <= h / self._before[0] <= 2.0:
-            return h / 2 * (v0 + v1)
-        g, v = self._before
-        return h / 6 * ((3 * g + 2 * h) / (g + h) * v1 + (3 * g + h) / g * v0
-                        - h * h / (g * (g + h)) * v)
-
-    @property
-    def s_v(self) -> Array:
-        """Free-start left side: ``C_n0n v_n + int C_n0n (omega_ie x v_n) - int C_n0n g_n``."""
-        return self.C_n0n @ self.v_n + self.int_omega_v - self.int_g
-
-    @property
-    def s_p(self) -> Array:
-        """Free-start position: one more integral, from velocity."""
-        return self.int_v + self.int_int_omega_v - self.int_int_g
+    def advance(self, time: float, s_v: Array) -> None:
+        """Append an epoch; s_p follows the parabola through the last three of them."""
+        h, last = time - self.time, self.s_v
+        area = h / 2 * (last + s_v)
+        if self._before is not None and 0.5 <= h / self._before[0] <= 2.0:
+            g, first = self._before
+            area = h / 6 * ((3 * g + 2 * h) / (g + h) * s_v + (3 * g + h) / g * last
+                            - h * h / (g * (g + h)) * first)
+        self.time, self.s_v, self.s_p = time, s_v, self.s_p + area
+        self._before = h, last
 
     @property
     def beta_v(self) -> Array:
@@ -210,11 +176,8 @@ class NoteMethod:
         self._position_form = config.method == 'pif'
         self._from_positions = self._position_form and use_position
         self._body = BodyIntegrals(self._lever_b, imu.omega[0])
-        place = epoch.latitude, epoch.longitude, epoch.altitude
-        self._track = InertialTrack.start(*place)
-        self._navigation: NavigationIntegrals | None = None
-        if epoch.v_n is not None:
-            self._navigation = NavigationIntegrals(*place, epoch.v_n)
+        self._track = InertialTrack.start(epoch.latitude, epoch.longitude, epoch.altitude)
+        self._navigation = None if epoch.v_n is None else NavigationSide(epoch.v_n)
         nuisance = 0
         if self._position_form:
             nuisance = 2 if self._free else int(self._from_positions)
@@ -236,11 +199,9 @@ class NoteMethod:
         """Take epochs and the IMU intervals before each; yield each when the results are its."""
         for k, epoch in enumerate(epochs):
             self._body.advance(imu, k)
-            time = (epoch.stamp_ns - self.t0_ns) * 1e-9
-            place = epoch.latitude, epoch.longitude, epoch.altitude
             self._track = self._track.along([epoch], self.t0_ns).at(0)
             if epoch.v_n is not None and self._navigation is not None:
-                self._navigation.advance(time, *place, epoch.v_n)
+                self._navigation.advance(float(self._track.time), self._track.s_v(epoch.v_n))
             self._pair(epoch)
             yield epoch
 

@@ -29,9 +29,9 @@ class InertialTrack:
     """
     The navigation side in the non-rotating frame n0, from positions and velocities as they come.
 
-    ``s_p = C_n0e Rz(W t) r_e(t) - int int gravitation`` and its derivative ``s_v`` differ from
-    the integrated forms of `NavigationIntegrals` by a constant and a term in t, which a free
-    start takes out; nothing between epochs has to be interpolated but gravitation, so gaps do no
+    ``s_p = C_n0e Rz(W t) r_e(t) - int int gravitation`` and its derivative ``s_v`` are the
+    integrals of the note: ``s_v - v_n(0)`` is its left side (9), ``s_p - t v_n(0)`` that of the
+    position form. Nothing between epochs has to be interpolated but gravitation, so gaps do no
     harm. Both are kept relative to a point that is fixed in the Earth at t0, against rounding.
     """
 
