@@ -35,9 +35,6 @@ from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.results import State, Status
 import numpy as np
 
-MIN_COURSE_SPEED = 2.0  # m/s above which a course means something
-MIN_COURSE_RATE = 0.05  # rad/s
-MIN_CORRELATION = 0.7
 ANY_GYRO_RATE = 70.0  # rad/s: more than the 4000 deg/s that any usual gyroscope measures
 LENGTH_CELLS, MIN_LENGTHS = 20, 20  # of GRID s over which forces are summed up; sums to judge by
 SHORTER, AS_LONG = 0.85, 0.15  # a quarter of the sums is so short; within this they are right
@@ -82,30 +79,6 @@ def _lengths(times: Array, gyro: Array, accel: Array, velocities: Series) -> Arr
             & (ends[LENGTH_CELLS:] < velocities.times[-1]))
     seen[:, 2] += STANDARD_GRAVITY * seconds
     return np.asarray(np.linalg.norm(felt[good], axis=1) / np.linalg.norm(seen[good], axis=1))
-
-
-def turn_ratio(times: Array, gyro: Array, up: Array, velocities: Series) -> float | None:
-    """
-    Return the rate about the vertical over the turn of the course; None: nothing to tell.
-
-    Of rates, rad/s, shape (N, 3), averaged over GRID s, at increasing times, s; `up` is the unit
-    vector of the mean specific force, shape (3,); velocities are as from `on_grid`.
-    """
-    if velocities.times.size < 5:
-        return None
-    v = velocities.vectors[:, :2]
-    course = np.unwrap(np.arctan2(v[:, 1], v[:, 0]))
-    elapsed = velocities.times[2:] - velocities.times[:-2]
-    rate = (course[2:] - course[:-2]) / elapsed
-    moving = ((np.hypot(*v.T)[1:-1] > MIN_COURSE_SPEED) & (elapsed < 3.0 * GRID)
-              & (np.abs(rate) > MIN_COURSE_RATE))
-    turning, rate = np.interp(velocities.times[1:-1], times, gyro @ up)[moving], rate[moving]
-    if rate.size < 10 or not turning.any():
-        return None
-    product, energy = float(turning @ rate), float(rate @ rate)
-    if abs(product) < MIN_CORRELATION * math.sqrt(energy * float(turning @ turning)):
-        return None
-    return product / energy
 
 
 def exchange_fault(positions_deg: Series, velocities: Series) -> str:

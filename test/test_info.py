@@ -110,7 +110,7 @@ def test_good_recording(drive):
     assert fix.figures['sigma'] == pytest.approx((2.5, 5.0))
     assert velocity.settings == fix.settings == info.settings == {}
     # It sets off after 15 s and then gains 5 m/s in some seconds.
-    assert 13.0 < info.figures['manoeuvres_s'][0] < 20.0
+    assert 13.0 < info.figures['first_manoeuvre_s'] < 20.0
     assert heading_of(info).startswith('yes')
 
 
@@ -125,7 +125,6 @@ def test_noise_and_bias_are_those_of_the_simulation(drive):
     still = truth.truth_gyro[100:600].mean(axis=0) + truth.gyro_bias
     sigma = noise.angle_random_walk / math.sqrt(imu['rest_s'])
     assert np.radians(imu['rest_rate_deg_s']) == pytest.approx(still, abs=3.0 * sigma)
-    assert imu['turn_ratio'] == pytest.approx(1.0, abs=0.1)
     assert imu['imu_grade'] == 'tactical'
 
 
@@ -135,7 +134,7 @@ def test_grade_at_rest(tmp_path, grade):
     info = inspect(tmp_path / 'a')
     assert info.topics[0].figures['imu_grade'] == grade
     assert heading_of(info).startswith('no')
-    assert info.figures['manoeuvres_s'] == []
+    assert info.figures['first_manoeuvre_s'] is None
 
 
 def test_noise_in_motion_is_an_upper_bound_only(tmp_path):
@@ -262,9 +261,9 @@ def test_two_good_imus_are_a_choice(changed):
     assert '--imu-topic /imu/data_raw' in info.command
 
 
-@pytest.mark.parametrize('factors, word', [((57.29578, 1.0), 'deg/s'), ((-1.0, 1.0), 'sign'),
+@pytest.mark.parametrize('factors, word', [((57.29578, 1.0), 'deg/s'),
                                            ((1.0, 0.10197), 'unit (g?)')])
-def test_units_and_signs_of_the_imu(changed, factors, word):
+def test_units_of_the_imu(changed, factors, word):
     def change(name, time, message):
         if name == '/imu/data_raw':
             for vector, factor in zip((message.angular_velocity, message.linear_acceleration),
@@ -515,7 +514,7 @@ def test_track_and_manoeuvres_by_hand():
     found = find_manoeuvres(velocities)
     assert found.max_speed == pytest.approx(10.0)
     assert found.largest_change == pytest.approx(10.0 * math.sqrt(2.0))
-    assert found.starts == (29.5,)
+    assert found.first == 29.5
     degree = math.degrees(1.0 / 6_371_000.0)
     north = np.cumsum(velocities.vectors[:, 1]) * 0.5
     cosine = math.cos(math.radians(60.0))
@@ -563,7 +562,7 @@ def test_wild_fixes_are_no_manoeuvres(tmp_path):
         messages = [(topic.name, time, deserialize(data, topic))
                     for topic, time, data in messages_of(bag, topics)]
     path = write_messages(tmp_path / 'b', 'mcap', messages, {'/imu/data_raw': IMU, '/fix': FIX})
-    assert inspect(path).figures['manoeuvres_s'] == []
+    assert inspect(path).figures['first_manoeuvre_s'] is None
 
 
 def test_sharp_turns_and_gaps_are_no_spikes():
@@ -609,7 +608,7 @@ def test_real_recordings(name, rate, frame, rest, first):
     assert (info.chosen['velocity'] is None) == (frame is None)
     if frame:
         assert by_name(info, '/fix_velocity').figures['frame'] == frame
-    assert info.figures['manoeuvres_s'][0] == pytest.approx(first, abs=2.0)
+    assert info.figures['first_manoeuvre_s'] == pytest.approx(first, abs=2.0)
     lines = describe(info).replace(info.command, '').splitlines()  # has the path, however long
     assert max(map(len, lines)) < 130
 

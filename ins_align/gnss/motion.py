@@ -52,7 +52,6 @@ class VelocityFrame:
     windows: int  # distances that were compared
     angle_deg: float | None = None  # of a turned frame against ENU, counter-clockwise
     speed_ratio: float | None = None  # velocity over change of position
-    upside_down: bool = False  # the vertical velocity has the wrong sign
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class Manoeuvres:
 
     max_speed: float  # m/s
     largest_change: float  # m/s, within MANOEUVRE_TIME
-    starts: tuple[float, ...]  # s, where a change by MANOEUVRE_SPEED begins
+    first: float | None  # s, when the first change by MANOEUVRE_SPEED begins
 
 
 def series_of(times: Array, vectors: Array) -> Series:
@@ -162,10 +161,7 @@ def velocity_frame(velocities: Series, positions: Series) -> VelocityFrame:
         return VelocityFrame('turned', count, float(np.degrees(-np.angle(as_enu))), ratio)
     if not frames:
         return VelocityFrame('body', count, speed_ratio=ratio)
-    frame = max(frames)[1]
-    climbs = float(moved[:, 2] @ travelled[:, 2]) * (1.0 if frame == 'enu' else -1.0)
-    clear = -climbs > 0.5 * float(np.sum(moved[:, 2] ** 2)) > 0.5 * MIN_DISTANCE ** 2
-    return VelocityFrame(frame, count, None, ratio, clear)
+    return VelocityFrame(max(frames)[1], count, None, ratio)
 
 
 def find_manoeuvres(velocities: Series) -> Manoeuvres | None:
@@ -185,22 +181,19 @@ def find_manoeuvres(velocities: Series) -> Manoeuvres | None:
         np.maximum(change[:-lag], step, out=change[:-lag])
         np.minimum(until[:-lag], np.where(step >= MANOEUVRE_SPEED, times[lag:], math.inf),
                    out=until[:-lag])
-    starts: list[float] = []
-    free_from = -math.inf
-    for index in np.flatnonzero(np.isfinite(until)).tolist():
-        if times[index] >= free_from:
-            # Of all starts of this change the latest: when it really begins.
-            same = index + np.flatnonzero(until[index:] <= until[index])[-1]
-            starts.append(float(times[same]))
-            free_from = until[index]
-    return Manoeuvres(float(np.hypot(*v.T).max()), float(change.max()), tuple(starts))
+    first = None
+    ends = until[np.isfinite(until)]
+    if ends.size:
+        # Of all starts of this change the latest: when it really begins.
+        first = float(times[np.flatnonzero(until <= ends[0])[-1]])
+    return Manoeuvres(float(np.hypot(*v.T).max()), float(change.max()), first)
 
 
 def heading_in_words(found: Manoeuvres | None) -> str:
     """Say whether manoeuvres show the heading."""
     if found is None:
         return 'unknown: there is no GNSS to tell the motion from'
-    if found.starts:
+    if found.first is not None:
         return 'yes: the velocity changes enough'
     if found.largest_change >= WEAK_SPEED:
         return 'weakly: the changes of velocity are small, it takes longer and a good receiver'

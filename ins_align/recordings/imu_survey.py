@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ins_align.checks import degrees_fault, turn_ratio
+from ins_align.checks import degrees_fault
 from ins_align.config import Config, ImuNoise, PRESETS
 from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, skew
@@ -62,7 +62,6 @@ PRIOR_STD = np.repeat([1e4, 1e4, math.radians(0.5), 3.0, 0.5], 3)
 MOVING = 1.0  # m/s
 MAX_TURN_STD = 0.2  # rad: a rotation that is known less well is open
 OUTLIER = 6.0  # times the median size of residuals
-LASTING = 0.1  # correlation from epoch to epoch; of white noise the fit makes a negative one
 LONGEST = 3600.0  # s from the first motion on that are looked at: memory is bounded
 
 
@@ -96,13 +95,8 @@ def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: floa
     up = values[:, 3:].mean(axis=0)
     up /= np.linalg.norm(up) or 1.0
     grid, cells = _cells(times, values)
-    ratio = turn_ratio(grid, cells[:, :3], up, velocities)
-    rates = degrees_fault(max_rate, grid, *np.split(cells, 2, axis=1), velocities)
-    if max_rate == 0.0:
-        rates = 'all angular rates are 0'
-    elif ratio is not None and ratio < 0.0 and not rates:
-        rates = ('in left turns the rate about the upward axis is negative: a sign of the '
-                 'gyroscopes or of the specific force is wrong (+9.8 along up at rest)')
+    rates = ('all angular rates are 0' if max_rate == 0.0 else
+             degrees_fault(max_rate, grid, *np.split(cells, 2, axis=1), velocities))
     for fault in filter(None, (force_fault(force), rates)):
         imu.add(fault, fault=True)
     x, y, z = up.tolist()
@@ -114,7 +108,7 @@ def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: floa
         imu.add('on average the specific force does not point along the z axis of the IMU: the '
                 'attitude will be that of the axes as they are, however the IMU is mounted')
     imu.add(f'angular rate: up to {math.degrees(max_rate):.0f} deg/s',
-            max_rate_deg_s=math.degrees(max_rate), turn_ratio=ratio)
+            max_rate_deg_s=math.degrees(max_rate))
     _add_end_of_range(imu, samples)
     _add_noise(imu, samples, _longest_rest(grid, cells, velocities), gravity)
 
@@ -323,10 +317,9 @@ def fit_motion(samples: Series, velocities: Series, gravity: float,
     the delay, which is searched from 0.5 s below to 1.2 s above each of the offsets, s.
 
     Returns figures, s and m/s, as far as motion and data tell them: ``gnss_delay`` (stamps less
-    the times of measurement on the clock of the IMU), ``gnss_delay_std``, ``gnss_delay_drift``
-    (that of the second half less that of the first), ``velocity_noise`` (horizontal, per axis),
-    ``velocity_noise_vertical``; ``velocity_lasting`` is the part of the horizontal noise that is
-    alike in neighbouring epochs and after ``velocity_lasting_s`` no more than 1 / e of that.
+    the times of measurement on the clock of the IMU), ``gnss_delay_std``, ``velocity_noise``
+    (horizontal, per axis),
+    ``velocity_noise_vertical``.
     """
     delays = np.concatenate([offset + DELAYS for offset in offsets])
     moving = np.flatnonzero(np.hypot(*velocities.vectors[:, :2].T) > MOVING)
@@ -359,34 +352,17 @@ def fit_motion(samples: Series, velocities: Series, gravity: float,
     delay, std = _maximum(near, likelihood.sum(axis=1))
     odd, even = (_maximum(near, likelihood[:, half::2].sum(axis=1))[0] for half in (1, 0))
     std = max(std, 0.5 * abs(odd - even))
-    first, second = (_maximum(delays, half.sum(axis=1))[0]
-                     for half in np.array_split(coarse, 2, axis=1))
     known = (std < MAX_DELAY_STD and np.count_nonzero(telling) >= MIN_WINDOWS
              and 0 < place % DELAYS.size < DELAYS.size - 1)
-    figures = {'gnss_delay': delay, 'gnss_delay_std': std, 'gnss_delay_drift': second - first}
-    interval = float(np.median(np.diff(velocities.times)))
+    figures = {'gnss_delay': delay, 'gnss_delay_std': std} if known else {}
     # Of windows in motion, if there are: standing, receivers are better than they are.
     chosen = np.hypot(v_n[..., 0], v_n[..., 1]).mean(axis=1) > MOVING
     chosen |= np.count_nonzero(chosen) < MIN_WINDOWS
-    # The fit has taken some of the noise away.
-    return (figures if known else {}) | _noise_left(
-        left[1][chosen], good[chosen], math.sqrt(3.0 * good.sum() / free.sum()), interval)
-
-
-def _noise_left(left: Array, good: Array, scale: float, interval: float) -> dict[str, float]:
-    """Return the noise of velocities, of residuals, shape (M, n, 3), weights (M, n), a factor."""
-    # The median does without the outliers.
-    size = scale / 0.6745 * np.abs(left[good > 0.0])
-    noise, vertical = float(np.median(size[:, :2])), float(np.median(size[:, 2]))
-    figures = {'velocity_noise': noise, 'velocity_noise_vertical': vertical}
-    horizontal, n = left[..., :2] * good[..., None], good.shape[1]
-    alike = np.array([np.sum(horizontal[:, lag:] * horizontal[:, :n - lag])
-                      / max(np.sum(good[:, lag:] * good[:, :n - lag]), 1.0)
-                      for lag in range(n // 2)])
-    if alike[1] > LASTING * alike[0]:
-        figures |= {'velocity_lasting': noise * math.sqrt(alike[1] / alike[0]),
-                    'velocity_lasting_s': interval * int(np.argmax(alike < alike[1] / math.e))}
-    return figures
+    # The fit has taken some of the noise away; the median does without the outliers.
+    scale = math.sqrt(3.0 * good.sum() / free.sum()) / 0.6745
+    size = scale * np.abs(left[1][chosen][good[chosen] > 0.0])
+    return figures | {'velocity_noise': float(np.median(size[:, :2])),
+                      'velocity_noise_vertical': float(np.median(size[:, 2]))}
 
 
 def _windows(times: Array, epochs: Array, delays: Array) -> np.ndarray:
