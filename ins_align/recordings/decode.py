@@ -172,13 +172,6 @@ def _read(data: bytes, topic: Topic) -> Any:
         return None
 
 
-def unmeasured(message: Any) -> list[str]:
-    """Name what a sensor_msgs/Imu says that it does not measure: the covariance is -1."""
-    return [what for what, covariance in (
-        ('angular rate', message.angular_velocity_covariance),
-        ('specific force', message.linear_acceleration_covariance)) if covariance[0] == -1.0]
-
-
 def short_name(msgtype: str) -> str:
     """Return a message type without its package."""
     return msgtype.rsplit('/', 1)[-1]

@@ -15,12 +15,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 import dataclasses
 import itertools
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 import os
+import re
 from typing import NamedTuple
 
 from ins_align.config import Config
@@ -34,7 +35,7 @@ from ins_align.recordings import BagError, listed, Topic
 from ins_align.recordings.bag import Bag, Block
 from ins_align.recordings.decode import (
     decode_gnss, decode_imu, deserialize, FIX_TYPE, Gnss, IMU_TYPE, ImuSamples, short_name,
-    unmeasured, VECTOR_TYPE, VELOCITY_TYPES)
+    VECTOR_TYPE, VELOCITY_TYPES)
 from ins_align.results import Severity
 import numpy as np
 
@@ -42,6 +43,8 @@ TF_TYPE = 'tf2_msgs/msg/TFMessage'
 UNSTAMPED_TYPES = ['geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistWithCovariance',
                    'geometry_msgs/msg/Vector3']
 REFERENCE_NAMESPACE = '/reference/'
+# A Vector3Stamped may be a field, an angular rate or a force as well.
+VELOCITY_NAME = re.compile(r'(?!.*ang).*vel', re.IGNORECASE)
 REFERENCE_TOPIC = '/reference/imu'  # truth or the best that is known: to compare with, never input
 OPTIONS = {'IMU': '--imu-topic', 'position': '--fix-topic', 'velocity': '--velocity-topic'}
 
@@ -189,16 +192,15 @@ def _velocity(bag: Bag, config: Config, fix: Topic, name: str | None) -> Topic |
     topic = _choose(bag, 'velocity', (preferred, twists, [VECTOR_TYPE], [*RECEIVERS]), name,
                     config)
     if topic is None:
-        for other in sorted(_candidates(bag, UNSTAMPED_TYPES), key=attrgetter('name')):
-            if not is_command(other):
-                bag.warn(f'{other.name} cannot be used: {type_in_words(other.msgtype)} has no '
-                         f'stamp; a velocity needs {_in_words(VELOCITY_TYPES)}')
+        for other in sorted(candidates(bag, UNSTAMPED_TYPES)):
+            bag.warn(f'{other.name} cannot be used: {type_in_words(other.msgtype)} has no '
+                     f'stamp; a velocity needs {_in_words(VELOCITY_TYPES)}')
     elif name is not None:
-        _measures(bag, topic, config)  # for the warning: it is read as the user wishes
+        _can_be_used(bag, topic, config)  # for the warning: it is read as the user wishes
     elif topic.msgtype in preferred:
         if names := sorted(f'{other.name} ({short_name(other.msgtype)})'
-                           for other in _candidates(bag, others)
-                           if _measures(bag, other, say=False)):
+                           for other in candidates(bag, others)
+                           if not doubt(bag.first_message(other), other)):
             bag.warn(f'the velocity is read from {topic.name} ({short_name(topic.msgtype)}), '
                      f'not from {", ".join(names)}: --velocity-topic chooses')
     return topic
@@ -210,27 +212,22 @@ def _required(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None
     raise BagError(f'{bag.path} has no {what} topic ({_in_words(groups[0])}); {_listing(bag)}')
 
 
-def _candidates(bag: Bag, types: list[str]) -> list[Topic]:
-    return [topic for topic in bag.topics if topic.msgtype in types
-            and REFERENCE_NAMESPACE not in topic.name]
-
-
 def _choose(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None,
             config: Config = Config()) -> Topic | None:
     """Return the topic of a name, or the one that measures of the first types that there are."""
     if name is not None:
         return _named(bag, what, list(dict.fromkeys(itertools.chain(*groups))), name)
     for types in groups:
-        candidates = _candidates(bag, types)
+        found = candidates(bag, types)
         # The only one of a standard type is read whatever it says of itself.
-        if what == 'velocity' or len(candidates) > 1 or types[0] in DRIVER_TYPES:
-            candidates = [topic for topic in candidates if _measures(bag, topic, config)]
-        if len(candidates) > 1:
-            names = ', '.join(sorted(topic.name for topic in candidates))
+        if what == 'velocity' or len(found) > 1 or types[0] in DRIVER_TYPES:
+            found = [topic for topic in found if _can_be_used(bag, topic, config)]
+        if len(found) > 1:
+            names = ', '.join(sorted(topic.name for topic in found))
             raise BagError(f'{bag.path} has more than one {what} topic ({names}): '
                            f'choose one with {OPTIONS[what]}')
-        if candidates:
-            return candidates[0]
+        if found:
+            return found[0]
     return None
 
 
@@ -248,30 +245,20 @@ def _named(bag: Bag, what: str, types: list[str], name: str) -> Topic:
     return topic
 
 
-def may_be_velocity(topic: Topic) -> bool:
-    """Whether the name of a topic is no other vector's: a field, an angular rate, a force."""
-    name = topic.name.lower()
-    return topic.msgtype != VECTOR_TYPE or ('vel' in name and 'ang' not in name)
+def candidates(bag: Bag, types: Collection[str]) -> list[Topic]:
+    """Return the topics of some types, without what is no measurement by its name."""
+    return [topic for topic in bag.topics if topic.msgtype in types
+            and REFERENCE_NAMESPACE not in topic.name
+            and 'cmd' not in topic.name.rsplit('/', 1)[-1]  # a wish: /cmd_vel
+            and (topic.msgtype != VECTOR_TYPE or VELOCITY_NAME.match(topic.name))]
 
 
-def is_command(topic: Topic) -> bool:
-    """Whether a topic is a wish, not a measurement: /cmd_vel."""
-    return 'cmd' in topic.name.rsplit('/', 1)[-1]
-
-
-def _measures(bag: Bag, topic: Topic, config: Config = Config(), say: bool = True) -> bool:
-    """
-    Look into a topic's first message for whether it can be what its type promises.
-
-    With `say` there is a warning of a message that cannot be used.
-    """
-    if is_command(topic) or not may_be_velocity(topic):
-        return False
-    data = bag.first_message(topic)
-    if data is None:
-        return False
+def doubt(first: bytes | None, topic: Topic, config: Config = Config()) -> str:
+    """Say why the first message of a topic is not what its type promises; '' where it is."""
+    if first is None:
+        return 'it has no messages'
     try:
-        message = deserialize(data, topic)
+        message = deserialize(first, topic)
         if topic.msgtype in RECEIVERS:
             with suppress(NoTimeError):
                 receiver_from_msg(message, topic.msgtype, config)
@@ -281,10 +268,20 @@ def _measures(bag: Bag, topic: Topic, config: Config = Config(), say: bool = Tru
             velocities_from_msgs([message], dataclasses.replace(
                 config, velocity_type=short_name(topic.msgtype)))
     except MessageError as error:
-        if say:
-            bag.warn(f'{topic.name} cannot be used: {error}')
-        return False
-    return topic.msgtype != IMU_TYPE or not unmeasured(message)
+        return str(error)
+    if topic.msgtype != IMU_TYPE:
+        return ''
+    unmeasured = ' and '.join(what for what, covariance in (
+        ('angular rate', message.angular_velocity_covariance),
+        ('specific force', message.linear_acceleration_covariance)) if covariance[0] == -1.0)
+    return unmeasured and f'its messages say that it does not measure {unmeasured} (covariance -1)'
+
+
+def _can_be_used(bag: Bag, topic: Topic, config: Config) -> bool:
+    """Whether the first message of a topic is what its type promises; a warning says why not."""
+    if why := doubt(bag.first_message(topic), topic, config):
+        bag.warn(f'{topic.name} cannot be used: {why}')
+    return not why
 
 
 def _listing(bag: Bag) -> str:
