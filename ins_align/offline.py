@@ -63,10 +63,14 @@ class _Run:
         for _ in range(undecodable):
             aligner.reject('imu_undecodable')
         for before, message in (*gnss, (len(stamps_ns), None)):
+            self._waiting += before - position + 1
             if before > position:
                 between = slice(position, before)
                 aligner.add_imu(stamps_ns[between], gyro[between], accel[between])
                 position = before
+            if self._waiting >= MESSAGES:
+                self._epochs += aligner.update(dry=True)
+                self._waiting = 0
             if isinstance(message, Fix):
                 aligner.add_fix(message)
             elif isinstance(message, Velocity):
@@ -76,10 +80,6 @@ class _Run:
         self._checks.add(stamps_ns, gyro, accel, [
             (before, message) for before, message in gnss
             if isinstance(message, (Fix, Velocity))])
-        self._waiting += len(stamps_ns) + len(gnss)
-        if self._waiting >= MESSAGES:
-            self._epochs += aligner.update(dry=True)
-            self._waiting = 0
 
     def result(self, **of_recording: Any) -> Result:
         """Return what came of it, at the end."""
@@ -203,13 +203,7 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     before = np.searchsorted(np.maximum.accumulate(stamps_ns),
                              [message.stamp_ns for message in gnss], side='right')
     run = _Run(settings)
-    first = 0
-    for start in range(0, stamps_ns.size, MESSAGES):
-        part = slice(start, start + MESSAGES)
-        last = int(np.searchsorted(before, start + MESSAGES, side='right'))
-        run.add(stamps_ns[part], rates[part], forces[part],
-                list(zip((before[first:last] - start).tolist(), gnss[first:last])))
-        first = last
+    run.add(stamps_ns, rates, forces, list(zip(before.tolist(), gnss)))
     return run.result()
 
 

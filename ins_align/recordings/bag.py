@@ -77,12 +77,11 @@ class Bag:
             self._readers = self._opened(stack)
             with _bag_errors(self.path):
                 filled = [reader for reader in self._readers if reader.end_time]
-                # Of whatever type and size they are in a file, here they fit into 64 bits.
-                times_ns = np.array([(reader.start_time, reader.end_time - 1)
-                                     for reader in filled], np.int64).reshape(-1, 2)
-                # When the first and the last message were recorded; 0 where there is none.
-                self.start_ns = int(times_ns[:, 0].min()) if filled else 0
-                self.end_ns = int(times_ns[:, 1].max()) if filled else 0
+                # When the first and the last message were recorded; 0 where there is none. Of
+                # whatever type and size they are in a file, here they fit into 64 bits.
+                self.start_ns, self.end_ns = (int(np.int64(time_ns)) for time_ns in (
+                    min((reader.start_time for reader in filled), default=0),
+                    max((reader.end_time - 1 for reader in filled), default=0)))
                 self.topics = self._listed_topics()  # whose messages can be decoded
             self._stack = stack.pop_all()
 
@@ -138,20 +137,17 @@ class Bag:
             yield numbers[id(connection)], time_ns, data
 
     def _listed_topics(self) -> tuple[Topic, ...]:
-        known: dict[tuple[str, str, str], list[Any]] = {}
-        for reader in self._readers:
-            for connection in reader.connections:
-                encoding = getattr(connection.ext, 'serialization_format', 'ros1')
-                parts = connection.msgtype.split('/')
-                msgtype = '/msg/'.join(parts) if len(parts) == 2 else connection.msgtype
-                key = '/' + connection.topic.strip('/'), msgtype, encoding
-                if encoding in ('cdr', 'ros1'):
-                    known.setdefault(key, []).append(connection)
+        known: dict[tuple[str, str, str], Topic] = {}
+        for connection in itertools.chain(*(reader.connections for reader in self._readers)):
+            encoding = getattr(connection.ext, 'serialization_format', 'ros1')
+            parts = connection.msgtype.split('/')
+            msgtype = '/msg/'.join(parts) if len(parts) == 2 else connection.msgtype
+            key = '/' + connection.topic.strip('/'), msgtype, encoding
+            if encoding in ('cdr', 'ros1'):
+                self._topics[id(connection)] = known.setdefault(
+                    key, Topic(*key, connection.msgdef.data))
         _check_topics(len(known))
-        for key, connections in known.items():
-            topic = Topic(*key, connections[0].msgdef.data)
-            self._topics.update((id(connection), topic) for connection in connections)
-        return tuple(dict.fromkeys(self._topics.values()))
+        return tuple(known.values())
 
     def _opened(self, stack: ExitStack) -> list[Any]:
         """Open those files that can be; an error only if there is none."""
@@ -205,8 +201,6 @@ class Bag:
         if _magic(path).startswith(ZSTD_MAGIC):
             path = self._unpacked(path, stack)
         magic = _magic(path)
-        if not magic:
-            raise BagError('is empty')
         if magic.startswith(MCAP_MAGIC):
             return self._open_mcap(path)
         if magic.startswith(SQLITE_MAGIC):
@@ -215,7 +209,8 @@ class Bag:
             reader = _Rosbag1Reader(path)
             reader.open()
             return reader
-        raise BagError('is no recording: neither mcap, sqlite3 nor ROS 1 bag')
+        raise BagError('is no recording: neither mcap, sqlite3 nor ROS 1 bag' if magic else
+                       'is empty')
 
     def _unpacked(self, path: Path, stack: ExitStack) -> Path:
         """Unpack a file that is compressed as a whole."""

@@ -161,16 +161,16 @@ def _survey_velocity(data: Recorded, positions: Series) -> None:
         return
     frame = velocity_frame(data.series(), positions)
     name = frame.frame
-    if data.doubt and name not in FRAMES_THAT_FIT:
+    data.add('', frame=name, speed_ratio=frame.speed_ratio)
+    if name in FRAMES_THAT_FIT:
+        data.add(f'frame: {name} (fits the change of position over {frame.windows} distances)',
+                 {'velocity_frame': name} if name == 'ned' or data.doubt else {})
+    elif data.doubt:
         data.add(data.doubt, fault=True)
     if name in FRAME_FAULTS:
         data.add(FRAME_FAULTS[name].format(frame), fault=True)
-    text = 'frame: not known, too little motion: it is taken as east-north-up'
-    if name in FRAMES_THAT_FIT:
-        text = f'frame: {name} (fits the change of position over {frame.windows} distances)'
-    data.add('' if name in FRAME_FAULTS else text,
-             {'velocity_frame': name} if name == 'ned' or name == 'enu' and data.doubt else {},
-             frame=name, speed_ratio=frame.speed_ratio)
+    elif name not in FRAMES_THAT_FIT:
+        data.add('frame: not known, too little motion: it is taken as east-north-up')
     moved = (data.values[data.usable] != 0.0).any(axis=0)
     if moved[:2].any() and not moved[2]:
         data.add('vertical velocity: always 0', {'velocity_vertical': 'absent'})
