@@ -35,7 +35,8 @@ from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.results import State, Status
 import numpy as np
 
-ANY_GYRO_RATE = 70.0  # rad/s: more than the 4000 deg/s that any usual gyroscope measures
+# rad/s: more than the 4000 deg/s that any usual gyroscope measures, unless few samples are.
+ANY_GYRO_RATE, TOO_FAST_SHARE = 70.0, 1e-3
 LENGTH_CELLS, MIN_LENGTHS = 20, 20  # of GRID s over which forces are summed up; sums to judge by
 SHORTER, AS_LONG = 0.85, 0.15  # a quarter of the sums is so short; within this they are right
 MIN_MISFIT = 0.1  # of the logarithm of a length: by so much exchanged positions fit better
@@ -45,17 +46,17 @@ BEYOND_THE_POLES = 'latitudes are beyond the poles: they are exchanged with the 
 CELLS, GNSS_MESSAGES = 600, 3000  # kept of the latest data: 5 minutes, at up to 10 Hz
 
 
-def degrees_fault(max_rate: float, times: Array, gyro: Array, accel: Array, velocities: Series,
+def degrees_fault(too_fast: bool, times: Array, gyro: Array, accel: Array, velocities: Series,
                   ) -> str:
     """
-    Say that angular rates, at most `max_rate`, are in deg/s; empty where they are not.
+    Say that angular rates are in deg/s, as those are that are too fast; empty where they are not.
 
     Of rates, rad/s, and specific forces, m/s^2, shape (N, 3), averaged over GRID s, at increasing
     times, s; velocities are as from `on_grid`. The sum of the specific force over some seconds,
     turned as the rates say, is as long as the change of velocity and gravity make it, whatever
     the attitude and the axes are; turned 57 times as far it becomes shorter.
     """
-    if max_rate <= ANY_GYRO_RATE:
+    if not too_fast:
         lengths = _lengths(times, gyro, accel, velocities)
         if not (lengths.size >= MIN_LENGTHS and np.quantile(lengths, 0.25) < SHORTER):
             return ''
@@ -194,9 +195,8 @@ class InputChecks:
         cells = sorted(self._cells)
         sums = np.array([self._cells[cell] for cell in cells]).reshape(-1, 7)
         degrees = degrees_fault(
-            math.inf if self._too_fast > 1e-3 * self._samples else 0.0,
-            (np.array(cells) + 0.5) * GRID, *np.split(sums[:, 1:] / sums[:, :1], 2, axis=1),
-            motion)
+            self._too_fast > TOO_FAST_SHARE * self._samples, (np.array(cells) + 0.5) * GRID,
+            *np.split(sums[:, 1:] / sums[:, :1], 2, axis=1), motion)
         exchanged = exchange_fault(fixes, velocities) or (
             BEYOND_THE_POLES if self._beyond_the_poles > MIN_LATE else '')
         return [fault for fault in (degrees, exchanged) if fault]

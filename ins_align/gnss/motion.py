@@ -26,7 +26,6 @@ EARTH_RADIUS = 6_371_000.0  # m, mean sphere: distances to 0.5 percent
 GRID = 0.5  # s, spacing on which velocities are compared
 MAX_GAP = 3.0  # s without GNSS over which nothing is interpolated
 MANOEUVRE_SPEED, MANOEUVRE_TIME = 5.0, 20.0  # m/s of change within so many s
-WEAK_SPEED = 1.0  # m/s: a change below this shows no heading with a usual receiver
 MIN_DISTANCE, DISTANCE_SIGMAS = 10.0, 10.0  # m, or so many sigmas of a position, to compare over
 SPANS = 2.0, 4.0, 8.0, 16.0, 30.0  # s in which a vehicle may cover that distance
 MIN_WINDOWS = 4
@@ -52,15 +51,6 @@ class VelocityFrame:
     windows: int  # distances that were compared
     angle_deg: float | None = None  # of a turned frame against ENU, counter-clockwise
     speed_ratio: float | None = None  # velocity over change of position
-
-
-@dataclass(frozen=True)
-class Manoeuvres:
-    """Changes of the horizontal velocity."""
-
-    max_speed: float  # m/s
-    largest_change: float  # m/s, within MANOEUVRE_TIME
-    first: float | None  # s, when the first change by MANOEUVRE_SPEED begins
 
 
 def series_of(times: Array, vectors: Array) -> Series:
@@ -164,41 +154,25 @@ def velocity_frame(velocities: Series, positions: Series) -> VelocityFrame:
     return VelocityFrame(max(frames)[1], count, None, ratio)
 
 
-def find_manoeuvres(velocities: Series) -> Manoeuvres | None:
+def find_manoeuvres(velocities: Series) -> tuple[float, float | None]:
     """
     Find changes of the horizontal velocity, which are what shows a heading.
 
-    Of velocities as from `on_grid` or `velocity_from_positions`; None where there are too few.
+    Of two velocities or more, as from `on_grid` or `velocity_from_positions`. Returns the largest
+    change within MANOEUVRE_TIME, m/s, and when the first one by MANOEUVRE_SPEED begins, s.
     """
     times, v = velocities.times, velocities.vectors[:, :2]
-    if times.size < 2:
-        return None
-    change = np.zeros(times.size)  # from its time on, the largest within MANOEUVRE_TIME
-    until = np.full(times.size, math.inf)  # when it first exceeds MANOEUVRE_SPEED
+    largest = 0.0
+    until = np.full(times.size, math.inf)  # when a change from a time on exceeds MANOEUVRE_SPEED
     for lag in range(1, min(round(MANOEUVRE_TIME / GRID), times.size - 1) + 1):
-        step = np.hypot(*(v[lag:] - v[:-lag]).T)
-        step[times[lag:] - times[:-lag] > MANOEUVRE_TIME] = 0.0
-        np.maximum(change[:-lag], step, out=change[:-lag])
-        np.minimum(until[:-lag], np.where(step >= MANOEUVRE_SPEED, times[lag:], math.inf),
+        change = np.hypot(*(v[lag:] - v[:-lag]).T)
+        change[times[lag:] - times[:-lag] > MANOEUVRE_TIME] = 0.0
+        largest = max(largest, float(change.max()))
+        np.minimum(until[:-lag], np.where(change >= MANOEUVRE_SPEED, times[lag:], math.inf),
                    out=until[:-lag])
-    first = None
     ends = until[np.isfinite(until)]
-    if ends.size:
-        # Of all starts of this change the latest: when it really begins.
-        first = float(times[np.flatnonzero(until <= ends[0])[-1]])
-    return Manoeuvres(float(np.hypot(*v.T).max()), float(change.max()), first)
-
-
-def heading_in_words(found: Manoeuvres | None) -> str:
-    """Say whether manoeuvres show the heading."""
-    if found is None:
-        return 'unknown: there is no GNSS to tell the motion from'
-    if found.first is not None:
-        return 'yes: the velocity changes enough'
-    if found.largest_change >= WEAK_SPEED:
-        return 'weakly: the changes of velocity are small, it takes longer and a good receiver'
-    return ('no: turn or change speed (standing, only navigation grade finds north, by the '
-            "Earth's rotation)")
+    # Of all starts of the first change the latest: when it really begins.
+    return largest, float(times[until <= ends[0]][-1]) if ends.size else None
 
 
 def _distances(velocities: Series, positions: Series) -> tuple[Array, Array]:

@@ -26,13 +26,13 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ins_align.checks import degrees_fault
+from ins_align.checks import ANY_GYRO_RATE, degrees_fault
 from ins_align.config import Config, ImuNoise, PRESETS
 from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, skew
 from ins_align.gnss.motion import GRID, Series
 from ins_align.imu.buffer import MAX_GAP_NS
-from ins_align.imu.noise import force_fault, RangeCheck, white_noise
+from ins_align.imu.noise import force_fault, white_noise
 from ins_align.recordings.topic_survey import rounded, Surveyed
 import numpy as np
 
@@ -96,7 +96,8 @@ def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: floa
     up /= np.linalg.norm(up) or 1.0
     grid, cells = _cells(times, values)
     rates = ('all angular rates are 0' if max_rate == 0.0 else
-             degrees_fault(max_rate, grid, *np.split(cells, 2, axis=1), velocities))
+             degrees_fault(max_rate > ANY_GYRO_RATE, grid, *np.split(cells, 2, axis=1),
+                           velocities))
     for fault in filter(None, (force_fault(force), rates)):
         imu.add(fault, fault=True)
     x, y, z = up.tolist()
@@ -109,19 +110,7 @@ def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: floa
                 'attitude will be that of the axes as they are, however the IMU is mounted')
     imu.add(f'angular rate: up to {math.degrees(max_rate):.0f} deg/s',
             max_rate_deg_s=math.degrees(max_rate))
-    _add_end_of_range(imu, samples)
     _add_noise(imu, samples, _longest_rest(grid, cells, velocities), gravity)
-
-
-def _add_end_of_range(imu: Surveyed, samples: Series) -> None:
-    """Say which sensors were at the end of their range, and where that is."""
-    check = RangeCheck()
-    check.add((samples.times * 1e9).astype(np.int64), samples.vectors)
-    largest = np.abs(samples.vectors).reshape(-1, 2, 3).max(axis=(0, 2))
-    for sensor, value, count in zip(SENSORS, largest, np.count_nonzero(check.densities, axis=0)):
-        if count:
-            imu.add(f'{sensor.name} at the end of their range, {value / sensor.size:.4g} '
-                    f'{sensor.unit}, in {count} samples: let the driver set a larger one')
 
 
 def _add_noise(imu: Surveyed, samples: Series, rest: tuple[float, float] | None, gravity: float,

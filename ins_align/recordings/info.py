@@ -30,9 +30,8 @@ from ins_align.geometry.earth import normal_gravity
 from ins_align.gnss.buffer import MAX_AHEAD_NS
 from ins_align.gnss.messages import enu_from_ned
 from ins_align.gnss.motion import (
-    differences, EMPTY, find_manoeuvres, heading_in_words, MANOEUVRE_SPEED, MANOEUVRE_TIME,
-    Manoeuvres, on_grid, Series, track, velocity_frame, velocity_from_positions,
-    without_wild_positions)
+    differences, EMPTY, find_manoeuvres, MANOEUVRE_SPEED, MANOEUVRE_TIME, on_grid, Series, track,
+    velocity_frame, velocity_from_positions, without_wild_positions)
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings import BagError, printable
 from ins_align.recordings.bag import Bag
@@ -43,6 +42,7 @@ from ins_align.recordings.topic_survey import (
 from ins_align.report import format_table
 import numpy as np
 
+WEAK_CHANGE = 1.0  # m/s: a smaller change shows no heading with a usual receiver
 MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
 MIN_AHEAD = 0.3  # s: clocks that differ by less may be jitter
 MAX_AHEAD, MAX_BEHIND = MAX_AHEAD_NS * 1e-9, 10.0  # s: stamps further apart are of two clocks
@@ -111,7 +111,7 @@ def inspect(path: str | os.PathLike[str]) -> Info:
         info = Info(str(bag.path), (end_ns - bag.start_ns) * 1e-9, bag.start_ns,
                     tuple(data for of_kind in topics for data in of_kind),
                     {kind: data and data.name for kind, data in chosen.items()})
-        _add_manoeuvres(info, find_manoeuvres(grid))
+        _add_manoeuvres(info, grid)
         obstacles = [f'{data.name} cannot be used: {data.faults[0]}'
                      for data in chosen.values() if data is not None and data.faults]
         if velocity is None:
@@ -123,11 +123,6 @@ def inspect(path: str | os.PathLike[str]) -> Info:
             obstacles += _different_clocks(imu, gnss)
             if not obstacles:
                 _add_timing(info, imu, gnss, motion, gravity)
-        for of_kind in topics:
-            good = [data.name for data in of_kind if not data.faults]
-            if len(good) > 1:
-                info.add(f'{", ".join(good)}: each could be read, the command takes the one with '
-                         'the most messages; choose for yourself')
         _propose(info, bag, chosen, obstacles)
     return info
 
@@ -198,17 +193,25 @@ def _best(topics: list[Recorded]) -> Recorded | None:
         data.figures.get('frame') in FRAMES_THAT_FIT, np.count_nonzero(data.usable)))
 
 
-def _add_manoeuvres(info: Info, found: Manoeuvres | None) -> None:
+def _add_manoeuvres(info: Info, velocities: Series) -> None:
     """Add how the vehicle moves, and whether that shows the heading."""
-    info.add(f'heading from the motion: {heading_in_words(found)}')
-    if found is None:
+    if velocities.times.size < 2:
+        info.add('heading from the motion: unknown: there is no GNSS to tell the motion from')
         return
-    info.add(f'up to {found.max_speed:.1f} m/s; velocity changes by up to '
-             f'{found.largest_change:.1f} m/s within {MANOEUVRE_TIME:g} s',
-             max_speed=found.max_speed, largest_change=found.largest_change)
-    info.add('' if found.first is None else
-             f'the first change by {MANOEUVRE_SPEED:g} m/s is at {found.first:.0f} s',
-             first_manoeuvre_s=found.first)
+    largest, first = find_manoeuvres(velocities)
+    shown = ('no: turn or change speed (standing, only navigation grade finds north, by the '
+             "Earth's rotation)")
+    if first is not None:
+        shown = 'yes: the velocity changes enough'
+    elif largest >= WEAK_CHANGE:
+        shown = 'weakly: the changes of velocity are small, it takes longer and a good receiver'
+    info.add(f'heading from the motion: {shown}')
+    speed = float(np.hypot(*velocities.vectors[:, :2].T).max())
+    info.add(f'up to {speed:.1f} m/s; velocity changes by up to {largest:.1f} m/s within '
+             f'{MANOEUVRE_TIME:g} s', max_speed=speed, largest_change=largest)
+    info.add('' if first is None else
+             f'the first change by {MANOEUVRE_SPEED:g} m/s is at {first:.0f} s',
+             first_manoeuvre_s=first)
 
 
 def _different_clocks(imu: Recorded, gnss: list[Recorded]) -> list[str]:
