@@ -87,6 +87,13 @@ class Refused(NamedTuple):
 Gnss = Union[Fix, Velocity, Refused]
 
 
+def decode(messages: Sequence[bytes], topic: Topic, config: Config) -> dict[str, Any]:
+    """Decode messages of a topic by kind: `ImuSamples` of an imu, a list of `Gnss` of others."""
+    if KINDS[topic.msgtype] == ('imu',):
+        return {'imu': decode_imu(messages, topic)}
+    return decode_gnss(messages, topic, config)
+
+
 def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
     """Decode messages of an IMU, sensor_msgs/Imu or a driver's own; what is none is left out."""
     if topic.msgtype == IMU_TYPE and len(set(map(len, messages))) == 1:

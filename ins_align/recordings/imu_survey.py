@@ -104,7 +104,7 @@ def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: floa
     imu.add(f'specific force: {force:.2f} m/s^2 on average, mean direction '
             f'({x:+.2f}, {y:+.2f}, {z:+.2f})', mean_force=force, up=[x, y, z])
     if imu.faults:
-        return  # the rest would be in wrong units, or of other axes
+        return  # the rest would be in wrong units
     if z < 0.5:
         imu.add('on average the specific force does not point along the z axis of the IMU: the '
                 'attitude will be that of the axes as they are, however the IMU is mounted')
@@ -120,15 +120,14 @@ def _add_noise(imu: Surveyed, samples: Series, rest: tuple[float, float] | None,
     part = slice(None) if rest is None else slice(*np.searchsorted(times, rest))
     rate, force = values[part].mean(axis=0).reshape(2, 3)
     off_gravity = float(np.linalg.norm(force) - gravity)
-    widths = [_add_resolution(imu, sensor, triad)
-              for sensor, triad in zip(SENSORS, np.split(values, 2, axis=1))]
-    interval = float(np.median(np.diff(times)))
-    walks, lost = _walks(times[part], values[part], 0.5 if rest else QUIET).tolist(), [0.0, 0.0]
-    for k, width in enumerate(widths):
-        # Noise of half a quantum carries small values over it; less leaves an error that lasts.
-        if walks[k] < width * math.sqrt(interval):
-            lost[k] = width / math.sqrt(3.0)  # uniform, 1 sigma
-            walks[k] = max(walks[k], lost[k] * math.sqrt(interval))
+    widths = np.array([_add_resolution(imu, sensor, triad)
+                       for sensor, triad in zip(SENSORS, np.split(values, 2, axis=1))])
+    walks = _walks(times[part], values[part], 0.5 if rest else QUIET)
+    root = math.sqrt(np.median(np.diff(times)))
+    # Noise of half a quantum carries small values over it; less leaves an error that lasts.
+    hidden = walks < widths * root
+    lost = np.where(hidden, widths / math.sqrt(3.0), 0.0)  # uniform, 1 sigma
+    walks = np.maximum(walks, lost * root)
     # What the Earth's rate does not explain is bias, in whatever direction.
     bias = abs(float(np.linalg.norm(rate)) - EARTH_RATE) / math.sqrt(3.0)
     measured = ImuNoise(*walks, *map(math.hypot, lost, (bias, off_gravity) if rest else (0, 0)))
@@ -136,33 +135,33 @@ def _add_noise(imu: Surveyed, samples: Series, rest: tuple[float, float] | None,
     preset = PRESETS[grade if rest else Config.imu_grade]
     settings, biases = {}, {}
     # Other noise is measured by the alignment itself; what is rounded away does not look noisy.
-    if lost[0] and measured.angle_random_walk > preset.angle_random_walk:
+    if hidden[0] and measured.angle_random_walk > preset.angle_random_walk:
         settings['angle_random_walk'] = rounded(math.degrees(60.0 * measured.angle_random_walk))
-    if measured.gyro_bias_std > preset.gyro_bias_std * (1.0 if lost[0] else BIAS_SIGMAS):
+    if measured.gyro_bias_std > preset.gyro_bias_std * (1.0 if hidden[0] else BIAS_SIGMAS):
         biases['gyro_bias_std'] = rounded(math.degrees(measured.gyro_bias_std))
     if measured.accel_bias_std > preset.accel_bias_std * BIAS_SIGMAS:
         biases['accel_bias_std'] = rounded(measured.accel_bias_std)
-    shown = [f'{walk / sensor.walk_size:.2g} {sensor.walk_unit}' + ' of rounding' * (hidden > 0.0)
-             for walk, hidden, sensor in zip(walks, lost, SENSORS)]
+    shown = [f'{walk / sensor.walk_size:.2g} {sensor.walk_unit}' + ' of rounding' * bool(rounding)
+             for walk, rounding, sensor in zip(walks, hidden, SENSORS)]
     imu.add(f'noise: {", ".join(shown)}' + ('' if rest else ' at most, measured in motion'),
             settings if rest else settings | biases,
-            angle_random_walk=math.degrees(60.0 * walks[0]), velocity_random_walk=60.0 * walks[1])
+            angle_random_walk=math.degrees(60.0 * walks[0]),
+            velocity_random_walk=float(60.0 * walks[1]))
     if rest is None:
         imu.add(f'imu_grade: {Config.imu_grade} is the default; not seen at rest, which would '
                 'show biases' + f'; its noise is no worse than that of {grade}' * covers,
                 imu_grade=grade)
         return
     degrees_s = np.degrees(rate).tolist()
-    within = [f' +- {width / sensor.size:.2g}' * (hidden > 0.0)
-              for width, hidden, sensor in zip(widths, lost, SENSORS)]
+    within = [f' +- {width / sensor.size:.2g}' * bool(rounding)
+              for width, rounding, sensor in zip(widths, hidden, SENSORS)]
     imu.add(f'at rest for {rest[1] - rest[0]:.0f} s: rate '
             f'({", ".join(f"{each:+.4f}" for each in degrees_s)}){within[0]} deg/s, specific '
             f'force {off_gravity:+.3f}{within[1]} m/s^2 off gravity', biases,
             rest_s=rest[1] - rest[0], rest_rate_deg_s=degrees_s, rest_force_error=off_gravity)
-    noisy = any(walk > NOISE_MARGIN * limit and not hidden
-                for walk, limit, hidden in zip(walks, preset, lost))
+    noisy = np.any(~hidden & (walks > NOISE_MARGIN * np.array(preset[:2])))
     imu.add(f'suits imu_grade {grade}' if covers else f'worse than imu_grade {grade}'
-            + ': more noise is measured while aligning' * noisy,
+            + ': more noise is measured while aligning' * bool(noisy),
             {} if grade == Config.imu_grade else
             {'imu_grade': grade, **(CHIP_THRESHOLDS if grade == 'chip' else {})},
             imu_grade=grade)
@@ -326,12 +325,13 @@ def fit_motion(samples: Series, velocities: Series, gravity: float,
     imu = _Imu(times, *np.split(values, 2, axis=1))
     epochs, v_n = velocities.times[windows], velocities.vectors[windows]
     good = np.ones(windows.shape)
-    costs, _, turn_std = zip(*(_fit(imu, epochs - delay, v_n, good, gravity) for delay in delays))
+    costs, left, turn_std = zip(*(
+        _fit(imu, epochs - delay, v_n, good, gravity) for delay in delays))
     # Steady motion leaves the heading open, and with it tells nothing of the delay.
     telling = np.median(turn_std, axis=0) < MAX_TURN_STD
     coarse = -1.5 * windows.shape[1] * np.log(costs)[:, telling]
     place = int(np.argmax(coarse.sum(axis=1)))
-    size = np.linalg.norm(_fit(imu, epochs - delays[place], v_n, good, gravity)[1], axis=2)
+    size = np.linalg.norm(left[place], axis=2)
     good = (size < OUTLIER * np.median(size)).astype(float)
     # Once more around the best one, without outliers.
     near = delays[place] + (DELAYS[1] - DELAYS[0]) * np.arange(-1.0, 2.0)

@@ -34,8 +34,8 @@ from ins_align.mounting import find_mounting, FixedFrames, Mounting
 from ins_align.recordings import BagError, listed, Topic
 from ins_align.recordings.bag import Bag, Block
 from ins_align.recordings.decode import (
-    decode_gnss, decode_imu, deserialize, FIX_TYPE, Gnss, IMU_TYPE, ImuSamples, short_name,
-    VECTOR_TYPE, VELOCITY_TYPES)
+    decode, decode_imu, deserialize, FIX_TYPE, Gnss, IMU_TYPE, ImuSamples, short_name, VECTOR_TYPE,
+    VELOCITY_TYPES)
 from ins_align.results import Severity
 import numpy as np
 
@@ -142,20 +142,19 @@ def _frame_id(bag: Bag, topic: Topic) -> str:
 def _decoded(block: Block, wanted: list[Topic], topics: Topics, config: Config, done: float,
              warnings: tuple[str, ...]) -> Part:
     """Decode a block, the messages of a topic all at once."""
-    messages = dict(zip(wanted, block.messages))
-    samples = decode_imu(messages[topics.imu], topics.imu)
+    decoded = {topic: decode(messages, topic, config)
+               for topic, messages in zip(wanted, block.messages)}
+    samples = decoded[topics.imu]['imu']
     before = np.zeros(block.topics.size, np.int64)
     before[block.topics == wanted.index(topics.imu)] = samples.decoded
     before = np.cumsum(before)
     gnss: list[tuple[int, Gnss]] = []
-    for topic in dict.fromkeys(filter(None, (topics.fix, topics.velocity))):
-        found = decode_gnss(messages[topic], topic, config)
-        places = np.flatnonzero(block.topics == wanted.index(topic)).tolist()
-        for kind, source in (('fix', topics.fix), ('velocity', topics.velocity)):
-            if topic is source:
-                gnss += zip(places, found[kind])
+    for kind, topic in (('fix', topics.fix), ('velocity', topics.velocity)):
+        if topic is not None:
+            places = np.flatnonzero(block.topics == wanted.index(topic))
+            gnss += zip(places.tolist(), decoded[topic][kind])
     gnss.sort(key=itemgetter(0))
-    reference = (decode_imu(messages[topics.reference], topics.reference) if topics.reference
+    reference = (decoded[topics.reference]['imu'] if topics.reference
                  else decode_imu((), topics.imu))
     return Part(topics, config, samples,
                 tuple((int(before[place]), message) for place, message in gnss), reference, done,

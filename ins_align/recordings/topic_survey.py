@@ -29,8 +29,7 @@ from ins_align.gnss.motion import Series, series_of
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.recordings import Topic
 from ins_align.recordings.bag import Bag
-from ins_align.recordings.decode import (
-    decode_gnss, decode_imu, Gnss, ImuSamples, KINDS, Refused)
+from ins_align.recordings.decode import decode, Gnss, ImuSamples, KINDS, Refused
 from ins_align.recordings.reader import candidates, doubt
 import numpy as np
 
@@ -216,8 +215,7 @@ def read_candidates(bag: Bag) -> list[Recorded]:
             counts[topic] += len(messages)
             times_ns = block.times_ns[block.topics == number]
             # Frames in their headers may be wrong: the motion will tell.
-            decoded = ({'imu': decode_imu(messages, topic)} if KINDS[topic.msgtype] == ('imu',)
-                       else decode_gnss(messages, topic, Config(velocity_frame='enu')))
+            decoded = decode(messages, topic, Config(velocity_frame='enu'))
             for kind, data in decoded.items():
                 parts[topic, kind].append(columns_of(times_ns, data))
     return [Recorded(topic, kind, bag.start_ns, first.get(topic), counts[topic],
