@@ -91,7 +91,7 @@ def gnss_ahead(seconds):
 
 
 def command_of(info):
-    assert info.command is not None, info.obstacles
+    assert info.command is not None, info.faults
     arguments = shlex.split(info.command)
     assert arguments[:3] == ['ins_align', 'replay', info.bag]
     return arguments[3:]
@@ -101,7 +101,7 @@ def test_good_recording(drive):
     path, _ = drive
     info = inspect(path)
     assert command_of(info) == ['--set', 'imu_grade=tactical']
-    assert info.obstacles == info.warnings == ()
+    assert info.faults == [] and info.warnings == ()
     assert [topic.name for topic in info.topics] == list(TOPICS)
     imu, fix, velocity = info.topics
     assert imu.figures['messages'] == 3001 and imu.figures['rate_hz'] == pytest.approx(50.0)
@@ -272,7 +272,7 @@ def test_units_of_the_imu(changed, factors, word):
     info = inspect(changed(change))
     assert word in by_name(info, '/imu/data_raw').faults[0]
     assert info.command is None
-    assert word in info.obstacles[0]
+    assert word in info.faults[0]
 
 
 def test_late_messages(changed):
@@ -286,7 +286,7 @@ def test_late_messages(changed):
 def test_different_clocks(changed):
     info = inspect(changed(gnss_ahead(-1_000_000)))
     assert info.command is None
-    assert 'different clocks' in info.obstacles[0]
+    assert 'different clocks' in info.faults[0]
 
 
 def test_stamps_gone_astray(changed):
@@ -361,7 +361,7 @@ def test_an_imu_that_is_too_slow(changed, drive):
     start = drive[1][0][1]
     info = inspect(changed(lambda name, time, message: [] if name == '/imu/data_raw' and (
         (time - start) % 1_000_000_000 >= 10_000_000) else None))
-    assert info.command is None and 'its rate is 1 Hz' in info.obstacles[0]
+    assert info.command is None and 'its rate is 1 Hz' in info.faults[0]
 
 
 @pytest.mark.parametrize('ahead', [3, -3])
@@ -409,15 +409,15 @@ def test_an_imu_that_says_it_does_not_measure(changed):
     assert 'does not measure' in by_name(two, '/imu/data_raw').faults[0]
 
 
-@pytest.mark.parametrize('latitude, status, obstacle', [
+@pytest.mark.parametrize('latitude, status, fault', [
     (math.nan, 0, 'numbers that can be used'), (48.0, -1, 'no message has a fix')])
-def test_positions_that_are_none(changed, latitude, status, obstacle):
+def test_positions_that_are_none(changed, latitude, status, fault):
     def change(name, time, message):
         if name == '/fix':
             message.latitude, message.status.status = latitude, status
 
     info = inspect(changed(change))
-    assert info.command is None and obstacle in info.obstacles[0]
+    assert info.command is None and fault in info.faults[0]
 
 
 @pytest.mark.parametrize('topics', [{'/fix': FIX}, {'/imu': IMU}, {'/fix_velocity': TWIST}, {
@@ -425,7 +425,7 @@ def test_positions_that_are_none(changed, latitude, status, obstacle):
 def test_topics_that_are_missing(tmp_path, topics):
     info = inspect(write_recording(tmp_path / 'a', 'mcap', 6.0, topics))
     assert info.command is None
-    assert 'has no ' in info.obstacles[-1]
+    assert 'has no ' in info.faults[-1]
     assert 'it cannot be aligned' in describe(info)
     assert ('positions alone' in describe(info)) == (topics == {'/fix': FIX})
     json.dumps(info.to_json(), allow_nan=False)
@@ -453,7 +453,7 @@ def test_positions_without_an_altitude(changed):
 
     info = inspect(changed(change))
     assert by_name(info, '/fix').figures['usable_share'] == 1.0
-    assert info.command is not None and not info.obstacles
+    assert info.command is not None and not info.faults
     assert by_name(info, '/fix_velocity').figures['frame'] == 'enu'
 
 

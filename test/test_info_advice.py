@@ -43,7 +43,7 @@ def inspected(simulation, path, **changes):
 
 def settings_of(info):
     """Return the parameters that the command sets."""
-    assert info.command is not None, info.obstacles
+    assert info.command is not None, info.faults
     words = shlex.split(info.command)
     return dict(words[k + 1].split('=') for k, word in enumerate(words) if word == '--set')
 
@@ -182,7 +182,7 @@ def test_a_chip_aligns_with_thresholds_that_it_reaches(tmp_path, seed):
 def test_of_rates_in_degrees_nothing_is_told_in_degrees(tmp_path):
     truth = drive(duration=60.0)
     info = inspected(truth, tmp_path / 'a', gyro=np.degrees(truth.gyro))
-    assert info.command is None and 'look like deg/s: they must be rad/s' in info.obstacles[0]
+    assert info.command is None and 'look like deg/s: they must be rad/s' in info.faults[0]
     assert not {'max_rate_deg_s', 'rest_rate_deg_s', 'angle_random_walk'} & set(imu_of(info))
 
 

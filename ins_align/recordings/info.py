@@ -67,14 +67,13 @@ NOT_LOOKED_FOR = (
 
 @dataclass
 class Info(Surveyed):
-    """What is known of a recording before an alignment."""
+    """What is known of a recording before an alignment; its faults are why it cannot be aligned."""
 
     bag: str
     duration_s: float
     start_ns: int
     topics: tuple[Recorded, ...]
     chosen: dict[str, str | None]  # topic by kind that the command reads
-    obstacles: tuple[str, ...] = ()  # why it cannot be aligned
     command: str | None = None  # to align it, quoted for a shell; None: it cannot be
     warnings: tuple[str, ...] = ()
 
@@ -87,9 +86,9 @@ def inspect(path: str | os.PathLike[str]) -> Info:
     """Tell what a recording holds; a BagError says that it cannot be read at all."""
     with Bag(path) as bag:
         candidates = read_candidates(bag)
-        imus, fixes, velocities = topics = [
+        imus, fixes, velocities = (
             [data for data in candidates if data.kind == kind]
-            for kind in ('imu', 'fix', 'velocity')]
+            for kind in ('imu', 'fix', 'velocity'))
         positions, gravity = _survey_fixes(fixes, velocities)
         for data in velocities:
             if data.stamps_ns.size:
@@ -109,21 +108,22 @@ def inspect(path: str | os.PathLike[str]) -> Info:
         end_ns = max([bag.end_ns, *(
             int(data.recorded_ns.max()) for data in candidates if data.recorded_ns.size)])
         info = Info(str(bag.path), (end_ns - bag.start_ns) * 1e-9, bag.start_ns,
-                    tuple(data for of_kind in topics for data in of_kind),
+                    (*imus, *fixes, *velocities),
                     {kind: data and data.name for kind, data in chosen.items()})
         _add_manoeuvres(info, grid)
-        obstacles = [f'{data.name} cannot be used: {data.faults[0]}'
-                     for data in chosen.values() if data is not None and data.faults]
+        for data in filter(None, chosen.values()):
+            if data.faults:
+                info.add(f'{data.name} cannot be used: {data.faults[0]}', fault=True)
         if velocity is None:
             info.add('there is no velocity that can be used: it is aligned from positions alone, '
                      'which takes longer unless they are RTK' * (fix is not None),
                      {'use_velocity': False} if velocities else {})
         gnss = [data for data in (fix, velocity) if data is not None]
         if imu is not None and gnss:
-            obstacles += _different_clocks(imu, gnss)
-            if not obstacles:
+            _add_clocks(info, imu, gnss)
+            if not info.faults:
                 _add_timing(info, imu, gnss, motion, gravity)
-        _propose(info, bag, chosen, obstacles)
+        _propose(info, bag, chosen)
     return info
 
 
@@ -214,12 +214,14 @@ def _add_manoeuvres(info: Info, velocities: Series) -> None:
              first_manoeuvre_s=first)
 
 
-def _different_clocks(imu: Recorded, gnss: list[Recorded]) -> list[str]:
+def _add_clocks(info: Info, imu: Recorded, gnss: list[Recorded]) -> None:
     """Say which stamps are of another clock than those of the IMU."""
-    late = [(data, data.age_s - imu.age_s) for data in gnss if data.stamps_ns.size]
-    return [f'the stamps of {data.name} are {abs(age):.1f} s '
-            f'{"behind" if age > 0.0 else "ahead of"} those of {imu.name}: they are of different '
-            'clocks' for data, age in late if not -MAX_AHEAD < age < MAX_BEHIND]
+    for data in gnss:
+        age = data.age_s - imu.age_s
+        if data.stamps_ns.size and not -MAX_AHEAD < age < MAX_BEHIND:
+            info.add(f'the stamps of {data.name} are {abs(age):.1f} s '
+                     f'{"behind" if age > 0.0 else "ahead of"} those of {imu.name}: they are of '
+                     'different clocks', fault=True)
 
 
 def _add_timing(info: Info, imu: Recorded, gnss: list[Recorded], motion: Series, gravity: float,
@@ -272,8 +274,7 @@ def _lateness(imu: Recorded, gnss: list[Recorded]) -> float:
     return float(np.quantile(np.concatenate(late), 0.99))
 
 
-def _propose(info: Info, bag: Bag, chosen: dict[str, Recorded | None], obstacles: list[str],
-             ) -> None:
+def _propose(info: Info, bag: Bag, chosen: dict[str, Recorded | None]) -> None:
     """Set the command, tried as far as its choice of topics goes, or why there is none."""
     arguments = ['ins_align', 'replay', info.bag if info.bag[0] != '-' else f'./{info.bag}']
     names: dict[str, str] = {}
@@ -291,9 +292,9 @@ def _propose(info: Info, bag: Bag, chosen: dict[str, Recorded | None], obstacles
     try:
         choose_topics(bag, config_from_mapping(settings), **names)
     except BagError as error:
-        obstacles.append(str(error))
-    info.obstacles, info.warnings = tuple(obstacles), tuple(bag.warnings)
-    info.command = None if obstacles else shlex.join(arguments)
+        info.add(str(error), fault=True)
+    info.warnings = tuple(bag.warnings)
+    info.command = None if info.faults else shlex.join(arguments)
 
 
 def describe(info: Info) -> str:
@@ -304,12 +305,13 @@ def describe(info: Info) -> str:
     if info.topics:
         lines += ['', format_table(list(map(_row, info.topics)), [
             'topic', 'type', *(title for title, _ in COLUMNS.values())], '  ')]
-    for title, surveyed in (*((topic.name, topic) for topic in info.topics), ('together', info)):
-        lines += ['', f'  {title}', *(
-            f'    cannot be used: {fault}' for fault in surveyed.faults), *(
-            f'    {line}' for line in surveyed.lines)]
+    for topic in info.topics:
+        lines += ['', f'  {topic.name}',
+                  *(f'    cannot be used: {fault}' for fault in topic.faults),
+                  *(f'    {line}' for line in topic.lines)]
+    lines += ['', '  together', *(f'    {line}' for line in info.lines)]
     if info.command is None:
-        lines += ['', '  it cannot be aligned', *(f'    - {text}' for text in info.obstacles)]
+        lines += ['', '  it cannot be aligned', *(f'    - {fault}' for fault in info.faults)]
     else:
         lines += [f'    {NOT_LOOKED_FOR}', '',
                   '  to align it, with the lever arm added unless /tf_static has it: '
