@@ -35,8 +35,8 @@ from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.results import State, Status
 import numpy as np
 
-# rad/s: more than the 4000 deg/s that any usual gyroscope measures, unless few samples are.
-ANY_GYRO_RATE, TOO_FAST_SHARE = 70.0, 1e-3
+ANY_GYRO_RATE = 70.0  # rad/s: more than the 4000 deg/s that any usual gyroscope measures
+TOO_FAST_SHARE = 1e-3  # of the samples may be beyond that: spikes
 LENGTH_CELLS, MIN_LENGTHS = 20, 20  # of GRID s over which forces are summed up; sums to judge by
 SHORTER, AS_LONG = 0.85, 0.15  # a quarter of the sums is so short; within this they are right
 MIN_MISFIT = 0.1  # of the logarithm of a length: by so much exchanged positions fit better

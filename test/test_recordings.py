@@ -344,7 +344,10 @@ def test_imu_that_measures_nothing_is_no_candidate(tmp_path):
     messages = [(name, START_NS, make_imu(store, START_NS, (0, 0, 0), (0, 0, 0),
                                           measured=name == '/b')) for name in ('/a', '/b')]
     write_messages(tmp_path / 'a', 'mcap', messages, {'/a': IMU, '/b': IMU, '/fix': FIX})
-    assert topics_of(tmp_path, None).imu.name == '/b'
+    with Bag(tmp_path / 'a') as bag:
+        assert choose_topics(bag, Config()).imu.name == '/b'
+        warning, = bag.warnings
+        assert '/a cannot be used: its messages say that it does not measure angular' in warning
 
 
 def velocities(tmp_path, child='map', names=('/a', '/b', '/c')):

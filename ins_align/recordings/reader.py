@@ -21,7 +21,6 @@ import dataclasses
 import itertools
 from operator import itemgetter
 import os
-import re
 from typing import NamedTuple
 
 from ins_align.config import Config
@@ -43,8 +42,6 @@ TF_TYPE = 'tf2_msgs/msg/TFMessage'
 UNSTAMPED_TYPES = ['geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistWithCovariance',
                    'geometry_msgs/msg/Vector3']
 REFERENCE_NAMESPACE = '/reference/'
-# A Vector3Stamped may be a field, an angular rate or a force as well.
-VELOCITY_NAME = re.compile(r'(?!.*ang).*vel', re.IGNORECASE)
 REFERENCE_TOPIC = '/reference/imu'  # truth or the best that is known: to compare with, never input
 OPTIONS = {'IMU': '--imu-topic', 'position': '--fix-topic', 'velocity': '--velocity-topic'}
 
@@ -246,10 +243,16 @@ def _named(bag: Bag, what: str, types: list[str], name: str) -> Topic:
 
 def candidates(bag: Bag, types: Collection[str]) -> list[Topic]:
     """Return the topics of some types, without what is no measurement by its name."""
-    return [topic for topic in bag.topics if topic.msgtype in types
-            and REFERENCE_NAMESPACE not in topic.name
-            and 'cmd' not in topic.name.rsplit('/', 1)[-1]  # a wish: /cmd_vel
-            and (topic.msgtype != VECTOR_TYPE or VELOCITY_NAME.match(topic.name))]
+    found = []
+    for topic in bag.topics:
+        name = topic.name.lower()
+        reference = REFERENCE_NAMESPACE in topic.name
+        command = 'cmd' in topic.name.rsplit('/', 1)[-1]  # a wish: /cmd_vel
+        # A vector may be a field, an angular rate or a force as well.
+        other = topic.msgtype == VECTOR_TYPE and ('vel' not in name or 'ang' in name)
+        if topic.msgtype in types and not (reference or command or other):
+            found.append(topic)
+    return found
 
 
 def doubt(first: bytes | None, topic: Topic, config: Config = Config()) -> str:

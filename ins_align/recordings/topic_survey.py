@@ -82,6 +82,10 @@ class Columns(NamedTuple):
     sigmas: Array  # (N, 2), horizontal and vertical; nan where no covariance is stated
 
 
+NOTHING = Columns(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)),
+                  np.zeros(0, bool), np.zeros(0, bool), np.zeros((0, 2)))
+
+
 def columns_of(times_ns: np.ndarray, decoded: ImuSamples | Sequence[Gnss]) -> Columns:
     """Return what messages say, recorded at some times; what cannot be decoded is left out."""
     if isinstance(decoded, ImuSamples):
@@ -100,20 +104,9 @@ def columns_of(times_ns: np.ndarray, decoded: ImuSamples | Sequence[Gnss]) -> Co
     return Columns(*map(np.array, zip(*rows))) if rows else NOTHING
 
 
-NOTHING = Columns(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)),
-                  np.zeros(0, bool), np.zeros(0, bool), np.zeros((0, 2)))
-
-
 @dataclass(init=False)
 class Recorded(Surveyed):
-    """
-    A topic that an alignment could read, with all its messages in recorded order.
-
-    Figures of all are ``messages``, ``rate_hz``, ``first_s`` and ``last_s`` (recorded),
-    ``stamp_age_s`` (recorded time less the header's stamp, median), ``stamp_age_spread_s`` (98
-    percent of the ages lie within this), ``gaps``, ``longest_gap_s`` and ``longest_gap_start_s``;
-    all but the first are missing where there is no message. Seconds are those of the recording.
-    """
+    """A topic that an alignment could read, with all its messages in recorded order."""
 
     name: str
     msgtype: str
