@@ -94,17 +94,18 @@ def exchange_fault(positions_deg: Series, velocities: Series) -> str:
     as_sent, exchanged = (
         velocity_frame(velocities, without_wild_positions(track(
             Series(positions_deg.times, vectors[:, order])))) for order in ([0, 1, 2], [1, 0, 2]))
-    if exchanged.frame not in ('enu', 'ned') or as_sent.frame in ('enu', 'unknown'):
-        return ''
     # Velocities north-east-down would fit the positions as they are, in length too.
-    if as_sent.frame == 'ned' and _misfit(as_sent) < _misfit(exchanged) + MIN_MISFIT:
+    if (as_sent.frame in ('enu', 'unknown')
+            or _misfit(as_sent) <= _misfit(exchanged) + MIN_MISFIT):
         return ''
     return ('the GNSS velocity fits the change of position with latitude and longitude exchanged: '
             'they are exchanged in the positions')
 
 
 def _misfit(frame: VelocityFrame) -> float:
-    return abs(math.log(frame.speed_ratio or math.inf))
+    """Return the logarithm by which lengths differ; infinite where directions do not fit."""
+    ratio = frame.speed_ratio if frame.frame in ('enu', 'ned') else None
+    return abs(math.log(ratio)) if ratio else math.inf
 
 
 def beyond_the_poles(latitude_deg: float, longitude_deg: float) -> bool:

@@ -79,21 +79,7 @@ def make_twist(store, stamp_ns, velocity, frame_id='gps'):
 
 
 def write_messages(path, kind, messages, topics):
-    """
-    Write a recording.
-
-    Parameters
-    ----------
-    path : Path
-        To make: a directory, for ROS 1 a file.
-    kind : str
-        One of FORMATS.
-    messages : iterable of (topic's name, recorded time, message)
-        In the order in which they are to be written.
-    topics : dict
-        Message type by name.
-
-    """
+    """Write (topic's name, recorded time, message), of topics with a type, as one of FORMATS."""
     from rosbags import rosbag1, rosbag2
     ros1 = kind.startswith('ros1')
     store = typestore(ros1)
