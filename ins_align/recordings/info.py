@@ -67,7 +67,7 @@ NOT_LOOKED_FOR = (
 
 @dataclass
 class Info(Surveyed):
-    """What is known of a recording before an alignment; its faults are why it cannot be aligned."""
+    """What is known of a recording; its faults say why it cannot be aligned."""
 
     bag: str
     duration_s: float
@@ -132,9 +132,12 @@ def _survey_fixes(fixes: list[Recorded], velocities: list[Recorded]) -> tuple[Se
     for data in fixes:
         if data.stamps_ns.size and not data.usable.any():
             beyond = [beyond_the_poles(*place) for place in data.values[:, :2].tolist()]
-            data.add('no message has a fix' if data.figures['no_fix_share'] == 1.0 else
-                     BEYOND_THE_POLES if np.mean(beyond) > 0.5 else
-                     'no message has a fix and numbers that can be used', fault=True)
+            fault = 'no message has a fix and numbers that can be used'
+            if data.figures['no_fix_share'] == 1.0:
+                fault = 'no message has a fix'
+            elif np.mean(beyond) > 0.5:
+                fault = BEYOND_THE_POLES
+            data.add(fault, fault=True)
     fix = _best(fixes)
     if fix is None:
         return EMPTY, 9.81
@@ -174,8 +177,7 @@ def _survey_velocity(data: Recorded, positions: Series) -> None:
 def _survey_imu(data: Recorded, motion: Series, gravity: float, alone: bool) -> None:
     """Measure an IMU and find what makes it useless."""
     if data.doubt:
-        data.add(data.doubt + '; its numbers are used all the same (covariances that are not '
-                 'known are 0)' * alone, fault=not alone)
+        data.add(data.doubt + '; its numbers are used all the same' * alone, fault=not alone)
     rate, gap = (data.figures.get(name) for name in ('rate_hz', 'longest_gap_s'))
     if rate is not None and rate < MIN_RATE:
         data.add(f'its rate is {rate:.2g} Hz: an alignment starts over after '

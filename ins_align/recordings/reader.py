@@ -276,7 +276,8 @@ def doubt(first: bytes | None, topic: Topic, config: Config = Config()) -> str:
     unmeasured = ' and '.join(what for what, covariance in (
         ('angular rate', message.angular_velocity_covariance),
         ('specific force', message.linear_acceleration_covariance)) if covariance[0] == -1.0)
-    return unmeasured and f'its messages say that it does not measure {unmeasured} (covariance -1)'
+    return unmeasured and (f'its messages say that it does not measure {unmeasured} (covariance '
+                           '-1; 0 says that it is not known)')
 
 
 def _can_be_used(bag: Bag, topic: Topic, config: Config) -> bool:
