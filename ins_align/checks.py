@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Checks of units, axes and clocks that need no alignment: the same for node, replay and info.
+Checks of units, coordinates and clocks that need no alignment: for node, replay and info.
 
 What is found is said in sentences that tell what to set or to change.
 """

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Units, axes and clocks that are wrong: node, replay and info say the same sentence."""
+"""Units, coordinates and clocks that are wrong: node, replay and info say the same."""
 
 import dataclasses
 
