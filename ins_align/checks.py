@@ -128,7 +128,7 @@ class InputChecks:
         self._config = config
         self._cells: dict[int, Array] = {}  # count, sums of rate and specific force
         self._samples = self._too_fast = self._beyond_the_poles = 0
-        self._newest_ns: int | None = None
+        self._newest_ns: Index = np.zeros(0, np.int64)  # of the samples so far, if there are any
         self._late: deque[float] = deque(maxlen=10 * MIN_LATE)
         self._fixes: deque[tuple[float, ...]] = deque(maxlen=GNSS_MESSAGES)
         self._velocities: deque[tuple[float, ...]] = deque(maxlen=GNSS_MESSAGES)
@@ -141,15 +141,14 @@ class InputChecks:
         Stamps of IMU samples, ns, shape (N,), their rates, rad/s, and forces, m/s^2, shape (N, 3),
         as sent; GNSS messages, each with how many of the samples come before it.
         """
-        before = np.array([] if self._newest_ns is None else [self._newest_ns], np.int64)
-        newest = np.maximum.accumulate(np.concatenate([before, stamps_ns]))
+        newest = np.maximum.accumulate(np.concatenate([self._newest_ns, stamps_ns]))
         for count, message in gnss:
-            if place := count + before.size:
+            if place := count + self._newest_ns.size:
                 self._late.append((int(newest[place - 1]) - message.stamp_ns) * 1e-9)
             self._add_gnss(message)
         if stamps_ns.size:
             # The newest of these: a clock that was set back goes on from where it is.
-            self._newest_ns = int(stamps_ns.max())
+            self._newest_ns = stamps_ns.max(keepdims=True)
             self._add_imu(stamps_ns, gyro, accel)
 
     def _add_gnss(self, message: Fix | Velocity) -> None:

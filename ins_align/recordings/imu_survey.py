@@ -71,12 +71,11 @@ class Sensor(NamedTuple):
     name: str
     unit: str
     size: float
-    walk_unit: str
-    walk_size: float
+    walk_unit: str  # of 1 / 60 of that size in SI units
 
 
-SENSORS = (Sensor('gyroscopes', 'deg/s', math.radians(1.0), 'deg/sqrt(h)', math.radians(1.0) / 60),
-           Sensor('accelerometers', 'm/s^2', 1.0, 'm/s/sqrt(h)', 1.0 / 60.0))
+SENSORS = (Sensor('gyroscopes', 'deg/s', math.radians(1.0), 'deg/sqrt(h)'),
+           Sensor('accelerometers', 'm/s^2', 1.0, 'm/s/sqrt(h)'))
 
 
 def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: float) -> None:
@@ -141,7 +140,8 @@ def _add_noise(imu: Surveyed, samples: Series, rest: tuple[float, float] | None,
         biases['gyro_bias_std'] = rounded(math.degrees(measured.gyro_bias_std))
     if measured.accel_bias_std > preset.accel_bias_std * BIAS_SIGMAS:
         biases['accel_bias_std'] = rounded(measured.accel_bias_std)
-    shown = [f'{walk / sensor.walk_size:.2g} {sensor.walk_unit}' + ' of rounding' * bool(rounding)
+    shown = [f'{60.0 * walk / sensor.size:.2g} {sensor.walk_unit}'
+             + ' of rounding' * bool(rounding)
              for walk, rounding, sensor in zip(walks, hidden, SENSORS)]
     imu.add(f'noise: {", ".join(shown)}' + ('' if rest else ' at most, measured in motion'),
             settings if rest else settings | biases,
