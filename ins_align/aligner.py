@@ -32,7 +32,7 @@ from ins_align.estimation.declaration import Declaration, Fit
 from ins_align.estimation.formula import NoteMethod
 from ins_align.geometry.rotation import Array, Transform
 from ins_align.gnss.antenna import Antenna
-from ins_align.gnss.buffer import GnssBuffer, GnssEpoch, PAIR_NS
+from ins_align.gnss.buffer import GnssBuffer, GnssEpoch
 from ins_align.gnss.messages import AntennaEpoch, Fix, Velocity
 from ins_align.imu.buffer import ImuBuffer, NO_SAMPLE
 from ins_align.imu.noise import ForceCheck
@@ -47,6 +47,12 @@ DRY_INTERVAL_NS = 2_000_000_000
 # Positions alone are used when no velocity came for this long (ns).
 NO_VELOCITY_NS = 2_000_000_000
 MAX_WARNINGS = 100      # different sentences about messages that could not be used
+# Why messages were left out, by the end of the name under which they are counted.
+_LEFT_OUT = {'no_fix': 'without a fix', 'undecodable': 'that cannot be decoded',
+             'nan': 'without numbers or with impossible ones',
+             'duplicate': 'with the stamp of another (does the driver set stamps?)',
+             'late': 'further behind the IMU than gnss_lateness allows',
+             'ahead': 'far ahead of the IMU'}
 _DECLARED = {State.LEVELLED: 1, State.ALIGNED: 2}
 
 
@@ -87,8 +93,7 @@ class Aligner:
         """Forget everything but the counts."""
         lateness_ns = round(self.config.gnss_lateness * 1e9) + max(self._delay_ns, 0)
         self._imu = ImuBuffer(lateness_ns, self._counts, self.config.imu_noise)
-        self._gnss = GnssBuffer(lateness_ns, self._counts,
-                                0 if self.config.use_velocity is False else PAIR_NS)
+        self._gnss = GnssBuffer(lateness_ns, self._counts)
         self._refusal = ''                          # why velocities cannot be used
         self._first_t0_ns: int | None = None
         self._forget(None)
@@ -149,6 +154,9 @@ class Aligner:
     def add_velocity(self, velocity: Velocity) -> None:
         """Take a GNSS velocity."""
         self._refusal = ''
+        if self.config.use_velocity is False:
+            self._counts['velocity'] += 1
+            return
         self._gnss.add(velocity._replace(stamp_ns=velocity.stamp_ns - self._delay_ns),
                        self._imu.newest_ns)
 
@@ -232,7 +240,7 @@ class Aligner:
         """Process the messages that wait, as far as nothing late can precede them any more."""
         upto_ns = self._imu.settled_ns(last)
         if upto_ns is None:
-            if left_out := self._imu.left_out(self._counts_before):
+            if left_out := self._left_out('imu'):
                 self._wait(State.WAITING_FOR_IMU, f'no IMU sample of use yet: {left_out}')
             return
         self._imu.check(upto_ns)
@@ -250,7 +258,7 @@ class Aligner:
             if self._imu.silent:
                 self._wait(State.WAITING_FOR_IMU, NO_SAMPLE)
             elif self._first_fix_ns is None:
-                left_out = self._gnss.left_out('fix', self._counts_before)
+                left_out = self._left_out('fix')
                 self._wait(State.WAITING_FOR_GNSS,
                            'no GNSS position yet' + (left_out and f': {left_out}'))
 
@@ -357,7 +365,7 @@ class Aligner:
         wanted = config.use_velocity is not False
         alone = not wanted or (config.use_velocity == 'auto' and config.method != 'vif'
                                and epoch.stamp_ns - self._first_fix_ns >= NO_VELOCITY_NS)
-        no_velocity = self._refusal or self._gnss.left_out('velocity', self._counts_before)
+        no_velocity = self._refusal or self._left_out('velocity')
         if epoch.v_n is None and not alone:
             self._wait(State.WAITING_FOR_GNSS,
                        'no GNSS velocity yet' + (no_velocity and f': {no_velocity}'))
@@ -401,6 +409,17 @@ class Aligner:
             self._say_start_over(why)
             learnt = self._method.learnt()
         self._forget(learnt)
+
+    def _left_out(self, kind: str) -> str:
+        """List in words which messages of a kind were left out since the last start."""
+        parts = []
+        for ending, why in _LEFT_OUT.items():
+            name = f'{kind}_{ending}'
+            if count := self._counts[name] - self._counts_before[name]:
+                off_ns = self._gnss.off_ns.get(name)
+                off = '' if off_ns is None else f' (the last one by {off_ns * 1e-9:.1f} s)'
+                parts.append(f'{count} {why}{off}')
+        return ', '.join(parts)
 
     def _wait(self, state: State, reason: str) -> None:
         self._set_verdict(Verdict(state, reason))

@@ -119,6 +119,13 @@ def test_only_positions_wait_for_velocities_and_then_go_on(flight):
     assert normalised_error(aligner.status().initial, flight) < chi2.ppf(0.9999, 3)
 
 
+def test_velocities_that_are_not_wanted_are_counted_and_change_nothing(flight):
+    runs = [aligned(flight, velocity=velocity, use_velocity=False) for velocity in (True, False)]
+    assert runs[0][0].counts['velocity'] == len(flight.gnss_stamps_ns)
+    given, without = (aligner.status() for aligner, _ in runs)
+    assert np.array_equal(given.current.C_nb, without.current.C_nb)
+
+
 def test_only_velocities_wait_for_a_position(flight):
     aligner, epochs = aligned(flight, fix=False)
     assert epochs == [] and aligner.status().state is State.WAITING_FOR_GNSS
@@ -959,12 +966,13 @@ def test_covariances_of_any_size_break_nothing(flight):
     assert np.all(np.linalg.eigvalsh(initial.covariance) > 0)
 
 
-@pytest.mark.parametrize('none', (
-    np.zeros((3, 3)), -np.eye(3), np.diag([1.0, np.nan, 1.0]),
-    np.eye(3) + 2.0 * np.eye(3)[[1, 0, 2]]), ids=('zero', 'negative', 'nan', 'indefinite'))
-def test_a_covariance_that_is_none_is_not_known(flight, none):
+@pytest.mark.parametrize('sent, used', (
+    (np.zeros((3, 3)), None), (-np.eye(3), None), (np.diag([1.0, np.nan, 1.0]), None),
+    (np.eye(3) + 2.0 * np.eye(3)[[1, 0, 2]], np.diag([1.0, 1.0, 3.0]))),
+    ids=('zero', 'negative', 'nan', 'indefinite'))
+def test_of_a_covariance_that_is_none_the_variances_count(flight, sent, used):
     attitudes = []
-    for covariance in (none, None):
+    for covariance in (sent, used):
         aligner = Aligner(config_for(flight))
         for kind, payload in itertools.islice(flight.messages(), 1500):
             give(aligner, kind, payload if kind == 'imu'

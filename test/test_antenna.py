@@ -139,11 +139,6 @@ def test_a_receiver_that_has_measured_the_vertical_may_say_zero():
         assert np.array_equal(epoch.velocity_covariance, CORRELATED)
 
 
-def test_velocities_that_are_not_wanted_are_not_there():
-    antenna = Antenna(Config(use_velocity=False), Counter())
-    assert antenna.epoch(told(0, 0.0, (1.0, 2.0, 3.0))).v_n is None
-
-
 @pytest.mark.parametrize('silent, off, believed', [
     (1, 550.0, True), (1, 650.0, False), (9, 2950.0, True), (9, 3050.0, False)])
 def test_a_fix_may_be_further_off_after_a_silence(silent, off, believed):

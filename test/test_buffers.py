@@ -18,7 +18,7 @@ import math
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ins_align.gnss.buffer import GnssBuffer, PAIR_NS
+from ins_align.gnss.buffer import GnssBuffer
 from ins_align.gnss.messages import Fix, Velocity
 from ins_align.imu.buffer import ImuBuffer, KEPT_BEFORE, KEPT_NS
 import numpy as np
@@ -254,7 +254,7 @@ def test_epochs_are_released_in_order_up_to_a_stamp():
     for stamp in (50, 10, 40, 20, 30):
         buffer.add(fix(stamp), None)
     assert [e.stamp_ns for e in buffer.release(30)] == [10, 20, 30]
-    assert [e.stamp_ns for e in buffer.release(99)] == [40, 50]
+    assert [e.stamp_ns for e in buffer.release(99, last=True)] == [40, 50]
 
 
 @pytest.mark.parametrize('changes, reason', [
@@ -307,8 +307,7 @@ def test_duplicates_are_counted_and_the_first_is_kept():
 @pytest.mark.parametrize('late', (0, 30 * MS))
 def test_epochs_that_move_and_repeat_the_one_before_are_left_out(late):
     """A driver that sends what the receiver said last at a rate of its own."""
-    counts = Counter()
-    buffer = GnssBuffer(LATENESS, counts, PAIR_NS)
+    buffer, counts = gnss_buffer()
     said = [(48.0, 3.0), (48.0, 3.0), (48.1, 3.0), (48.1, 3.0), (48.1, 3.0), (48.1, 3.1)]
     for k, (latitude, north) in enumerate(said):
         buffer.add(fix(k * 200 * MS, latitude_deg=latitude), None)
@@ -324,18 +323,17 @@ def test_a_receiver_that_stands_or_says_half_repeats_nothing():
     """At rest some receivers hold position and velocity; positions alone may do so too."""
     buffer, counts = gnss_buffer()
     for k in range(3):
-        buffer.add(fix(k * MS), None)
-        buffer.add(velocity(k * MS, (0.0, 0.0, 0.0)), None)
-        buffer.add(fix((10 + k) * MS), None)
-        buffer.add(velocity((20 + k) * MS, (1.0, 2.0, 0.0)), None)
-    assert len(buffer.release(100 * MS)) == 9 and counts['gnss_repeated'] == 0
+        buffer.add(fix(k * 100 * MS), None)
+        buffer.add(velocity(k * 100 * MS, (0.0, 0.0, 0.0)), None)
+        buffer.add(fix((1000 + 100 * k) * MS), None)
+        buffer.add(velocity((2000 + 100 * k) * MS, (1.0, 2.0, 0.0)), None)
+    assert len(buffer.release(3000 * MS)) == 9 and counts['gnss_repeated'] == 0
 
 
 @pytest.mark.parametrize('late', (0, 30 * MS))
 def test_velocities_of_a_receiver_without_a_fix_are_left_out(late):
     """It sends zeros, or what it knew last, and some messages have no room to say so."""
-    counts = Counter()
-    buffer = GnssBuffer(LATENESS, counts, PAIR_NS)
+    buffer, counts = gnss_buffer()
     epochs = []
     for k in range(12):                                     # twice as many velocities as fixes
         if k % 2 == 0:
@@ -358,7 +356,7 @@ def test_velocities_of_a_receiver_without_a_fix_are_left_out(late):
 
 
 def test_what_is_behind_the_end_is_left_out_and_counted():
-    buffer = GnssBuffer(LATENESS, counts := Counter(), PAIR_NS)
+    buffer, counts = gnss_buffer()
     for k in range(4):
         buffer.add(fix(k * 1000 * MS), None)
     assert len(buffer.release(1000 * MS)) == 1 and counts['gnss_after_imu'] == 0
@@ -382,19 +380,15 @@ def test_gnss_without_imu_is_bounded():
     for k in range(12_000):
         buffer.add(velocity(k), None)
     assert counts['gnss_overflow'] == 2_000
-    released = buffer.release(12_000)
+    released = buffer.release(12_000, last=True)
     assert len(released) == 10_000
     assert (released[0].stamp_ns, released[-1].stamp_ns) == (2_000, 11_999)
-
-
-def pairing_buffer():
-    return GnssBuffer(LATENESS, Counter(), PAIR_NS)
 
 
 @pytest.mark.parametrize('late', (-30 * MS, 30 * MS))
 def test_fix_and_velocity_with_stamps_of_their_own_are_one_epoch(late):
     """At the velocity's stamp, the fix carried to it: 30 ms at 100 m/s are 3 m."""
-    buffer = pairing_buffer()
+    buffer, _ = gnss_buffer()
     for stamp, longitude in ((1000 * MS, 11.0), (1200 * MS, 11.1)):
         buffer.add(fix(stamp, longitude_deg=longitude), None)
         buffer.add(velocity(stamp + late, (0.0, 100.0, 10.0)), None)
@@ -408,7 +402,7 @@ def test_fix_and_velocity_with_stamps_of_their_own_are_one_epoch(late):
 
 
 def test_half_an_epoch_waits_for_the_other_half_and_not_for_ever():
-    buffer = pairing_buffer()
+    buffer, _ = gnss_buffer()
     buffer.add(fix(1000 * MS), None)
     assert buffer.release(1040 * MS) == [] and buffer.oldest_ns == 1000 * MS
     buffer.add(velocity(1045 * MS), None)
@@ -422,14 +416,14 @@ def test_half_an_epoch_waits_for_the_other_half_and_not_for_ever():
 
 
 def test_two_of_a_kind_are_no_pair():
-    buffer = pairing_buffer()
+    buffer, _ = gnss_buffer()
     for stamp in (1000 * MS, 1040 * MS):
         buffer.add(velocity(stamp), None)
     assert len(buffer.release(2000 * MS)) == 2
 
 
 def test_an_epoch_is_whole_whatever_comes_right_behind_it():
-    buffer = pairing_buffer()
+    buffer, _ = gnss_buffer()
     buffer.add(fix(0), None)
     for stamp in (0, 30 * MS):
         buffer.add(velocity(stamp), None)

@@ -17,7 +17,7 @@ from types import SimpleNamespace as Msg
 
 from ins_align.config import Config
 from ins_align.gnss.messages import (
-    _usable_covariances, fixes_from_msgs, imu_from_msg, MessageError, stamp_from_msg,
+    fixes_from_msgs, imu_from_msg, MessageError, sound_covariance, stamp_from_msg,
     velocities_from_msgs)
 import numpy as np
 import pytest
@@ -197,12 +197,13 @@ def test_other_frames_are_taken(frame):
 
 @pytest.mark.parametrize('variance', [1e-320, 1e-13])
 def test_variances_of_no_sensor_are_unknown(variance):
-    assert _usable_covariances(np.eye(3)[None] * variance, None) == [None]
-    filled, = _usable_covariances(np.diag([0.04, variance, 0.04])[None], (0.2, 0.3, 0.4))
-    np.testing.assert_allclose(filled, np.diag([0.04, 0.09, 0.04]))
+    assert sound_covariance(np.eye(3) * variance) is None
+    np.testing.assert_allclose(
+        sound_covariance(np.diag([0.04, variance, 0.04]), (0.2, 0.3, 0.4)),
+        np.diag([0.04, 0.09, 0.04]))
 
 
-def test_variances_beyond_all_bounds_stay_finite_in_products():
-    covariance = np.full((3, 3), 1e300) + np.diag([0.0, 0.0, 1e300])
-    usable, = _usable_covariances(covariance[None], None)
+@pytest.mark.parametrize('correlation', (0.0, 1e300))
+def test_variances_beyond_all_bounds_stay_finite_in_products(correlation):
+    usable = sound_covariance(np.full((3, 3), correlation) + np.diag([1e300, 1.0, 2e300]))
     assert np.isfinite(np.linalg.det(usable)) and np.linalg.det(usable) > 0.0

@@ -94,10 +94,8 @@ class Antenna:
 
     def epoch(self, message: GnssEpoch) -> AntennaEpoch | None:
         """Take what the receiver said at an epoch; None while the place is not known."""
-        config, velocity, fix = self._config, message.velocity, message.fix
-        v_n = None
-        if velocity is not None and config.use_velocity is not False:
-            v_n = np.asarray(velocity.velocity, float)
+        velocity, fix = message.velocity, message.fix
+        v_n = None if velocity is None else np.asarray(velocity.velocity, float)
         believed = self._locate(message.stamp_ns, fix, self._v_n if v_n is None else v_n)
         if self._place is None or self.jumped:
             return None

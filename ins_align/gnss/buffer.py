@@ -19,12 +19,12 @@ epoch is released once the IMU is far enough ahead of it, so that results depend
 and not on when somebody looked.
 """
 
-from collections import Counter, deque
+from collections import Counter
 import math
 from typing import NamedTuple
 
 from ins_align.geometry.earth import dead_reckon
-from ins_align.gnss.messages import Fix, usable, Velocity
+from ins_align.gnss.messages import Fix, NO_FIX, sound_covariance, usable, Velocity
 
 # A GNSS stamp this far ahead of the IMU comes from another clock (ns).
 MAX_AHEAD_NS = 10_000_000_000
@@ -36,11 +36,6 @@ STATUS_UNKNOWN = -2
 # A receiver without a fix does not know its velocity either, whatever it sends: none is taken
 # until the next fix, or for this long (ns).
 NO_FIX_NS = 2_000_000_000
-# Why messages were left out, by the end of the name under which they are counted.
-_LEFT_OUT = {'no_fix': 'without a fix', 'undecodable': 'that cannot be decoded',
-             'nan': 'without numbers',
-             'late': 'further behind the IMU than gnss_lateness allows',
-             'ahead': 'far ahead of the IMU'}
 
 
 class GnssEpoch(NamedTuple):
@@ -62,20 +57,19 @@ class GnssBuffer:
 
     They are counted, and so are epochs that only repeat the one before (``gnss_repeated``) or are
     behind the end of the IMU (``gnss_after_imu``), and velocities of a receiver that has no fix
-    (``velocity_no_fix``). A fix and a velocity no further apart than `pair_ns` are of one epoch.
+    (``velocity_no_fix``).
     """
 
-    def __init__(self, lateness_ns: int, counts: Counter[str], pair_ns: int = 0) -> None:
+    def __init__(self, lateness_ns: int, counts: Counter[str]) -> None:
         """Start empty."""
         self._lateness_ns = lateness_ns
         self._counts = counts
-        self._pair_ns = pair_ns
         self._pending: dict[int, GnssEpoch] = {}
         self._said: tuple[float, ...] = ()          # position and velocity, released last
-        self._fix_ns = -(1 << 62)                   # the last fix that was released
-        self._no_fix_ns: deque[int] = deque(maxlen=MAX_PENDING)
-        # How far from the newest IMU sample the last one was that is counted by a name.
-        self._off_ns: dict[str, int] = {}
+        # Since when the receiver says that it has no fix; None: it has one.
+        self._no_fix_ns: int | None = None
+        # By the name that counts them, how far the last one was from the newest IMU sample.
+        self.off_ns: dict[str, int] = {}
 
     def add(self, message: Fix | Velocity, imu_newest_ns: int | None) -> None:
         """Put a message into the epoch of its stamp, or count why not; of two the first counts."""
@@ -87,38 +81,27 @@ class GnssBuffer:
         off = behind_ns > self._lateness_ns or behind_ns < -MAX_AHEAD_NS
         if fault:
             self._counts[f'{kind}_{fault}'] += 1
-            if fault == 'no_fix' and not off:
-                self._no_fix_ns.append(stamp_ns)
-            return
-        if isinstance(message, Fix) and message.status == STATUS_UNKNOWN:
+            if fault == 'nan' or off:
+                return
+            message = Fix(stamp_ns, 0.0, 0.0, 0.0, None, NO_FIX)    # what else it says is nothing
+        elif isinstance(message, Fix) and message.status == STATUS_UNKNOWN:
             self._counts['fix_status_unknown'] += 1
         if isinstance(message, Fix) and not message.vertical:
             self._counts['fix_no_altitude'] += 1
         if off:
             name = f'{kind}_late' if behind_ns > 0 else f'{kind}_ahead'
             self._counts[name] += 1
-            self._off_ns[name] = abs(behind_ns)
+            self.off_ns[name] = abs(behind_ns)
             return
         if len(self._pending) >= MAX_PENDING:
             del self._pending[min(self._pending)]
             self._counts['gnss_overflow'] += 1
         epoch = self._pending.get(stamp_ns, GnssEpoch(stamp_ns))
-        if getattr(epoch, kind) is not None:
+        if getattr(epoch, kind) is None:
+            message = message._replace(covariance=sound_covariance(message.covariance))
+            self._pending[stamp_ns] = epoch._replace(**{kind: message})
+        elif not fault:
             self._counts[f'{kind}_duplicate'] += 1
-        else:
-            self._pending[stamp_ns] = (epoch._replace(fix=message) if isinstance(message, Fix)
-                                       else epoch._replace(velocity=message))
-
-    def left_out(self, kind: str, before: Counter[str]) -> str:
-        """List in words which of a kind, fix or velocity, were left out since counts `before`."""
-        parts = []
-        for ending, why in _LEFT_OUT.items():
-            name = f'{kind}_{ending}'
-            if count := self._counts[name] - before[name]:
-                off_ns = self._off_ns.get(name)
-                off = '' if off_ns is None else f' (the last one by {off_ns * 1e-9:.1f} s)'
-                parts.append(f'{count} {why}{off}')
-        return ', '.join(parts)
 
     @property
     def oldest_ns(self) -> int | None:
@@ -136,7 +119,7 @@ class GnssBuffer:
         released = []
         place = 0
         while place < len(stamps) and stamps[place] <= upto_ns:
-            paired_upto_ns = stamps[place] + self._pair_ns
+            paired_upto_ns = stamps[place] + PAIR_NS
             first, *close = (self._pending[stamp] for stamp in stamps[place:place + 2]
                              if stamp <= paired_upto_ns)
             epoch = _joined(first, *close)
@@ -147,30 +130,20 @@ class GnssBuffer:
             place += len(parts)
             fix = parts[0].fix or parts[-1].fix
             if fix is not None:
-                self._fix_ns = first.stamp_ns
-            if self._repeats(fix, epoch.velocity):
+                self._no_fix_ns = epoch.stamp_ns if fix.status == NO_FIX else None
+            if self._no_fix_ns is not None and epoch.stamp_ns - self._no_fix_ns <= NO_FIX_NS:
+                if epoch.velocity is not None:
+                    self._counts['velocity_no_fix'] += 1
+            elif self._repeats(fix, epoch.velocity):
                 self._counts['gnss_repeated'] += 1
-            elif self._is_without_fix(epoch):
-                self._counts['velocity_no_fix'] += 1
             else:
                 released.append(epoch)
         for stamp in stamps[:place]:
             del self._pending[stamp]
-        if self._no_fix_ns:
-            self._no_fix_ns = deque((stamp for stamp in self._no_fix_ns
-                                     if stamp > upto_ns - NO_FIX_NS), MAX_PENDING)
         if last:
             self._counts['gnss_after_imu'] += len(self._pending)
             self._pending.clear()
         return released
-
-    def _is_without_fix(self, epoch: GnssEpoch) -> bool:
-        """Whether an epoch is a velocity of a receiver that said last that it has no fix."""
-        upto_ns = epoch.stamp_ns + self._pair_ns
-        said_ns = max((stamp for stamp in self._no_fix_ns if stamp <= upto_ns),
-                      default=self._fix_ns)
-        return (epoch.fix is None and said_ns > self._fix_ns
-                and epoch.stamp_ns - said_ns <= NO_FIX_NS)
 
     def _repeats(self, fix: Fix | None, velocity: Velocity | None) -> bool:
         """

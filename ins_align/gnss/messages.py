@@ -47,6 +47,7 @@ _BODY_FRAME = re.compile(r'(?:^|[_\-/.])(?:base|body|chassis|footprint|imu|ins|v
 # brought between a tenth of a millimetre and a kilometre, or matrices of it have no inverse.
 SMALLEST_VARIANCE = 1e-12
 MIN_VARIANCE, MAX_VARIANCE = 1e-8, 1e6
+MIN_EIGENVALUE = 1e-9  # of possible correlations: less is rounding
 # Beyond these no receiver measures; such values would overflow the integrals (m/s, m).
 MAX_SPEED, MAX_ALTITUDE = 2000.0, 1e6
 NO_FIX = -1  # status
@@ -105,10 +106,8 @@ def usable(message: Fix | Velocity) -> tuple[Fix | Velocity, str]:
     Return what can be used of a message, and as what it is counted if nothing can be.
 
     That is ``no_fix``, ``nan`` or ''. A vertical that is nan, as in a 2D fix, becomes 0 and is
-    then not measured; a covariance that is none is not known.
+    then not measured. The covariance is not looked at.
     """
-    if message.covariance is not None and not _is_covariance(message.covariance):
-        message = message._replace(covariance=None)
     if isinstance(message, Velocity):
         east, north, up = message.velocity.tolist()
         if math.isnan(up):
@@ -126,11 +125,29 @@ def usable(message: Fix | Velocity) -> tuple[Fix | Velocity, str]:
     return message, '' if good else 'nan'
 
 
-def _is_covariance(matrix: Array) -> bool:
-    """Return whether a matrix, (3, 3), is positive definite (Sylvester's criterion)."""
-    (ee, en, eu), (_, nn, nu), (_, _, uu) = matrix.tolist()
-    return bool(min(ee, nn, uu) >= SMALLEST_VARIANCE and ee * nn > en * en and (
-        ee * (nn * uu - nu * nu) - en * (en * uu - eu * nu) + eu * (en * nu - eu * nn) > 0.0))
+def sound_covariance(sent: Array | None, default_std: Sequence[float] = ()) -> Array | None:
+    """
+    Return a covariance, (3, 3), that is symmetric and positive definite; None: nothing is known.
+
+    A variance that is 0 (or less than that of any sensor), negative (-1 marks "unknown") or not
+    finite is unknown. The default stands in for it unless all three are unknown; without a
+    default one makes all unknown. Impossible correlations are dropped.
+    """
+    if sent is None:
+        return None
+    variances = sent.diagonal().tolist()
+    known = [SMALLEST_VARIANCE <= variance < math.inf for variance in variances]
+    if not any(known) or not (default_std or all(known)):
+        return None
+    used = [min(max(variance, MIN_VARIANCE), MAX_VARIANCE) if is_known else default_std[axis] ** 2
+            for axis, (variance, is_known) in enumerate(zip(variances, known))]
+    # Impossible correlations must not turn into a negative variance in some direction.
+    if used == variances and sent[~np.eye(3, dtype=bool)].any() and (np.abs(sent) <= MAX_VARIANCE).all():
+        symmetric: Array = 0.5 * sent + 0.5 * sent.T
+        scale = 1.0 / np.sqrt(used)
+        if np.linalg.eigvalsh(symmetric * scale * scale[:, None])[0] > MIN_EIGENVALUE:
+            return symmetric
+    return np.diag(used)
 
 
 def numbers_of(message: Fix | Velocity) -> tuple[list[float], str]:
@@ -170,10 +187,10 @@ def fixes(stamps_ns: ArrayLike, places: ArrayLike, covariances: np.ndarray,
     as sent, m^2.
     """
     columns = (stamps_ns, *np.asarray(places, float).T, covariance_types, status)
-    return [Fix(stamp, latitude, longitude, altitude, covariance if kind != 0 else None, mode)
+    return [Fix(stamp, latitude, longitude, altitude,
+                sound_covariance(covariance) if kind != 0 else None, mode)
             for (stamp, latitude, longitude, altitude, kind, mode), covariance
-            in zip(zip(*(np.asarray(column).tolist() for column in columns)),
-                   _usable_covariances(covariances, None))]
+            in zip(zip(*(np.asarray(column).tolist() for column in columns)), covariances)]
 
 
 def velocities_from_msgs(msgs: Sequence[Any], config: Config) -> list[Velocity]:
@@ -202,11 +219,9 @@ def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
     """
     Make velocities of the columns of N messages that say that they are in a frame.
 
-    A variance that is 0 (or less than that of any sensor), negative (-1 marks "unknown") or not
-    finite takes the configured value; where all three are like that, the covariance is None.
     `linear`, (N, 3), m/s, is east, north, up or as ``config.velocity_frame`` says; covariances,
-    (N, 6, 6), are those of twists. The frame of a body is a MessageError, unless
-    ``config.velocity_frame`` says otherwise.
+    (N, 6, 6), are those of twists: see `sound_covariance`. The frame of a body is a MessageError,
+    unless ``config.velocity_frame`` says otherwise.
     """
     if config.velocity_frame == 'auto' and _BODY_FRAME.search(frame):
         raise MessageError(
@@ -214,43 +229,11 @@ def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
             'world frame, east-north-up or north-east-down; if it is in one, whatever its '
             'frame_id says, set velocity_frame to enu or ned')
     velocity = np.array(linear, dtype=float)
-    usable: list[np.ndarray | None] = [None] * len(velocity)
-    if covariances is not None:
-        covariances = covariances[:, :3, :3]
+    sent = [None] * len(velocity) if covariances is None else covariances[:, :3, :3]
     if config.velocity_frame == 'ned':
         velocity = enu_from_ned(velocity)
         if covariances is not None:
-            covariances = enu_from_ned(enu_from_ned(covariances).swapaxes(1, 2))
-    if covariances is not None:
-        usable = _usable_covariances(
-            covariances, (config.velocity_std, config.velocity_std, config.velocity_std_vertical))
-    return [Velocity(*columns) for columns in zip(np.asarray(stamps_ns).tolist(), velocity,
-                                                  usable)]
-
-
-def _usable_covariances(covariances: np.ndarray, default_std: tuple[float, float, float] | None,
-                        ) -> list[np.ndarray | None]:
-    """
-    Return symmetric positive definite covariances of those sent, None where nothing is known.
-
-    `default_std` stands in for single unknown variances; None: one makes all unknown.
-    """
-    variances = np.diagonal(covariances, axis1=1, axis2=2)
-    known = (variances >= SMALLEST_VARIANCE) & (variances < np.inf)
-    count = np.count_nonzero(known, axis=1)
-    default = np.array([std ** 2 for std in default_std or (1.0, 1.0, 1.0)])
-    filled = np.where(known, np.clip(variances, MIN_VARIANCE, MAX_VARIANCE), default)
-    usable = filled[:, :, None] * np.eye(3)
-    # Correlations without sense must not turn into a negative variance in some direction.
-    correlated = np.flatnonzero(
-        (count == 3) & (filled == variances).all(axis=1)
-        & covariances[:, ~np.eye(3, dtype=bool)].any(axis=1)
-        & np.isfinite(covariances).all(axis=(1, 2)))
-    if correlated.size:
-        symmetric = 0.5 * covariances[correlated]
-        symmetric += symmetric.transpose(0, 2, 1)
-        scale = 1.0 / np.sqrt(filled[correlated])
-        sound = np.linalg.eigvalsh(symmetric * scale[:, None, :] * scale[:, :, None])[:, 0] > 1e-9
-        usable[correlated[sound]] = symmetric[sound]
-    there = count == 3 if default_std is None else count > 0
-    return [usable[k] if there[k] else None for k in range(len(usable))]
+            sent = enu_from_ned(enu_from_ned(sent).swapaxes(1, 2))
+    stds = config.velocity_std, config.velocity_std, config.velocity_std_vertical
+    return [Velocity(stamp_ns, vector, sound_covariance(covariance, stds)) for
+            stamp_ns, vector, covariance in zip(np.asarray(stamps_ns).tolist(), velocity, sent)]

@@ -51,11 +51,6 @@ NOISE_EXCESS = 1.25
 KEPT_NS = max(NOISE_WINDOW_NS, round(1e9 * AGES[-1]))
 # How many IMU samples are cut at one go; those that an epoch looks back at count for a sixth.
 MAX_CUT_SAMPLES, LOOKED_AT = 6144, 6
-# Why samples were left out, by the name under which they are counted.
-_LEFT_OUT = {'imu_undecodable': 'that cannot be decoded',
-             'imu_nan': 'without numbers or with impossible ones',
-             'imu_duplicate': 'with the stamp of another (does the driver set stamps?)',
-             'imu_late': 'too late'}
 
 
 class Silence(NamedTuple):
@@ -238,11 +233,6 @@ class ImuBuffer:
         """Whether samples come, but for too long none that could be used."""
         return (self.newest_ns is not None and self.stamps.size > 0
                 and self.newest_ns - self._lateness_ns - int(self.stamps[-1]) > MAX_GAP_NS)
-
-    def left_out(self, before: Counter[str]) -> str:
-        """List in words what was left out since the counts were those `before`."""
-        return ', '.join(f'{count} {why}' for name, why in _LEFT_OUT.items()
-                         if (count := self._counts[name] - before[name]))
 
     def rates_since(self, stamp_ns: int) -> tuple[Index, Array, Array] | None:
         """
