@@ -24,7 +24,6 @@ depend on the messages alone and not on when `update` is called.
 """
 
 from collections import Counter
-from copy import copy
 
 from ins_align.config import Config, ConfigError, parameters
 from ins_align.estimation.bank import Bank, Learnt
@@ -60,20 +59,9 @@ class Aligner:
     """
     In-motion alignment from messages as they come.
 
-    Parameters
-    ----------
-    config : Config, optional
-        By default all parameters at their defaults.
-    base : Transform, optional
-        From the vehicle's frame to that of the IMU, of use with ``vehicle``; by default they are
-        the same.
-
-    Attributes
-    ----------
-    config : Config
-    declared : Attitude or None
-        The initial attitude as it was declared; None while none is.
-
+    By default all parameters have their defaults. `base` leads from the vehicle's frame to that of
+    the IMU, of use with ``vehicle``; by default they are the same. The attribute `declared` is the
+    initial attitude as it was declared, None while none is.
     """
 
     def __init__(self, config: Config | None = None, base: Transform | None = None) -> None:
@@ -118,34 +106,35 @@ class Aligner:
         self._initial: Attitude | None = None
         self._current: Attitude | None = None
         self.declared: Attitude | None = None
-        self._prediction: Prediction | None = None  # from `_current` on
 
     # Input: step 2
 
     def add_imu(self, stamp_ns: 'int | np.ndarray', gyro: Array, accel: Array) -> None:
         """
-        Take an IMU sample, or many.
+        Take an IMU sample, or N of them if stamps are an array, shape (N,).
 
-        Parameters
-        ----------
-        stamp_ns : int or ndarray, shape (N,)
-            Time of measurement.
-        gyro, accel : array_like, shape (3,) or (N, 3)
-            Angular rate, rad/s; specific force, m/s^2.
-
+        Angular rates, rad/s, and specific forces, m/s^2, have the shape (3,) or (N, 3).
         """
         if not isinstance(stamp_ns, np.ndarray):
-            self._imu.add(stamp_ns, gyro, accel)
-            if self._imu.jumped_to_ns is not None:
-                self._clock_jumped()
-                self._imu.add(stamp_ns, gyro, accel)
+            self._add_sample(stamp_ns, gyro, accel)
             return
         # Copies: they are used later.
         stamps_ns = np.array(stamp_ns, np.int64)
         gyro, accel = np.array(gyro, float), np.array(accel, float)
-        while (taken := self._imu.add_many(stamps_ns, gyro, accel)) < stamps_ns.size:
-            self._clock_jumped()
-            stamps_ns, gyro, accel = stamps_ns[taken:], gyro[taken:], accel[taken:]
+        if not self._imu.add_in_order(stamps_ns, gyro, accel):
+            for sample in zip(stamps_ns.tolist(), gyro, accel):
+                self._add_sample(*sample)
+
+    def _add_sample(self, stamp_ns: int, gyro: Array, accel: Array) -> None:
+        if self._imu.add(stamp_ns, gyro, accel):
+            return
+        since = self._imu.held
+        self._process()                             # what could have been asked for before
+        self._counts['clock_jumps'] += 1
+        # A recording that is played again says nothing new: what it said before is no prior.
+        self._start_over('the clock of the IMU jumped back')
+        for sample in since:
+            self._imu.add(*sample)
 
     def add_fix(self, fix: Fix) -> None:
         """Take a GNSS position."""
@@ -173,15 +162,6 @@ class Aligner:
         self._counts['resets'] += 1
         self._start_over(reason)
 
-    def _clock_jumped(self) -> None:
-        first = self._imu.suspect
-        self._process()                             # what could have been asked for before
-        self._counts['clock_jumps'] += 1
-        # A recording that is played again says nothing new: what it said before is no prior.
-        self._start_over('the clock of the IMU jumped back')
-        if first is not None:
-            self._imu.add(*first)
-
     def _start_over(self, why: str) -> None:
         self._say_start_over(why)
         self._forget_all()
@@ -191,15 +171,7 @@ class Aligner:
         self._events.append(Event(Severity.WARNING, self._started_over))
 
     def reconfigure(self, config: Config) -> None:
-        """
-        Change what may change while running: thresholds and hold time.
-
-        Raises
-        ------
-        ConfigError
-            If anything else differs.
-
-        """
+        """Change thresholds and hold time; ConfigError if anything else differs."""
         for parameter in parameters():
             if parameter.read_only and (getattr(config, parameter.name)
                                         != getattr(self.config, parameter.name)):
@@ -209,32 +181,19 @@ class Aligner:
 
     # Processing: steps 3 to 8
 
-    def update(self, dry: bool = False) -> list[Epoch]:
+    def update(self, dry: bool = False, last: bool = False) -> list[Epoch]:
         """
-        Process what nothing late can precede any more.
+        Process what nothing late can precede any more; return the epochs since the last call.
 
-        Parameters
-        ----------
-        dry : bool
-            Whether to return the epochs without measurement that divide an outage, too.
-
-        Returns
-        -------
-        list of Epoch
-            Those that were not returned yet.
-
+        `dry`: with those without measurement that divide an outage; `last`: nothing comes any more.
         """
-        self._process()
-        return self._take_done(dry)
+        self._process(last)
+        done, self._done = self._done, []
+        return [epoch for epoch in done if dry or not epoch.dry]
 
     def flush(self, dry: bool = False) -> list[Epoch]:
         """Process the rest, at the end of a recording; otherwise as `update`."""
-        self._process(last=True)
-        return self._take_done(dry)
-
-    def _take_done(self, dry: bool) -> list[Epoch]:
-        done, self._done = self._done, []
-        return [epoch for epoch in done if dry or not epoch.dry]
+        return self.update(dry, last=True)
 
     def _process(self, last: bool = False) -> None:
         """Process the messages that wait, as far as nothing late can precede them any more."""
@@ -334,7 +293,7 @@ class Aligner:
         """Take over the attitudes after an epoch; return the verdict of the declaration."""
         stamp_ns, declaration = epoch.stamp_ns, self._declaration
         initial, current = method.initial(), method.current()
-        self._initial = self._current = self._prediction = None
+        self._initial = self._current = None
         measured = epoch.v_n is not None or epoch.position_measured
         if measured:
             self._measured_ns = stamp_ns
@@ -455,27 +414,22 @@ class Aligner:
         None before there is one, and after a gap of the IMU.
         """
         prediction = self.prediction()
-        return None if prediction is None else Attitude(prediction.stamp_ns,
-                                                        *prediction.matrices())
+        return None if prediction is None else prediction.attitude()
 
     def prediction(self) -> Prediction | None:
-        """Return the attitude at the newest IMU sample, for the caller to carry on."""
+        """Return the attitude at the newest IMU sample, to be carried on; None after a gap."""
         current, method = self._current, self._method
         if current is None or method is None:
             return None
-        since = self._imu.rates_since(
-            current.stamp_ns if self._prediction is None else self._prediction.stamp_ns)
-        if since is None:
-            return None                             # nobody knows how it has turned since
-        stamps, rates, rate = since
-        if self._prediction is None:
-            sensors = method.sensor_errors()
-            self._prediction = Prediction(
-                current, sensors.gyro_bias, sensors.gyro_matrix,
-                float(np.max(method.nuisance().gyro_bias_std)),
-                self.config.imu_noise.angle_random_walk, rate)
-        self._prediction.carry_many(stamps, rates)
-        return copy(self._prediction)
+        stamps, rates, rate = self._imu.rates_since(current.stamp_ns)
+        sensors = method.sensor_errors()
+        prediction = Prediction(
+            current, sensors.gyro_bias, sensors.gyro_matrix,
+            float(np.max(method.nuisance().gyro_bias_std)),
+            self.config.imu_noise.angle_random_walk, rate)
+        carried = all(prediction.carry(*sample)
+                      for sample in zip(stamps.tolist(), rates.tolist()))
+        return prediction if carried else None
 
     @property
     def counts(self) -> Counter[str]:

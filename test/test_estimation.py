@@ -200,7 +200,7 @@ def prepared(s, *, velocity=True, **changes):
         messages.add(fix._replace(stamp_ns=fix.stamp_ns - delay_ns), None)
         if velocity:
             messages.add(measured._replace(stamp_ns=measured.stamp_ns - delay_ns), None)
-    samples.add_many(s.imu_stamps_ns, s.gyro, s.accel)
+    samples.add_in_order(s.imu_stamps_ns, s.gyro, s.accel)
     antenna = Antenna(config, counts)
     first, *epochs = map(antenna.epoch, messages.release(samples.settled_ns(True), True))
     bank = Bank(config, first, samples.start(first.stamp_ns).integrated(), not velocity)

@@ -31,7 +31,7 @@ def cut(stamps_ns, samples, epochs=EPOCHS, drift=0.0):
     """Cut samples at the epochs behind the first one; return what comes of it, and the counts."""
     counts = Counter()
     buffer = ImuBuffer(0, counts, ImuNoise(*STATED, gyro_bias_std=0.0, accel_bias_std=0.0))
-    buffer.add_many(stamps_ns, samples[:, :3], samples[:, 3:])
+    buffer.add_in_order(stamps_ns, samples[:, :3], samples[:, 3:])
     buffer.consolidate()
     buffer.check(int(epochs[-1]))
     buffer.start(epochs[0])

@@ -98,89 +98,86 @@ class ImuBuffer:
         # What is not sorted into these yet: stamps and samples, of one sample or of many.
         self._new: list[tuple[ArrayLike, ArrayLike]] = []
         self.newest_ns: int | None = None           # that has come
-        # A sample from long ago, until the next one shows whether the clock was set back there.
-        self.suspect: tuple[int, Array, Array] | None = None
-        # A sample far ahead of the others, until the next one shows whether time goes on there.
-        self._ahead: tuple[int, Array, Array] | None = None
-        # The samples in a row behind the newest one: that one, the first, the last, how many.
-        self._behind: tuple[int | None, int, int, int] = None, 0, 0, 0
-        self.jumped_to_ns: int | None = None        # where the clock has jumped back to
+        # Samples that may be of another clock, until those behind them tell: one far ahead of the
+        # newest, or some in a row behind it.
+        self.held: list[tuple[int, Array, Array]] = []
         # Up to here samples are cut: what comes later and is older is late.
         self.used_ns = -(1 << 62)
         self._range = RangeCheck()
         self._checked_ns = 0                # up to where it has seen them
         self._silences: list[Silence] = []
 
-    def add(self, stamp_ns: int, gyro: Array, accel: Array) -> None:
-        """Append one sample."""
-        if self._ahead is not None:
-            ahead, self._ahead = self._ahead, None
+    def add(self, stamp_ns: int, gyro: Array, accel: Array) -> bool:
+        """Take a sample; False: the clock was set back to those that are `held`."""
+        sample = stamp_ns, gyro, accel
+        if self.newest_ns is None:
+            self._append(sample)
+            return True
+        if self.held and self.held[0][0] > self.newest_ns:
+            ahead = self.held.pop()
             if stamp_ns >= ahead[0] - self._lateness_ns:
-                self._append(*ahead)
+                self._append(ahead)             # time goes on there
             else:
                 self._counts['imu_ahead'] += 1
-        if self.newest_ns is not None and stamp_ns > self.newest_ns + self._reach_ns:
-            self._ahead = stamp_ns, gyro, accel
+        behind_ns = self.newest_ns - stamp_ns
+        if behind_ns > 0:
+            if self.held and not 0 < stamp_ns - self.held[-1][0] < 1_000_000_000:
+                self._let_go()
+            self.held.append(sample)
+            return not self._set_back(behind_ns > self._lateness_ns)
+        self._let_go()
+        if behind_ns < -self._reach_ns:
+            self.held.append(sample)
         else:
-            self._append(stamp_ns, gyro, accel)
+            self._append(sample)
+        return True
 
-    def _append(self, stamp_ns: int, gyro: Array, accel: Array) -> None:
-        newest = self.newest_ns
-        if newest is not None and stamp_ns < newest - self._lateness_ns:
-            # One sample from long ago is late; a second one after it means a clock set back.
-            if self.suspect is not None and 0 <= stamp_ns - self.suspect[0] < 1_000_000_000:
-                self._counts['imu_late'] -= 1
-                self.jumped_to_ns = stamp_ns
-            else:
-                self.suspect = stamp_ns, gyro, accel
-                self._counts['imu_late'] += 1
-            return
-        self.suspect = None
-        if newest is None or stamp_ns > newest:
-            self.newest_ns = stamp_ns
-        elif stamp_ns < newest:
-            self._counts['imu_out_of_order'] += 1
-            if self._set_back(stamp_ns):
-                self.jumped_to_ns = stamp_ns
-                return
+    def add_in_order(self, stamps_ns: Index, gyro: Array, accel: Array) -> bool:
+        """
+        Take samples, shapes (N,), (N, 3), (N, 3), if all of them go on from the newest one.
+
+        False: they do not, and none is taken.
+        """
+        newest_ns = stamps_ns[:1] - 1 if self.newest_ns is None else self.newest_ns
+        gaps_ns = np.diff(stamps_ns, prepend=newest_ns)
+        if self.held or np.any((gaps_ns <= 0) | (gaps_ns > self._reach_ns)):
+            return False
+        if stamps_ns.size:
+            self._new.append((stamps_ns, np.hstack([gyro, accel])))
+            self.newest_ns = int(stamps_ns[-1])
+        return True
+
+    def _append(self, sample: tuple[int, Array, Array]) -> None:
+        stamp_ns, gyro, accel = sample
         self._new.append(((stamp_ns,), ((*gyro, *accel),)))
+        if self.newest_ns is None or stamp_ns > self.newest_ns:
+            self.newest_ns = stamp_ns
 
-    def add_many(self, stamps_ns: np.ndarray, gyro: Array, accel: Array) -> int:
-        """
-        Append samples, shapes (N,), (N, 3), (N, 3); the same as one by one.
-
-        Returns how many were taken: all, or those before the one at which the clock has jumped.
-        """
-        if stamps_ns.size == 0:
-            return 0
-        before_ns = self.newest_ns if stamps_ns.size == 1 else stamps_ns[-2]
-        ordered = (self._ahead is None and (stamps_ns[1:] > stamps_ns[:-1]).all()
-                   and (self.newest_ns is None or stamps_ns[0] > self.newest_ns)
-                   and (before_ns is None or stamps_ns[-1] <= before_ns + self._reach_ns))
-        if not ordered:
-            for k, (stamp_ns, g, a) in enumerate(zip(stamps_ns.tolist(), gyro, accel)):
-                self.add(stamp_ns, g, a)
-                if self.jumped_to_ns is not None:
-                    return k
-            return int(stamps_ns.size)
-        self.suspect = None
-        self._new.append((stamps_ns, np.hstack([gyro, accel])))
-        self.newest_ns = int(stamps_ns[-1])
-        return int(stamps_ns.size)
-
-    def _set_back(self, stamp_ns: int) -> bool:
-        """Whether samples behind the newest one are of a clock that was set back a little."""
-        newest, first, last, number = self._behind
-        if newest != self.newest_ns or stamp_ns <= last:
-            first, number = stamp_ns, 0
-        self._behind = self.newest_ns, first, stamp_ns, number + 1
-        if (number + 1) % SET_BACK_SAMPLES:
+    def _set_back(self, far: bool) -> bool:
+        """Whether the samples held, behind the newest one, are of a clock that was set back."""
+        if far:
+            return len(self.held) > 1           # a single one from long ago is late
+        if len(self.held) < SET_BACK_SAMPLES:
             return False
         # Samples that were only late fill a hole; others of their time would stand beside them.
         # Those with the very stamps of others cannot be told from samples sent twice.
         self.consolidate()
-        inside = np.searchsorted(self.stamps, stamp_ns) - np.searchsorted(self.stamps, first)
-        return bool(inside > 1.5 * number)
+        behind = [stamp for stamp, _, _ in self.held]
+        inside = slice(*np.searchsorted(self.stamps, [behind[0], behind[-1]]))
+        if np.union1d(self.stamps[inside], behind).size > 1.5 * len(behind):
+            return True
+        self._let_go()
+        return False
+
+    def _let_go(self) -> None:
+        """Take samples that were held behind the newest one, or count them: they were late."""
+        for sample in self.held:
+            if self.newest_ns is not None and sample[0] < self.newest_ns - self._lateness_ns:
+                self._counts['imu_late'] += 1
+            else:
+                self._counts['imu_out_of_order'] += 1
+                self._append(sample)
+        self.held.clear()
 
     def consolidate(self, last: bool = False) -> None:
         """
@@ -188,9 +185,11 @@ class ImuBuffer:
 
         `last`: nothing comes any more.
         """
-        if last and self._ahead is not None:
-            self._counts['imu_ahead'] += 1
-            self._ahead = None
+        if last and self.held and self.newest_ns is not None:
+            if self.held[0][0] > self.newest_ns:
+                self._counts['imu_ahead'] += 1
+                self.held.clear()
+            self._let_go()
         if not self._new:
             return
         new, self._new = self._new, []
@@ -234,16 +233,14 @@ class ImuBuffer:
         return (self.newest_ns is not None and self.stamps.size > 0
                 and self.newest_ns - self._lateness_ns - int(self.stamps[-1]) > MAX_GAP_NS)
 
-    def rates_since(self, stamp_ns: int) -> tuple[Index, Array, Array] | None:
+    def rates_since(self, stamp_ns: int) -> tuple[Index, Array, Array]:
         """
-        Return the angular rates after a stamp, rad/s, without spikes; None where there is a gap.
+        Return the angular rates after a stamp, rad/s, without spikes.
 
         Stamps, shape (N,), rates, (N, 3), and the rate at the stamp itself, (3,).
         """
         self.consolidate()
         first = int(np.searchsorted(self.stamps, stamp_ns, side='right'))
-        if np.any(np.diff(self.stamps[first:], prepend=stamp_ns) > MAX_GAP_NS):
-            return None
         looked_at = max(first - IMU_BEFORE, 0)
         stamps = self.stamps[looked_at:]
         rates = without_spikes(stamps, self.samples[looked_at:])[0][:, :3]

@@ -108,11 +108,8 @@ class RangeCheck:
 
     def __init__(self) -> None:
         """Start with no samples."""
-        # Of each value and its negative.
-        self._ends = np.repeat([END_RATE, END_FORCE], 3)[None].repeat(2, axis=0)
-        self._times = np.zeros((2, 6), int)
-        # The largest value below the end, and how often it came.
-        self._below, self._times_below = self._ends.copy(), self._times.copy()
+        # Of each value and its negative the two largest that came, and how often they did.
+        self._times = [{end: 0} for end in 2 * (3 * [END_RATE] + 3 * [END_FORCE])]
         self._last = np.zeros(6)
         # The last sample within the range, of gyros and accelerometers, ns.
         self._within_ns = np.zeros(2, np.int64)
@@ -169,27 +166,23 @@ class RangeCheck:
     def _at_end(self, samples: Array) -> np.ndarray:
         """Which values are at the end of the range, shape (N, 6)."""
         at_end = np.zeros(samples.shape, bool)
-        reached = np.argwhere([samples.max(axis=0), -samples.min(axis=0)] >= self._below)
+        signed = np.hstack([samples, -samples])
+        reached = np.flatnonzero(signed.max(axis=0) >= list(map(min, self._times)))
         if reached.size:
             changed = np.diff(np.vstack([self._last, samples]), axis=0) != 0.0
             changing = np.count_nonzero(changed, axis=1)
-        for sign, axis in reached.tolist():
-            values = -samples[:, axis] if sign else samples[:, axis]
-            place = sign, axis
-            for k in np.flatnonzero(values >= self._below[place]).tolist():
-                if values[k] > self._ends[place]:
-                    self._below[place], self._times_below[place] = (
-                        self._ends[place], self._times[place])
-                    self._ends[place], self._times[place] = values[k], 0
-                elif values[k] > self._below[place] and values[k] < self._ends[place]:
-                    self._below[place], self._times_below[place] = values[k], 0
-                among_changing = changing[k] - changed[k, axis] >= END_CHANGING
-                if values[k] == self._ends[place]:
-                    self._times[place] += among_changing
-                    at_end[k, axis] |= self._times[place] >= max(
-                        END_TIMES, PILED_UP * self._times_below[place])
-                elif values[k] == self._below[place]:
-                    self._times_below[place] += among_changing
+        for column in reached.tolist():
+            times, axis = self._times[column], column % 6
+            for k in np.flatnonzero(signed[:, column] >= min(times)).tolist():
+                value = float(signed[k, column])
+                times.setdefault(value, 0)
+                if len(times) > 2:
+                    del times[min(times)]
+                if value in times:
+                    times[value] += int(changing[k] - changed[k, axis] >= END_CHANGING)
+                if value == max(times):
+                    others = sum(times.values()) - times[value]
+                    at_end[k, axis] |= times[value] >= max(END_TIMES, PILED_UP * others)
         return at_end
 
 

@@ -24,8 +24,7 @@ import copy
 import math
 
 from ins_align.geometry.earth import EARTH_RATE
-from ins_align.geometry.rotation import (
-    apply, Array, cumulative_rotations, exp_so3, matrix_from_quaternion, quaternion_from_matrix)
+from ins_align.geometry.rotation import Array, matrix_from_quaternion
 from ins_align.imu.buffer import MAX_GAP_NS, MAX_RATE
 from ins_align.results import Attitude
 import numpy as np
@@ -61,11 +60,12 @@ class Prediction:
         """
         Carry on to one sample (rad/s), with the mean of its rate and that of the last one.
 
-        Return whether the attitude is now that at the sample: not when it is old or broken.
+        Return whether the attitude is now that at the sample: not when it is old or broken, and
+        never again after a gap, in which nobody knows how it has turned.
         """
         x, y, z = gyro
-        if stamp_ns <= self.stamp_ns or not (
-                abs(x) < MAX_RATE and abs(y) < MAX_RATE and abs(z) < MAX_RATE):
+        if not (0 < stamp_ns - self.stamp_ns <= MAX_GAP_NS
+                and abs(x) < MAX_RATE and abs(y) < MAX_RATE and abs(z) < MAX_RATE):
             return False
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         last_x, last_y, last_z = self._rate
@@ -87,20 +87,6 @@ class Prediction:
         self.stamp_ns = stamp_ns
         return True
 
-    def carry_many(self, stamps_ns: np.ndarray, gyro: Array) -> None:
-        """Carry on to the last of many samples, shapes (N,), in order, and (N, 3)."""
-        if stamps_ns.size == 0:
-            return
-        dt = np.diff(stamps_ns, prepend=self.stamp_ns) * 1e-9
-        rates = np.vstack([self._rate, gyro])
-        self._rate = tuple(rates[-1].tolist())
-        rates = 0.5 * (rates[:-1] + rates[1:])
-        turns = (apply(np.array(self._matrix), rates) - self._bias) * dt[:, None]
-        turned = cumulative_rotations(exp_so3(turns))[-1]
-        x, y, z, w = quaternion_from_matrix(self.matrices()[0] @ turned).tolist()
-        self._quaternion = x, y, z, w
-        self.stamp_ns = int(stamps_ns[-1])
-
     @property
     def quaternion_xyzw(self) -> tuple[float, float, float, float]:
         """Body to ENU, w >= 0."""
@@ -115,10 +101,10 @@ class Prediction:
         ee, en, eu, ne, nn, nu, ue, un, uu = self._covariance
         return ee + drift, en, eu, ne, nn + drift, nu, ue, un, uu + drift
 
-    def matrices(self) -> tuple[Array, Array]:
-        """Return ``C_nb`` and its covariance, each of shape (3, 3)."""
-        return (matrix_from_quaternion(np.array(self._quaternion)),
-                np.array(self.covariance).reshape(3, 3))
+    def attitude(self) -> Attitude:
+        """Return the attitude at the sample that it was carried to."""
+        return Attitude(self.stamp_ns, matrix_from_quaternion(np.array(self._quaternion)),
+                        np.array(self.covariance).reshape(3, 3))
 
 
 class Follower:
@@ -150,18 +136,10 @@ class Follower:
             return  # it has seen what has not arrived here: wait for the next one
         self._prediction = copy.copy(prediction)
         for stamp_ns, gyro in reversed(since):
-            self._carry(stamp_ns, gyro)
+            self._prediction.carry(stamp_ns, gyro)
 
     def follow(self, stamp_ns: int, gyro: Sequence[float]) -> Prediction | None:
         """Take a sample and return the attitude at its stamp; None where there is none."""
         self._samples.append((stamp_ns, gyro))
-        return self._prediction if self._carry(stamp_ns, gyro) else None
-
-    def _carry(self, stamp_ns: int, gyro: Sequence[float]) -> bool:
-        prediction = self._prediction
-        if prediction is None:
-            return False
-        if stamp_ns > prediction.stamp_ns + MAX_GAP_NS:
-            self._prediction = None
-            return False
-        return prediction.carry(stamp_ns, gyro)
+        now = self._prediction
+        return now if now is not None and now.carry(stamp_ns, gyro) else None
