@@ -36,6 +36,7 @@ from ins_align.gnss.messages import AntennaEpoch, Fix, Velocity
 from ins_align.imu.buffer import ImuBuffer, NO_SAMPLE
 from ins_align.imu.noise import ForceCheck
 from ins_align.imu.prediction import Prediction
+from ins_align.imu.preintegration import preintegrate
 from ins_align.results import Attitude, Epoch, Event, Nuisance, Severity, State, Status, Verdict
 import numpy as np
 
@@ -252,12 +253,12 @@ class Aligner:
             return
         for part in self._imu.parts([epoch.stamp_ns for epoch in epochs]):
             # 4. Preintegration gives the IMU's interval before each.
-            imu = self._imu.cut([epoch.stamp_ns for epoch in epochs[part]],
-                                [epoch.gravity_drift for epoch in epochs[part]])
+            imu = preintegrate(*self._imu.cut([epoch.stamp_ns for epoch in epochs[part]],
+                                              [epoch.gravity_drift for epoch in epochs[part]]))
             # 5. The bank propagates and updates; each epoch comes when the estimates are its.
-            taken = method.advance(epochs[part], imu.integrated())
-            for epoch, force in zip(taken, imu.forces):
-                self._force_check.add(*force)
+            taken = method.advance(epochs[part], imu)
+            for epoch, force, seconds in zip(taken, imu.force.tolist(), imu.duration.tolist()):
+                self._force_check.add(force, seconds)
                 self._judge(epoch, method)
 
     def _judge(self, epoch: AntennaEpoch, method: Bank | NoteMethod) -> None:
@@ -346,7 +347,7 @@ class Aligner:
         if self._first_t0_ns is None:
             self._first_t0_ns = epoch.stamp_ns
         self._without_velocity = no_velocity if wanted and epoch.v_n is None else ''
-        imu = self._imu.start(epoch.stamp_ns).integrated()
+        imu = preintegrate(*self._imu.start(epoch.stamp_ns))
         if config.method == 'bank':
             self._method = Bank(config, epoch, imu, bool(use_position), self._learnt,
                                 self._base)

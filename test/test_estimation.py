@@ -32,7 +32,7 @@ from ins_align.geometry.rotation import exp_so3, log_so3, skew
 from ins_align.gnss.antenna import Antenna
 from ins_align.gnss.buffer import GnssBuffer
 from ins_align.imu.buffer import ImuBuffer
-from ins_align.imu.preintegration import Noise, SensorErrors
+from ins_align.imu.preintegration import Noise, preintegrate, SensorErrors
 from ins_align.imu.recent import recent_motion
 from ins_align.results import Attitude
 import numpy as np
@@ -203,9 +203,9 @@ def prepared(s, *, velocity=True, **changes):
     samples.add_in_order(s.imu_stamps_ns, s.gyro, s.accel)
     antenna = Antenna(config, counts)
     first, *epochs = map(antenna.epoch, messages.release(samples.settled_ns(True), True))
-    bank = Bank(config, first, samples.start(first.stamp_ns).integrated(), not velocity)
+    bank = Bank(config, first, preintegrate(*samples.start(first.stamp_ns)), not velocity)
     steps = samples.cut([epoch.stamp_ns for epoch in epochs], [0.0] * len(epochs))
-    return bank, epochs, steps.integrated()
+    return bank, epochs, preintegrate(*steps)
 
 
 def went(bank, epochs, imu, block=1):

@@ -101,6 +101,8 @@ def test_integrals_are_those_of_the_motion(jitter):
     assert angle(interval.R[0], R) < 2e-7
     assert np.allclose(interval.v[0], v, atol=2e-6)
     assert np.allclose(interval.p[0], p, atol=2e-4)
+    magnitudes = np.linalg.norm(force_of(np.linspace(0.0, 10.0, 10001)), axis=1)
+    assert interval.force[0] == pytest.approx(np.mean(magnitudes), rel=1e-3)
 
 
 def test_error_falls_faster_than_the_square_of_the_step():
@@ -416,7 +418,7 @@ def test_mirrored_intervals_are_those_of_mirrored_sensors():
             expected = vars(integrate(
                 cut_at(stamps, of_gyros * gyro, of_accel * accel, epochs), NOISE))
             found = {name: array[:, k] for name, array in vars(mirrored).items()
-                     if name not in ('duration', 'Q', 'Q_excess')}
+                     if name not in ('duration', 'force', 'Q', 'Q_excess')}
             for name in ('R', 'v', 'p', 'J_Rg', 'J_vg', 'J_pg', 'J_va', 'J_pa'):
                 off = np.abs(found[name] - expected[name]).max() / np.abs(expected[name]).max()
                 assert off < (first if name in ('J_vg', 'J_pg') else second), name

@@ -27,7 +27,7 @@ from ins_align.geometry.rotation import Array, Index
 from ins_align.imu.noise import (
     gap_and_jitter, GAP_ANGULAR_ACCELERATION, GAP_JERK, IMU_BEFORE, RangeCheck, stuck, white_noise,
     without_spikes)
-from ins_align.imu.preintegration import Intervals, Noise, preintegrate, split_at_epochs, Steps
+from ins_align.imu.preintegration import Noise, split_at_epochs, Steps
 from ins_align.imu.recent import AGES, Recent, recent_motion
 import numpy as np
 from numpy.typing import ArrayLike
@@ -60,20 +60,6 @@ class Silence(NamedTuple):
     end_ns: int
     counter: str
     why: str
-
-
-class ImuSteps(NamedTuple):
-    """IMU steps before each of K epochs, the white noise in them and the motion at their ends."""
-
-    steps: Steps
-    noise: Noise
-    recent: Recent
-    # Sum and number of the magnitudes of the specific force before each epoch, and seconds.
-    forces: list[tuple[float, int, float]]
-
-    def integrated(self) -> Intervals:
-        """Return the intervals that they make."""
-        return preintegrate(self.steps, self.noise, self.recent)
 
 
 class ImuBuffer:
@@ -290,14 +276,15 @@ class ImuBuffer:
         starts = np.flatnonzero(np.diff(size // MAX_CUT_SAMPLES, prepend=-1)).tolist()
         return [slice(*ends) for ends in zip(starts, [*starts[1:], len(epochs_ns)])]
 
-    def start(self, stamp_ns: int) -> ImuSteps:
-        """Return the steps of no length at the first epoch of an alignment."""
+    def start(self, stamp_ns: int) -> tuple[Steps, Noise, Recent]:
+        """Return the steps of no length at the first epoch of an alignment; see `cut`."""
         self.used_ns = stamp_ns
         return self.cut([stamp_ns], [0.0])
 
-    def cut(self, epochs_ns: list[int], gravity_drift: list[float]) -> ImuSteps:
+    def cut(self, epochs_ns: list[int], gravity_drift: list[float],
+            ) -> tuple[Steps, Noise, Recent]:
         """
-        Return the steps up to each epoch, in increasing order, since the one before.
+        Return what `preintegrate` takes: up to each epoch, in increasing order, since the last.
 
         `gravity_drift`: noise of gravity for want of a place, m/s/sqrt(s), before each.
         """
@@ -322,14 +309,9 @@ class ImuBuffer:
             _together(self._stated[1], GAP_JERK * gap, jitter * _rms(steps.f_dot), beyond[1],
                       np.array(gravity_drift)[:, None]),
             excess[:, :1], excess[:, 1:])
-        magnitudes = np.sqrt(np.sum(np.square(samples[:, 3:]), axis=1))
-        sums = np.diff(np.concatenate([[0.0], np.cumsum(magnitudes)])[ends - 2])
-        seconds = np.diff(ends_ns) * 1e-9
-        cut = ImuSteps(steps, noise, recent_motion(stamps, samples, ends_ns[1:]),
-                       list(zip(sums.tolist(), np.diff(ends).tolist(), seconds.tolist())))
         self.used_ns = epochs_ns[-1]
         self.forget_before(self.used_ns)
-        return cut
+        return steps, noise, recent_motion(stamps, samples, ends_ns[1:])
 
 
 def _together(*densities: 'Array | float') -> Array:

@@ -23,10 +23,10 @@ import math
 from ins_align.geometry.rotation import Array, Index
 import numpy as np
 
-# The specific force averages gravity, over this time (s) and so many samples, unless the vehicle
-# falls, flies loops (up to 6 g) or its units are wrong (m/s^2).
+# The specific force averages gravity, over this time (s), unless the vehicle falls, flies loops (up
+# to 6 g) or its units are wrong (m/s^2).
 FORCE_RANGE = 4.0, 60.0
-FORCE_TIME, FORCE_SAMPLES = 5.0, 20
+FORCE_TIME = 5.0
 # A spike leaves the mean of its neighbours by at least this (rad/s, m/s^2), by this many times as
 # much as the neighbours differ, and as other samples do: of so many before it, this one in the
 # order of size, so that one more spike among them does no harm.
@@ -257,16 +257,12 @@ class ForceCheck:
     def __init__(self) -> None:
         """Start with no samples."""
         self._sum = self._seconds = 0.0
-        self._count = 0
         self.fault = ''
 
-    def add(self, total: float, count: int, seconds: float) -> None:
-        """Take the sum of so many magnitudes in so many seconds."""
-        self._sum += total
-        self._count += count
+    def add(self, mean: float, seconds: float) -> None:
+        """Take the mean magnitude over so many seconds, m/s^2."""
+        self._sum += mean * seconds
         self._seconds += seconds
-        if self._seconds < FORCE_TIME or self._count < FORCE_SAMPLES:
-            return
-        mean = self._sum / self._count
-        self._sum, self._count, self._seconds = 0.0, 0, 0.0
-        self.fault = force_fault(mean)
+        if self._seconds >= FORCE_TIME:
+            self.fault = force_fault(self._sum / self._seconds)
+            self._sum = self._seconds = 0.0

@@ -79,6 +79,7 @@ class Intervals:
     J_pa: Array
     Q: Array            # (K, 9, 9), of the errors (rotation, v, p) that the sensors' noise leaves
     Q_excess: Array     # the same for the noise that was measured in excess of what is stated
+    force: Array        # (K,), mean magnitude of the specific force, m/s^2
     omega: Array        # (K, 3), angular rate at the end, as measured, rad/s
     gained: Array       # (K, RUNGS, 3), before the end, as measured; see `Recent`
     turned: Array
@@ -236,6 +237,8 @@ def preintegrate(steps: Steps, noise: Noise, recent: Recent) -> Intervals:
 
     passed = np.cumsum(dt, axis=1)
     duration = passed[:, -1]
+    magnitude = (np.cumsum(0.5 * dt * np.linalg.norm(both, axis=2), axis=1)[:, -1]
+                 / np.maximum(duration, 1e-9))
     remaining = duration[:, None] - passed + 0.5 * dt       # from the middle of each step on
     derivatives = _derivatives(dt, product(A, h[..., None] * jacobian), u, *(
         0.5 * (values[:, :-1] + values[:, 1:]) for values in (omega, f)))
@@ -247,7 +250,7 @@ def preintegrate(steps: Steps, noise: Noise, recent: Recent) -> Intervals:
     # Intervals are chained for hours, and taken one by one.
     R = orthonormalized(turned[:, -1])
     return Intervals(*map(np.ascontiguousarray, (
-        duration, R, v, p, *derivatives, Q, Q_excess, omega[:, -1], *recent)))
+        duration, R, v, p, *derivatives, Q, Q_excess, magnitude, omega[:, -1], *recent)))
 
 
 def _covariances(noise: Noise, dt: Array, v_rest: Array, p_rest: Array,
