@@ -186,7 +186,7 @@ class Aligner:
         """
         Process what nothing late can precede any more; return the epochs since the last call.
 
-        `dry`: with those without measurement that divide an outage; `last`: nothing comes any more.
+        `dry`: with those without measurement that divide an outage; `last`: nothing more comes.
         """
         self._process(last)
         done, self._done = self._done, []

@@ -117,8 +117,8 @@ def test_spikes_are_counted_once_and_replaced():
         spoilt[place, :3] += 5.0
     steps, _, counts = cut(stamps, spoilt)
     assert counts['imu_spike'] == 3
-    assert np.allclose(steps.omega, samples[0, :3]) and np.allclose(steps.f,
-                                                                        samples[0, 3:])
+    assert np.allclose(steps.omega, samples[0, :3])
+    assert np.allclose(steps.f, samples[0, 3:])
 
 
 def test_the_end_of_the_range_is_noise_of_the_steps_before():

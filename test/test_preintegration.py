@@ -142,22 +142,6 @@ def test_split_at_any_epochs_is_the_unsplit(inner, jitter):
     assert np.allclose(whole[2], parts[2], atol=1e-6)
 
 
-def test_intervals_in_one_batch_are_those_one_by_one():
-    epochs = [0.0, 0.213, 0.4, 1.0, 1.001, 2.0]
-    stamps, gyro, accel = samples(2.0, jitter=0.3)
-    batch = integrate(cut_at(stamps, gyro, accel, np.array(epochs)), NOISE)
-    for k in range(len(epochs) - 1):
-        one = integrate(cut_at(stamps, gyro, accel, np.array(epochs[k:k + 2])), NOISE)
-        for name, array in vars(one).items():
-            assert np.allclose(array[0], getattr(batch, name)[k], rtol=1e-12, atol=1e-14), name
-
-
-def test_values_at_an_epoch_are_interpolated():
-    epochs = np.array([0.0, 0.5037, 1.0])
-    interval = integrated(epochs)
-    assert np.allclose(interval.omega, omega_of(epochs[1:]), atol=1e-6)
-
-
 @pytest.mark.parametrize('jitter', (0.0, 0.4))
 def test_changes_per_second_of_a_parabola_are_exact(jitter):
     """At samples and at epochs between them, whose slopes come of the cubic."""
@@ -229,18 +213,6 @@ def corrected_for(interval, errors):
     return replace(interval, R=Rotation.from_rotvec(interval.J_Rg @ gyro).as_matrix() @ interval.R,
                    v=interval.v + interval.J_vg @ gyro + interval.J_va @ accel,
                    p=interval.p + interval.J_pg @ gyro + interval.J_pa @ accel)
-
-
-def test_correction_is_re_integration_to_first_order():
-    matrix = 1e-3 * np.array([[1.0, 0.5, -0.5], [0.3, -2.0, 0.2], [-0.4, 0.1, 2.0]])
-    errors = np.concatenate([[2e-3, -1e-3, 1.5e-3], matrix.ravel(), [0.05, -0.02, 0.03],
-                             matrix.T.ravel()])
-    corrected = corrected_for(integrated([0.0, 0.2]), errors)
-    again = integrated([0.0, 0.2], errors=errors)
-    # Second order: 1/2 (2.7e-3 * 0.2)^2 for angles.
-    assert angle(corrected.R[0], again.R[0]) < 3e-7
-    assert np.allclose(corrected.v[0], again.v[0], atol=3e-6)
-    assert np.allclose(corrected.p[0], again.p[0], atol=1e-6)
 
 
 @pytest.mark.parametrize('interval, rotation, force', [(0.2, 0.15, 3.0), (1.0, 3.0, 50.0)])

@@ -99,7 +99,8 @@ class GnssBuffer:
         epoch = self._pending.get(stamp_ns, GnssEpoch(stamp_ns))
         if getattr(epoch, kind) is None:
             message = message._replace(covariance=sound_covariance(message.covariance))
-            self._pending[stamp_ns] = epoch._replace(**{kind: message})
+            self._pending[stamp_ns] = (epoch._replace(fix=message) if isinstance(message, Fix)
+                                       else epoch._replace(velocity=message))
         elif not fault:
             self._counts[f'{kind}_duplicate'] += 1
 

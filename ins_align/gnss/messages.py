@@ -139,10 +139,11 @@ def sound_covariance(sent: Array | None, default_std: Sequence[float] = ()) -> A
     known = [SMALLEST_VARIANCE <= variance < math.inf for variance in variances]
     if not any(known) or not (default_std or all(known)):
         return None
-    used = [min(max(variance, MIN_VARIANCE), MAX_VARIANCE) if is_known else default_std[axis] ** 2
-            for axis, (variance, is_known) in enumerate(zip(variances, known))]
+    used = [min(max(variance, MIN_VARIANCE), MAX_VARIANCE) if is_known else std ** 2
+            for variance, is_known, std in zip(variances, known, default_std or variances)]
     # Impossible correlations must not turn into a negative variance in some direction.
-    if used == variances and sent[~np.eye(3, dtype=bool)].any() and (np.abs(sent) <= MAX_VARIANCE).all():
+    correlated = sent[~np.eye(3, dtype=bool)].any() and (np.abs(sent) <= MAX_VARIANCE).all()
+    if correlated and used == variances:
         symmetric: Array = 0.5 * sent + 0.5 * sent.T
         scale = 1.0 / np.sqrt(used)
         if np.linalg.eigvalsh(symmetric * scale * scale[:, None])[0] > MIN_EIGENVALUE:
@@ -229,11 +230,11 @@ def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
             'world frame, east-north-up or north-east-down; if it is in one, whatever its '
             'frame_id says, set velocity_frame to enu or ned')
     velocity = np.array(linear, dtype=float)
-    sent = [None] * len(velocity) if covariances is None else covariances[:, :3, :3]
+    sent: Array = (np.zeros((len(velocity), 3, 3)) if covariances is None
+                   else covariances[:, :3, :3])
     if config.velocity_frame == 'ned':
         velocity = enu_from_ned(velocity)
-        if covariances is not None:
-            sent = enu_from_ned(enu_from_ned(sent).swapaxes(1, 2))
+        sent = enu_from_ned(enu_from_ned(sent).swapaxes(1, 2))
     stds = config.velocity_std, config.velocity_std, config.velocity_std_vertical
     return [Velocity(stamp_ns, vector, sound_covariance(covariance, stds)) for
             stamp_ns, vector, covariance in zip(np.asarray(stamps_ns).tolist(), velocity, sent)]

@@ -23,8 +23,8 @@ import math
 from ins_align.geometry.rotation import Array, Index
 import numpy as np
 
-# The specific force averages gravity, over this time (s), unless the vehicle falls, flies loops (up
-# to 6 g) or its units are wrong (m/s^2).
+# The specific force averages gravity, over this time (s), unless the vehicle falls, flies loops
+# (up to 6 g) or its units are wrong (m/s^2).
 FORCE_RANGE = 4.0, 60.0
 FORCE_TIME = 5.0
 # A spike leaves the mean of its neighbours by at least this (rad/s, m/s^2), by this many times as
