@@ -66,7 +66,7 @@ class GnssBuffer:
         self._counts = counts
         self._pending: dict[int, GnssEpoch] = {}
         self._said: tuple[float, ...] = ()          # position and velocity, released last
-        # Since when the receiver says that it has no fix; None: it has one.
+        # When the receiver said last that it has no fix; None: it has one since.
         self._no_fix_ns: int | None = None
         # By the name that counts them, how far the last one was from the newest IMU sample.
         self.off_ns: dict[str, int] = {}

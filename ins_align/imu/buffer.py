@@ -94,7 +94,7 @@ class ImuBuffer:
         self._silences: list[Silence] = []
 
     def add(self, stamp_ns: int, gyro: Array, accel: Array) -> bool:
-        """Take a sample; False: the clock was set back to those that are `held`."""
+        """Take a sample; return False if the clock was set back: since then come those `held`."""
         sample = stamp_ns, gyro, accel
         if self.newest_ns is None:
             self._append(sample)
@@ -227,11 +227,9 @@ class ImuBuffer:
         """
         self.consolidate()
         first = int(np.searchsorted(self.stamps, stamp_ns, side='right'))
-        looked_at = max(first - IMU_BEFORE, 0)
-        stamps = self.stamps[looked_at:]
-        rates = without_spikes(stamps, self.samples[looked_at:])[0][:, :3]
-        rate = np.array([np.interp(0.0, stamps - stamp_ns, axis) for axis in rates.T])
-        return stamps[first - looked_at:], rates[first - looked_at:], rate
+        rates = without_spikes(self.stamps, self.samples)[0][:, :3]
+        rate = np.array([np.interp(0.0, self.stamps - stamp_ns, axis) for axis in rates.T])
+        return self.stamps[first:], rates[first:], rate
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop samples that no epoch at or after a stamp looks back at."""
@@ -245,11 +243,9 @@ class ImuBuffer:
         """Look for times in which the IMU says too little, and for the end of its range."""
         stamps = self.stamps
         first, last = np.searchsorted(stamps, [self._checked_ns, upto_ns], side='right').tolist()
-        context = max(first - IMU_BEFORE, 0)
-        around = slice(context, last + 1)
-        samples, _ = without_spikes(stamps[around], self.samples[around])
+        samples, _ = without_spikes(stamps[:last + 1], self.samples[:last + 1])
         before = self._range.stamps.size
-        self._range.add(stamps[first:last], samples[first - context:last - context])
+        self._range.add(stamps[first:last], samples[first:last])
         self._counts['imu_saturated'] += self._range.stamps.size - before
         self._checked_ns = max(self._checked_ns, upto_ns)
         gaps = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
