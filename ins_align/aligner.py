@@ -134,8 +134,8 @@ class Aligner:
         self._counts['clock_jumps'] += 1
         # A recording that is played again says nothing new: what it said before is no prior.
         self._start_over('the clock of the IMU jumped back')
-        for sample in since:
-            self._imu.add(*sample)
+        for held_ns, values in since:
+            self._imu.add(held_ns, values[:3], values[3:])
 
     def add_fix(self, fix: Fix) -> None:
         """Take a GNSS position."""
@@ -201,7 +201,7 @@ class Aligner:
         upto_ns = self._imu.settled_ns(last)
         if upto_ns is None:
             if left_out := self._left_out('imu'):
-                self._wait(State.WAITING_FOR_IMU, f'no IMU sample of use yet: {left_out}')
+                self._wait(State.WAITING_FOR_IMU, 'no IMU sample of use yet', left_out)
             return
         self._imu.check(upto_ns)
         for message in self._gnss.release(upto_ns, last):
@@ -218,9 +218,7 @@ class Aligner:
             if self._imu.silent:
                 self._wait(State.WAITING_FOR_IMU, NO_SAMPLE)
             elif self._first_fix_ns is None:
-                left_out = self._left_out('fix')
-                self._wait(State.WAITING_FOR_GNSS,
-                           'no GNSS position yet' + (left_out and f': {left_out}'))
+                self._wait(State.WAITING_FOR_GNSS, 'no GNSS position yet', self._left_out('fix'))
 
     def _line_up(self, message: GnssEpoch) -> None:
         """Make an epoch of GNSS messages: t0, or one that follows it."""
@@ -327,8 +325,7 @@ class Aligner:
                                and epoch.stamp_ns - self._first_fix_ns >= NO_VELOCITY_NS)
         no_velocity = self._refusal or self._left_out('velocity')
         if epoch.v_n is None and not alone:
-            self._wait(State.WAITING_FOR_GNSS,
-                       'no GNSS velocity yet' + (no_velocity and f': {no_velocity}'))
+            self._wait(State.WAITING_FOR_GNSS, 'no GNSS velocity yet', no_velocity)
             return
         use_position = config.use_position
         if use_position == 'auto':
@@ -381,8 +378,8 @@ class Aligner:
                 parts.append(f'{count} {why}{off}')
         return ', '.join(parts)
 
-    def _wait(self, state: State, reason: str) -> None:
-        self._set_verdict(Verdict(state, reason))
+    def _wait(self, state: State, what: str, why: str = '') -> None:
+        self._set_verdict(Verdict(state, what + (why and f': {why}')))
 
     def _set_verdict(self, verdict: Verdict) -> None:
         """Take over a verdict; another state is an event."""

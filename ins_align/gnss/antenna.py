@@ -209,43 +209,42 @@ class VelocityCheck:
     def __init__(self) -> None:
         """Start with nothing compared."""
         self._origin: Place | None = None
-        self._path = 0.0, 0.0
-        # East and north of the fix, and of what the velocity makes of the way, since the origin.
-        self._recent: deque[tuple[float, ...]] = deque(maxlen=AGREEING)
-        self._anchor: tuple[float, ...] | None = None
-        self._last: tuple[float, float, float] | None = None
+        # Of places, ways and velocities east is the real part, north the imaginary one.
+        self._path = 0j
+        # The fix and what the velocity makes of the way, since the origin.
+        self._recent: deque[tuple[complex, complex]] = deque(maxlen=AGREEING)
+        self._anchor: tuple[complex, complex] | None = None
+        self._last: tuple[float, complex] | None = None
         self.bad_in_a_row = 0
         self._as_ned_in_a_row = 0
 
     def add(self, time: float, place: Place, v_n: Array, position_std: float) -> None:
         """Take an epoch that has both; seconds, radians, metres, ENU."""
-        east, north, _ = v_n.tolist()
+        velocity = complex(*v_n[:2].tolist())
         if self._last is not None and 0 < time - self._last[0] < 2.5:
-            half = (time - self._last[0]) / 2
-            self._path = (self._path[0] + half * (self._last[1] + east),
-                          self._path[1] + half * (self._last[2] + north))
+            self._path += (time - self._last[0]) / 2 * (self._last[1] + velocity)
         else:
             self._origin = None
-        self._last = time, east, north
+        self._last = time, velocity
         if self._origin is None:
-            self._origin, self._path, self._anchor = place, (0.0, 0.0), None
+            self._origin, self._path, self._anchor = place, 0j, None
             self._recent.clear()
-        self._recent.append((*enu_offset(self._origin, place)[:2], *self._path))
+        self._recent.append((complex(*enu_offset(self._origin, place)[:2]), self._path))
         if len(self._recent) < AGREEING:
             return
         here = self._recent[AGREEING // 2]
         if self._anchor is None:
             self._anchor = here
             return
-        moved_e, moved_n, went_e, went_n = (now - then for now, then in zip(here, self._anchor))
-        distance = max(math.hypot(moved_e, moved_n), math.hypot(went_e, went_n))
+        moved, travelled = (now - then for now, then in zip(here, self._anchor))
+        distance = max(abs(moved), abs(travelled))
         tolerance = MAX_MISMATCH * distance
         # A wild fix is no journey, and one after the other they do not agree.
         if (distance < max(MIN_DISTANCE, DISTANCE_SIGMAS * position_std)
-                or any(math.dist(other[:2], here[:2]) > tolerance for other in self._recent)):
+                or any(abs(other - here[0]) > tolerance for other, _ in self._recent)):
             return
-        bad = math.hypot(moved_e - went_e, moved_n - went_n) > tolerance
-        as_ned = math.hypot(moved_e - went_n, moved_n - went_e) < tolerance
+        bad = abs(moved - travelled) > tolerance
+        as_ned = abs(moved - 1j * travelled.conjugate()) < tolerance    # east and north exchanged
         self._origin = None                   # the next journey begins here
         if as_ned and not bad:
             return                            # to north-east both frames say the same

@@ -20,6 +20,7 @@ is not known).
 """
 
 from collections import Counter
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from ins_align.config import ImuNoise
@@ -86,16 +87,16 @@ class ImuBuffer:
         self.newest_ns: int | None = None           # that has come
         # Samples that may be of another clock, until those behind them tell: one far ahead of the
         # newest, or some in a row behind it.
-        self.held: list[tuple[int, Array, Array]] = []
+        self.held: list[tuple[int, tuple[float, ...]]] = []
         # Up to here samples are cut: what comes later and is older is late.
         self.used_ns = -(1 << 62)
         self._range = RangeCheck()
         self._checked_ns = 0                # up to where it has seen them
         self._silences: list[Silence] = []
 
-    def add(self, stamp_ns: int, gyro: Array, accel: Array) -> bool:
+    def add(self, stamp_ns: int, gyro: Iterable[float], accel: Iterable[float]) -> bool:
         """Take a sample; return False if the clock was set back: since then come those `held`."""
-        sample = stamp_ns, gyro, accel
+        sample = stamp_ns, (*gyro, *accel)
         if self.newest_ns is None:
             self._append(sample)
             return True
@@ -133,9 +134,9 @@ class ImuBuffer:
             self.newest_ns = int(stamps_ns[-1])
         return True
 
-    def _append(self, sample: tuple[int, Array, Array]) -> None:
-        stamp_ns, gyro, accel = sample
-        self._new.append(((stamp_ns,), ((*gyro, *accel),)))
+    def _append(self, sample: tuple[int, tuple[float, ...]]) -> None:
+        stamp_ns, values = sample
+        self._new.append(((stamp_ns,), (values,)))
         if self.newest_ns is None or stamp_ns > self.newest_ns:
             self.newest_ns = stamp_ns
 
@@ -148,7 +149,7 @@ class ImuBuffer:
         # Samples that were only late fill a hole; others of their time would stand beside them.
         # Those with the very stamps of others cannot be told from samples sent twice.
         self.consolidate()
-        behind = [stamp for stamp, _, _ in self.held]
+        behind = [stamp for stamp, _ in self.held]
         inside = slice(*np.searchsorted(self.stamps, [behind[0], behind[-1]]))
         if np.union1d(self.stamps[inside], behind).size > 1.5 * len(behind):
             return True
