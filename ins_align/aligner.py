@@ -203,7 +203,6 @@ class Aligner:
             if left_out := self._left_out('imu'):
                 self._wait(State.WAITING_FOR_IMU, 'no IMU sample of use yet', left_out)
             return
-        self._imu.check(upto_ns)
         for message in self._gnss.release(upto_ns, last):
             self._bridge_outage(message.stamp_ns)
             self._line_up(message)

@@ -32,8 +32,7 @@ def cut(stamps_ns, samples, epochs=EPOCHS, drift=0.0):
     counts = Counter()
     buffer = ImuBuffer(0, counts, ImuNoise(*STATED, gyro_bias_std=0.0, accel_bias_std=0.0))
     buffer.add_in_order(stamps_ns, samples[:, :3], samples[:, 3:])
-    buffer.consolidate()
-    buffer.check(int(epochs[-1]))
+    buffer.settled_ns(last=True)
     buffer.start(epochs[0])
     steps, noise, _ = buffer.cut(epochs[1:], [drift] * (len(epochs) - 1))
     return steps, noise, counts

@@ -203,7 +203,8 @@ class ImuBuffer:
         """
         Return the stamp up to which epochs can be cut; None while there are too few samples.
 
-        Nothing late can precede it any more; `last`: nothing comes any more at all.
+        Nothing late can precede it any more; `last`: nothing comes any more at all. Up to there
+        samples are checked, for `silence` and the noise of steps.
         """
         self.consolidate(last)
         if self.newest_ns is None or self.stamps.size < 4:
@@ -212,7 +213,9 @@ class ImuBuffer:
         settled = int(np.searchsorted(self.stamps, settled_ns, side='right'))
         # Interpolation at an epoch wants two samples after it, and whether they are spikes shows
         # in the next one.
-        return int(self.stamps[max(settled, 3) - 3])
+        upto_ns = int(self.stamps[max(settled, 3) - 3])
+        self._check(upto_ns)
+        return upto_ns
 
     @property
     def silent(self) -> bool:
@@ -240,7 +243,7 @@ class ImuBuffer:
 
     # Steps between epochs
 
-    def check(self, upto_ns: int) -> None:
+    def _check(self, upto_ns: int) -> None:
         """Look for times in which the IMU says too little, and for the end of its range."""
         stamps = self.stamps
         first, last = np.searchsorted(stamps, [self._checked_ns, upto_ns], side='right').tolist()
