@@ -20,7 +20,6 @@ several times as long for vectors of three.
 
 from collections import deque
 from collections.abc import Sequence
-import copy
 import math
 
 from ins_align.geometry.earth import EARTH_RATE
@@ -121,7 +120,7 @@ class Follower:
         self._prediction: Prediction | None = None
 
     def adopt(self, prediction: Prediction | None) -> None:
-        """Go on from another prediction; None: there is no attitude."""
+        """Go on from another prediction, its own from now on; None: there is no attitude."""
         self._prediction = None
         if prediction is None:
             return
@@ -134,9 +133,9 @@ class Follower:
             since.append(sample)
         else:
             return  # it has seen what has not arrived here: wait for the next one
-        self._prediction = copy.copy(prediction)
+        self._prediction = prediction
         for stamp_ns, gyro in reversed(since):
-            self._prediction.carry(stamp_ns, gyro)
+            prediction.carry(stamp_ns, gyro)
 
     def follow(self, stamp_ns: int, gyro: Sequence[float]) -> Prediction | None:
         """Take a sample and return the attitude at its stamp; None where there is none."""
