@@ -135,15 +135,16 @@ def sound_covariance(sent: Array | None, default_std: Sequence[float] = ()) -> A
     """
     if sent is None:
         return None
-    variances = sent.diagonal().tolist()
+    (ee, en, eu), (ne, nn, nu), (ue, un, uu) = sent.tolist()
+    variances, covariances = [ee, nn, uu], [en, eu, ne, nu, ue, un]
     known = [SMALLEST_VARIANCE <= variance < math.inf for variance in variances]
     if not any(known) or not (default_std or all(known)):
         return None
     used = [min(max(variance, MIN_VARIANCE), MAX_VARIANCE) if is_known else std ** 2
             for variance, is_known, std in zip(variances, known, default_std or variances)]
     # Impossible correlations must not turn into a negative variance in some direction.
-    correlated = sent[~np.eye(3, dtype=bool)].any() and (np.abs(sent) <= MAX_VARIANCE).all()
-    if correlated and used == variances:
+    if used == variances and any(covariances) and all(
+            abs(covariance) <= MAX_VARIANCE for covariance in covariances):
         symmetric: Array = 0.5 * sent + 0.5 * sent.T
         scale = 1.0 / np.sqrt(used)
         if np.linalg.eigvalsh(symmetric * scale * scale[:, None])[0] > MIN_EIGENVALUE:
