@@ -49,12 +49,8 @@ def keep_to_one() -> None:
         os.environ.setdefault(variable, '1')
 
 
-def pool(workers: int) -> ProcessPoolExecutor:
-    """Return an executor whose processes leave Ctrl-C to this one and end when it is killed."""
-    return ProcessPoolExecutor(workers, initializer=_serve_parent)
-
-
 def _serve_parent() -> None:
+    """Leave Ctrl-C to the parent process, and end when it is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -66,18 +62,19 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def run_all(function: Callable[[Any], T], tasks: Sequence[Any], jobs: int,
+def run_all(function: Callable[[Any], T], tasks: Sequence[Any], jobs: int | None,
             ) -> Iterator[T | Exception]:
     """
     Do tasks in so many processes; yield in their order what a function returns of each.
 
-    One job is this process. Where the process of a task is gone, the exception that says so takes
-    the place of what it should have returned.
+    By default one process a processor; one job is this process. Where the process of a task is
+    gone, the exception that says so takes the place of what it should have returned.
     """
-    if jobs == 1:
+    jobs = min(jobs or processors(), len(tasks))
+    if jobs <= 1:
         yield from map(function, tasks)
         return
-    executor = pool(min(jobs, len(tasks)))
+    executor = ProcessPoolExecutor(jobs, initializer=_serve_parent)
     try:
         yield from _in_order(executor, function, tasks, BrokenProcessPool)
     except BaseException:

@@ -22,7 +22,6 @@ a row for all runs of a name.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
 import io
 import itertools
 import json
@@ -35,7 +34,7 @@ from ins_align.config import Config
 from ins_align.experiments.spoilt import LOT, Message, SECOND, SENSORS, Stream, stream_of
 from ins_align.geometry.rotation import Array, log_so3
 from ins_align.outputs import write_whole
-from ins_align.processes import pool, processors
+from ins_align.processes import run_all
 from ins_align.report import format_table
 from ins_align.simulation.simulate import give, noise_parameters, simulate, Simulation
 import numpy as np
@@ -58,20 +57,20 @@ Groups = list[tuple[str, list[JsonDict]]]       # names and their runs
 def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jobs: int | None,
              name: str = '') -> list[list[Any]]:
     """
-    Map a function of a module over groups of tasks; in processes, by default one a processor.
+    Map a function of a module over groups of tasks, as `run_all`; whoever fails ends it.
 
     Tasks that share a trajectory should be neighbours: a process keeps the last few. The name is
     shown with the progress on a terminal.
     """
     from tqdm import tqdm
 
-    every = list(itertools.chain(*groups))
-    jobs = min(jobs or processors(), max(len(every), 1))
-    with ExitStack() as stack:
-        results = map(function, every) if jobs == 1 else stack.enter_context(pool(jobs)).map(
-            function, every, chunksize=max(1, min(10, len(every) // (4 * jobs))))
-        shown = iter(tqdm(results, name, len(every), disable=None))     # None: not on a terminal
-        return [list(itertools.islice(shown, len(group))) for group in groups]
+    tasks, results = [*itertools.chain(*groups)], []
+    for result in tqdm(run_all(function, tasks, jobs), name, len(tasks), disable=None):
+        if isinstance(result, Exception):
+            raise result
+        results.append(result)
+    every = iter(results)
+    return [list(itertools.islice(every, len(group))) for group in groups]
 
 
 # Runs
@@ -85,6 +84,11 @@ class Case(NamedTuple):
     config: JsonDict = {}           # parameters of `Config` in place of the truth
     spoil: Callable[[Stream], Any] | None = None
     between: bool = False           # attitudes between epochs are judged, instead of those there
+    exact: bool = False             # the aligner knows the very model: noise, lever arm, delay
+
+    def seeded(self, seed: int, **drawn: Any) -> Case:
+        """Return the case with a seed, and what is drawn of the arguments of `simulate`."""
+        return self._replace(simulate={**self.simulate, 'seed': seed, **drawn})
 
 
 def combination(index: int, seed: Sequence[int], *axes: Iterable[Any]) -> Any:
@@ -116,7 +120,8 @@ def prepare(case: Case) -> tuple[Simulation, Stream, Aligner]:
     stream = stream_of(simulation, BETWEEN_LOT if case.between else LOT)
     if case.spoil is not None:
         case.spoil(stream)
-    return simulation, stream, Aligner(config_for(simulation, **{**stream.config, **case.config}))
+    configured = exact_config_for if case.exact else config_for
+    return simulation, stream, Aligner(configured(simulation, **{**stream.config, **case.config}))
 
 
 def follow(aligner: Aligner, sent: Iterable[Message], every_s: float = UPDATE_EVERY,

@@ -28,13 +28,13 @@ import math
 from pathlib import Path
 from typing import Any
 
-from ins_align.aligner import Aligner, State
+from ins_align.aligner import State
 from ins_align.config import Config, PRESETS
+from ins_align.experiments.bound import bound_of
 from ins_align.experiments.common import (
-    BINS, Case, cell, combination, config_for, exact_config_for, GRADES, groups_of, JsonDict,
-    moment_row, parallel, Report, run_case, setup)
-from ins_align.experiments.dense import bound
-from ins_align.simulation.simulate import epochs_of, SCENARIOS, simulate
+    BINS, Case, cell, combination, follow, GRADES, groups_of, JsonDict, moment_row, parallel,
+    prepare, Report, run_case, setup)
+from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
 
 DURATION = 100.0
@@ -142,44 +142,43 @@ def draw_silent(scenario: str, seed: int) -> Case:
 
 def time_to_heading(runs: int, jobs: int | None) -> list[JsonDict]:
     """Time to a declared heading, where the bound crosses the threshold, and when it does."""
-    kinds = list(itertools.product(SCENARIOS, GRADES, (True, False)))
-    [crossings] = parallel(crossing_time, [kinds], jobs, 'bounds')
-    reachable = [each for each in zip(kinds, crossings) if each[1] is not None]
+    cases = [time_case(*kind) for kind in itertools.product(SCENARIOS, GRADES, (True, False))]
+    [crossings] = parallel(crossing_time, [cases], jobs, 'bounds')
+    reachable = [each for each in zip(cases, crossings) if each[1] is not None]
     times = parallel(run_time, [
-        [(*kind, TIME_SEED + seed) for seed in range(runs)] for kind, _ in reachable], jobs,
-        'times')
-    # What was not declared took for ever.
-    medians = [float(np.median([np.inf if t is None else t for t in each])) for each in times]
-    return [{'scenario': scenario, 'imu': grade, 'exact': exact, 'bound_s': bound_s,
-             'median_s': median_s, 'ratio': median_s / bound_s, 'declared_s': each}
-            for ((scenario, grade, exact), bound_s), median_s, each in zip(
-                reachable, medians, times)]
+        [(case, TIME_SEED + seed) for seed in range(runs)] for case, _ in reachable], jobs, 'times')
+    waits = []
+    for (case, bound_s), declared_s in zip(reachable, times):
+        # What was not declared took for ever.
+        median_s = float(np.median([np.inf if t is None else t for t in declared_s]))
+        waits.append({'scenario': case.scenario, 'imu': case.simulate['imu_grade'],
+                      'exact': case.exact, 'bound_s': bound_s, 'median_s': median_s,
+                      'ratio': median_s / bound_s, 'declared_s': declared_s})
+    return waits
 
 
-def crossing_time(task: tuple[str, str, bool]) -> float | None:
-    """
-    Return when the bound of the heading crosses the threshold, None if it does not.
+def time_case(scenario: str, grade: str, exact: bool) -> Case:
+    """Return a case with everything known, or with the defaults."""
+    # The heading is to be what is waited for, not the tilt.
+    config = {'tilt_std_threshold': THRESHOLD_DEG} if exact else {
+        'lever_arm_std': Config.lever_arm_std, 'gnss_delay_std': Config.gnss_delay_std}
+    return Case('time', scenario, {'imu_grade': grade, 'duration': HORIZON}, config, exact=exact)
 
-    The task: scenario, grade, whether lever arm and delay are known.
-    """
-    scenario, grade, exact = task
-    default = Config()
-    unknown = {} if exact else {'lever_arm_std': default.lever_arm_std,
-                                'delay_std': default.gnss_delay_std}
-    limit = bound(simulate(scenario, imu_grade=grade, duration=HORIZON), **unknown)
+
+def crossing_time(case: Case) -> float | None:
+    """Return when the bound of the heading crosses the threshold, None if it does not."""
+    limit = bound_of(case)
     good = np.degrees(np.sqrt(limit.covariance[:, 2, 2])) <= THRESHOLD_DEG
     return float(limit.time[np.argmax(good)]) if good.any() else None
 
 
-def run_time(task: tuple[str, str, bool, int]) -> float | None:
-    """Seconds until the heading is declared, None if it is not; with the exact model or not."""
-    scenario, grade, exact, seed = task
-    simulation = simulate(scenario, imu_grade=grade, seed=seed, duration=HORIZON)
-    # The heading is to be what is waited for, not the tilt.
-    config = (exact_config_for(simulation, tilt_std_threshold=THRESHOLD_DEG) if exact
-              else config_for(simulation))
-    return next((epoch.t_s for epoch in epochs_of(Aligner(config), simulation)
-                 if epoch.state is State.ALIGNED), None)
+def run_time(task: tuple[Case, int]) -> float | None:
+    """Seconds until the heading of a case with a seed is declared, None if it is not."""
+    case, seed = task
+    _, stream, aligner = prepare(case.seeded(seed))
+    looks = follow(aligner, stream.messages(aligner.config))
+    return next((epoch.t_s for epoch in itertools.chain.from_iterable(looks)
+                 if epoch.state is State.ALIGNED and not epoch.dry), None)
 
 
 def time_table(report: Report, waits: list[JsonDict]) -> None:
@@ -245,15 +244,12 @@ def run_worse(report: Report, runs: int, jobs: int | None, data: Path | None) ->
     return {'runs': found}
 
 
-def draw_worse(seed: int, faults: tuple[str, ...] | None = None,
-               scenario: str | None = None) -> Case:
-    """Draw a run of ``declare-worse``; its faults and scenario may be given."""
-    drawn, drawn_scenario = combination(seed, [3], COMBINATIONS, SCENARIOS)
-    faults = drawn if faults is None else faults
+def draw_worse(seed: int) -> Case:
+    """Draw a run of ``declare-worse``."""
+    faults, scenario = combination(seed, [3], COMBINATIONS, SCENARIOS)
     random = np.random.default_rng([4, seed])
     arguments = {'seed': seed, 'duration': DURATION, **setup(random),
                  'stand_still': STAND_STILL * random.integers(2)}
     for fault in faults:
         arguments |= WORSE[fault]
-    return Case(PAIR.join(faults) or 'none', scenario or drawn_scenario, arguments,
-                {'imu_grade': 'mems'})
+    return Case(PAIR.join(faults) or 'none', scenario, arguments, {'imu_grade': 'mems'})
