@@ -26,7 +26,7 @@ extras = {
     'dask': ['distributed>=2024.1'],
     'plot': ['matplotlib>=3.8'],
     'simulation': simulation,
-    'experiments': [*replay, *simulation, 'matplotlib>=3.8', 'pillow'],
+    'experiments': [*replay, *simulation, 'matplotlib>=3.8'],
     'test': [
         'catkin-pkg', 'hypothesis', 'mcap', 'mypy', 'pytest', 'pytest-cov', 'pytest-xdist',
         'ros-ament-flake8', 'ros-ament-pep257', 'flake8', 'flake8-blind-except', 'flake8-builtins',

@@ -75,7 +75,6 @@ def test_killed_experiment_leaves_the_old_files(tmp_path):
 @pytest.mark.parametrize('call', ['os.fsync', 'os.replace'])
 def test_killed_figure_leaves_the_old_one(tmp_path, call):
     pytest.importorskip('matplotlib')
-    pytest.importorskip('PIL')
     (tmp_path / 'x.png').write_text('old')
     draw = """
 from ins_align.experiments.common import Report

@@ -19,7 +19,7 @@ from ins_align.geometry.rotation import matrix_from_rpy, Transform
 from ins_align.offline import replay
 from ins_align.results import State
 from ins_align.simulation.scenarios import Motion, Scenario, SCENARIOS
-from ins_align.simulation.simulate import epochs_of, simulate, write_bag
+from ins_align.simulation.simulate import feed, simulate, write_bag
 import numpy as np
 import pytest
 
@@ -31,7 +31,7 @@ def aligned(simulation, base=None, **config):
     """Return the aligner, its epochs and the headings' errors over their sigmas."""
     aligner = Aligner(Config(**{**CAR, 'lever_arm': tuple(simulation.lever_arm.tolist()),
                                 **config}), base)
-    epochs = [epoch for epoch in epochs_of(aligner, simulation) if epoch.current is not None]
+    epochs = [epoch for epoch in feed(aligner, simulation) if epoch.current is not None]
     true = simulation.attitude_at([epoch.stamp_ns for epoch in epochs])
     errors = [epoch.current.heading_deg - heading_deg(C) for epoch, C in zip(epochs, true)]
     sigmas = [epoch.current.sigma_deg[2] for epoch in epochs]

@@ -24,7 +24,6 @@ data.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import itertools
 from pathlib import Path
 from typing import Any
@@ -32,10 +31,10 @@ from typing import Any
 from ins_align.config import Config
 from ins_align.experiments import dense
 from ins_align.experiments.common import (
-    Case, error_of, follow, GRADES, JsonDict, parallel, prepare, Report)
+    Case, error_of, follow, GRADES, JsonDict, parallel, prepare, Report, run_cases,
+    simulated)
 from ins_align.geometry.rotation import Array, roll_pitch_yaw
 from ins_align.report import new_figure
-from ins_align.simulation.simulate import simulate
 import numpy as np
 
 TIMES = (10.0, 20.0, 50.0, 100.0)
@@ -44,11 +43,12 @@ LEVER_STD, DELAY, DELAY_STD = 1.0, 0.12, 0.1
 RATIO_LIMIT, NEES_RANGE = 1.10, (0.85, 1.15)
 
 
-def case_of(name: str, scenario: str, grade: str, config: JsonDict = {}, **arguments: Any) -> Case:
+def case_of(name: str, scenario: str, grade: str, config: JsonDict = {}, part: int = 1,
+            **arguments: Any) -> Case:
     """Return a case; `config` is beside the very model of its simulation."""
     # Nothing is declared, for that may move t0, and the bound is about the first one.
-    return Case(name, scenario, {'imu_grade': grade, 'duration': TIMES[-1] + 0.5, **arguments},
-                {'hold_time': 1e3, **config}, exact=True)
+    return Case(name, ((scenario, grade),), None, {'duration': TIMES[-1] + 0.5, **arguments},
+                {'hold_time': 1e3, **config}, part, exact=True)
 
 
 MOVING = tuple(itertools.product(('flight', 'car'), GRADES))
@@ -56,29 +56,27 @@ POSITIONS = {'use_velocity': False}
 # In the order of the tables. What has a sigma in the configuration is unknown to the bound too.
 CASES = (
     *(case_of('velocity', *moving) for moving in MOVING),
-    *(case_of('velocity, gyro bias 0.5 deg/s', scenario, 'mems', gyro_bias_std=np.radians(0.5))
-      for scenario in ('flight', 'car')),
-    *(case_of('RTK 2 cm, 5 Hz', *moving, POSITIONS, position_std=0.02) for moving in MOVING),
-    *(case_of('position 1 m white, 1 Hz', *moving, POSITIONS, position_std=1.0, gnss_rate=1.0)
+    *(case_of('velocity, gyro bias 0.5 deg/s', scenario, 'mems', {}, 2,
+              gyro_bias_std=np.radians(0.5)) for scenario in ('flight', 'car')),
+    *(case_of('RTK 2 cm, 5 Hz', *moving, POSITIONS, 2, position_std=0.02) for moving in MOVING),
+    *(case_of('position 1 m white, 1 Hz', *moving, POSITIONS, 4, position_std=1.0, gnss_rate=1.0)
       for moving in MOVING),
     *(case_of('unknown lever arm', 'flight', grade, {
-        'lever_arm': (0.0, 0.0, 0.0), 'lever_arm_std': LEVER_STD}) for grade in GRADES),
-    *(case_of('unknown delay', 'flight', grade, {'gnss_delay_std': DELAY_STD}, gnss_delay=DELAY)
-      for grade in GRADES),
-    case_of('standing: north from the Earth rate', 'static', 'navigation'))
-# Of the runs asked for.
-SHARES = {case.name: 0.5 for case in CASES} | {
-    'velocity': 1.0, 'position 1 m white, 1 Hz': 0.25, 'standing: north from the Earth rate': 0.25}
+        'lever_arm': (0.0, 0.0, 0.0), 'lever_arm_std': LEVER_STD}, 2) for grade in GRADES),
+    *(case_of('unknown delay', 'flight', grade, {'gnss_delay_std': DELAY_STD}, 2,
+              gnss_delay=DELAY) for grade in GRADES),
+    case_of('standing: north from the Earth rate', 'static', 'navigation', part=4))
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``bound``: every case; print ratios and normalised errors."""
     [bounds] = parallel(bound_of, [CASES], jobs, 'bounds')
-    results = [each for case in zip(CASES, bounds, run_all(CASES, runs, jobs))
-               for each in results_of(*case)]
+    groups = run_cases(run_exact, CASES, runs, jobs)
+    results = [each for case, limit, (_, found) in zip(CASES, bounds, groups)
+               for each in results_of(case, limit, found)]
     report.text(
         'GNSS 5 Hz, 0.1 m/s, lever arm [1 1 1] m unless said otherwise. Errors of the attitude at '
-        't0; tilt: both axes. The bound comes from the dense reference on the true motion. '
+        't0; tilt: both axes. '
         'NEES/3: mean normalised squared error of the three angles, 1 when sigma is right. '
         'Chance alone (1 sigma) moves a ratio by the root of 1/(2 runs), NEES/3 by that of '
         '2/(3 runs). The aligner is told the noise and that lever arm and delay are known, but '
@@ -88,23 +86,20 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         f'Targets: ratio of error and bound at most {RATIO_LIMIT:g}, NEES/3 within '
         f'{NEES_RANGE[0]:g} to {NEES_RANGE[1]:g}; beyond chance: by more than two of its sigmas',
         [target_row(title, [each for each in results if each['title'] == title])
-         for title in SHARES])
+         for title in dict.fromkeys(case.name for case in CASES)])
     report.table('Root mean square errors, bounds and their ratios', map(result_row, results))
     return {'runs': runs, 'results': results}
-
-
-def run_all(cases: Sequence[Case], runs: int, jobs: int | None) -> list[list[JsonDict]]:
-    """Run every case with its share of the runs."""
-    return parallel(run_exact, [
-        [(case, seed) for seed in range(max(1, round(SHARES.get(case.name, 1.0) * runs)))]
-        for case in cases], jobs, 'runs')
 
 
 def bound_of(case: Case) -> dense.Bound:
     """Return the bound of a case, with what is unknown in it."""
     return dense.bound(
-        simulate(case.scenario, **case.simulate), not case.config.get('use_velocity', True),
+        simulated(case), not case.config.get('use_velocity', True),
         case.config.get('lever_arm_std', 0.0), case.config.get('gnss_delay_std', 0.0))
+
+
+def _lever_arm(seed: int) -> JsonDict:
+    return {'lever_arm': LEVER_STD * np.random.default_rng([3, seed]).standard_normal(3)}
 
 
 def run_exact(task: tuple[Case, int]) -> JsonDict:
@@ -115,12 +110,11 @@ def run_exact(task: tuple[Case, int]) -> JsonDict:
     (K, 3) and of roll, pitch, yaw (K, 3), degrees, and the normalised squared error (K,).
     """
     case, seed = task
-    drawn = {}
     if 'lever_arm_std' in case.config:      # another one in each run
-        drawn['lever_arm'] = LEVER_STD * np.random.default_rng([3, seed]).standard_normal(3)
-    simulation, stream, aligner = prepare(case.seeded(seed, **drawn))
+        case = case._replace(drawn=_lever_arm)
+    simulation, stream, aligner = prepare(case, seed)
     rows = []
-    for epoch in itertools.chain(*follow(aligner, stream.messages(aligner.config))):
+    for epoch in itertools.chain(*follow(aligner, stream)):
         if epoch.dry:
             continue
         row = np.full(7, np.nan)
@@ -150,12 +144,11 @@ def results_of(case: Case, bound: dense.Bound, runs: list[JsonDict]) -> list[Jso
     """Return the statistics of a case's runs at each of `TIMES`."""
     error, nees = (np.array([run[name][places_of(run['time'])] for run in runs])
                    for name in ('error_deg', 'nees'))
-    results = []
+    [(scenario, grade)], results = case.motions, []
     for k, time in enumerate(TIMES):
         east, north, up = np.diag(bound.at(time))
-        result = {'title': case.name, 'scenario': case.scenario,
-                  'grade': case.simulate['imu_grade'], 'time': time, 'runs': len(runs),
-                  'nees': np.mean(nees[:, k]) / 3}
+        result = {'title': case.name, 'scenario': scenario, 'grade': grade, 'time': time,
+                  'runs': len(runs), 'nees': np.mean(nees[:, k]) / 3}
         for angle, errors, variance in (('tilt', np.hypot(*error[:, k, :2].T), east + north),
                                         ('heading', error[:, k, 2], up)):
             limit = np.degrees(np.sqrt(variance))
@@ -220,10 +213,9 @@ def run_note(report: Report, runs: int, jobs: int | None, data: Path | None) -> 
         'Scenario `flight` (100 m/s, S-turns with 40 s period, oscillation of 2 to 3 deg about '
         f'all axes), IMU 100 Hz, GNSS velocity 5 Hz, 0.1 m/s; lever arm {list(LEVER)} m; {runs} '
         'runs. The note does not give its own set-up. Errors of the attitude at t0.')
-    results = run_all(NOTE_CASES, runs, jobs)
-    time = results[0][0]['time']
-    errors = {case.name: np.array([each['rpy_deg'] for each in found])
-              for case, found in zip(NOTE_CASES, results)}
+    results = run_cases(run_exact, NOTE_CASES, runs, jobs)
+    time = results[0][1][0]['time']
+    errors = {name: np.array([each['rpy_deg'] for each in found]) for name, found in results}
     heading = {name: rms(each[:, places_of(time), 2]) for name, each in errors.items()}
     for case in NOTE_CASES:
         if case.name.endswith('bank'):

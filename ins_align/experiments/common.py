@@ -22,7 +22,6 @@ a row for all runs of a name.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-import io
 import itertools
 import json
 import math
@@ -31,7 +30,7 @@ from typing import Any, NamedTuple
 
 from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
-from ins_align.experiments.spoilt import LOT, Message, SECOND, SENSORS, Stream, stream_of
+from ins_align.experiments.spoilt import Random, SECOND, SENSORS, Stream, stream_of
 from ins_align.geometry.rotation import Array, log_so3
 from ins_align.outputs import write_whole
 from ins_align.processes import run_all
@@ -43,10 +42,8 @@ import numpy as np
 LATENESS = 0.5
 GRADES = ('navigation', 'tactical', 'mems')
 BINS = (3.0, 5.0)       # sigmas that are counted
-COLOURS = 64            # of a figure
 UPDATE_EVERY = 5.0      # s
 LONGEST = 5.0           # s that an epoch stands for
-BETWEEN_LOT = 7         # IMU samples given at once where attitudes between epochs are judged
 ANGLES = ('tilt', 'heading')
 
 JsonDict = dict[str, Any]
@@ -76,19 +73,25 @@ def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jo
 # Runs
 
 class Case(NamedTuple):
-    """One run: what is simulated, how its messages are spoilt, what is configured."""
+    """A row of a table: what is simulated, how its messages are spoilt, what is configured."""
 
-    name: str                       # the row of a table
-    scenario: str
-    simulate: JsonDict              # arguments of `simulate`
+    name: str
+    motions: tuple[tuple[str, str], ...]    # scenario and grade of IMU, of the seeds in turn
+    spoil: Callable[[Stream, Random], Any] | None = None
+    simulate: JsonDict = {}         # further arguments of `simulate`
     config: JsonDict = {}           # parameters of `Config` in place of the truth
-    spoil: Callable[[Stream], Any] | None = None
+    part: int = 1                   # there is one run for so many of those asked for
     between: bool = False           # attitudes between epochs are judged, instead of those there
     exact: bool = False             # the aligner knows the very model: noise, lever arm, delay
+    drawn: Callable[[int], JsonDict] | None = None      # arguments that the seed draws
 
-    def seeded(self, seed: int, **drawn: Any) -> Case:
-        """Return the case with a seed, and what is drawn of the arguments of `simulate`."""
-        return self._replace(simulate={**self.simulate, 'seed': seed, **drawn})
+
+def run_cases(function: Callable[[Any], Any], cases: Sequence[Case], runs: int, jobs: int | None,
+              ) -> Groups:
+    """Map a function of a case and a seed over the runs of every case."""
+    return list(zip((case.name for case in cases), parallel(function, [
+        [(case, seed) for seed in range(max(1, runs // case.part))] for case in cases], jobs,
+        'runs')))
 
 
 def combination(index: int, seed: Sequence[int], *axes: Iterable[Any]) -> Any:
@@ -106,45 +109,54 @@ def setup(random: np.random.Generator) -> JsonDict:
             'mount_rpy_deg': random.uniform(-20, 20, 3).tolist()}
 
 
-def run_case(task: Sequence[Any]) -> JsonDict:
-    """Run what a function draws, the task being the function and its arguments; judge it."""
-    case = task[0](*task[1:])
-    simulation, stream, aligner = prepare(case)
-    looks = follow(aligner, stream.messages(aligner.config), between=case.between)
-    return outcome(case, simulation, stream, aligner, list(itertools.chain(*looks)))
+def run_case(task: tuple[Case | Callable[[int], Case], int]) -> JsonDict:
+    """Run a case, or what a function draws, with a seed; judge it."""
+    case, seed = task
+    if not isinstance(case, Case):
+        case = case(seed)
+    simulation, stream, aligner = prepare(case, seed)
+    epochs = [*itertools.chain(*follow(aligner, stream))]
+    return outcome(case.name, simulation, stream, aligner, epochs)
 
 
-def prepare(case: Case) -> tuple[Simulation, Stream, Aligner]:
+def simulated(case: Case, seed: int = 0) -> Simulation:
+    """Simulate a case."""
+    scenario, grade = case.motions[seed % len(case.motions)]
+    drawn = case.drawn(seed) if case.drawn else {}
+    return simulate(scenario, **{'imu_grade': grade, 'seed': seed, **drawn, **case.simulate})
+
+
+def prepare(case: Case, seed: int) -> tuple[Simulation, Stream, Aligner]:
     """Simulate, spoil the messages, and configure an aligner for what is left of the truth."""
-    simulation = simulate(case.scenario, **case.simulate)
-    stream = stream_of(simulation, BETWEEN_LOT if case.between else LOT)
+    simulation = simulated(case, seed)
+    stream = stream_of(simulation, case.between)
     if case.spoil is not None:
-        case.spoil(stream)
+        case.spoil(stream, np.random.default_rng([6, seed]))
     configured = exact_config_for if case.exact else config_for
     return simulation, stream, Aligner(configured(simulation, **{**stream.config, **case.config}))
 
 
-def follow(aligner: Aligner, sent: Iterable[Message], every_s: float = UPDATE_EVERY,
-           between: bool = False) -> Iterator[list[Epoch]]:
+def follow(aligner: Aligner, stream: Stream) -> Iterator[list[Epoch]]:
     """
     Give an aligner messages in the order of arrival, and yield the epochs of each update.
 
     An update without epochs yields what the status says, as an epoch without GNSS, so that silence
-    counts. Updates come every so often, with messages 'update' and 'reset', and at the end;
-    `between`: after every message, with the attitude now instead of epochs.
+    counts; so does each where attitudes between epochs are wanted. Updates come at a reset, at the
+    end, and when the stream says, by default every `UPDATE_EVERY`.
     """
-    due = 0.0 if math.isfinite(every_s) else math.inf
-    for now, kind, payload in sent:
+    due = 0.0
+    for now, kind, payload in stream.messages(aligner.config):
         if kind in SENSORS:
             give(aligner, kind, payload)
         elif kind == 'reject':
             aligner.reject(payload)
-        if between or now >= due or kind in ('update', 'reset'):
-            yield _epochs(aligner, aligner.update(), between)
-            due = now + every_s * SECOND
+        if stream.between or kind in ('update', 'reset') or (
+                now >= due and not stream.updates.size):
+            yield _epochs(aligner, aligner.update(), stream.between)
+            due = now + UPDATE_EVERY * SECOND
         if kind == 'reset':
             aligner.reset()
-    yield _epochs(aligner, aligner.flush(), between)
+    yield _epochs(aligner, aligner.flush(), stream.between)
 
 
 def _epochs(aligner: Aligner, epochs: list[Epoch], between: bool) -> list[Epoch]:
@@ -187,7 +199,7 @@ def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Any = 0.0) -> Jso
             'tilt_deg': float(np.hypot(*angles[:2])), 'heading_deg': float(abs(angles[2]))}
 
 
-def outcome(case: Case, simulation: Simulation, stream: Stream, aligner: Aligner,
+def outcome(name: str, simulation: Simulation, stream: Stream, aligner: Aligner,
             epochs: list[Epoch]) -> JsonDict:
     """Return which run it was, how it ended, and how right it was."""
     status = aligner.status()
@@ -195,8 +207,9 @@ def outcome(case: Case, simulation: Simulation, stream: Stream, aligner: Aligner
     def true(stamps: list[int]) -> Array:
         return simulation.attitude_at(stream.true_stamps(stamps))
 
-    return {'name': case.name, 'scenario': case.scenario, 'imu': aligner.config.imu_grade,
-            'seed': case.simulate['seed'], 'state': status.state.value, 'reason': status.reason,
+    return {'name': name, 'scenario': simulation.meta['scenario'],
+            'imu': aligner.config.imu_grade, 'seed': simulation.meta['seed'],
+            'state': status.state.value, 'reason': status.reason,
             'counts': {name: count for name, count in status.counts.items() if count},
             'least_heading_sigma_deg': min((epoch.initial.sigma_deg[2] for epoch in epochs
                                             if epoch.initial is not None), default=None),
@@ -343,14 +356,8 @@ class Report:
 
     def figure(self, figure: Any, caption: str) -> None:
         """Write a figure as PNG and refer to it."""
-        from PIL import Image
-
         file = f'{self._name}.png'
-        drawn = io.BytesIO()
-        figure.savefig(drawn, dpi=110)
-        # A palette makes the files of the documentation a third as large.
-        image = Image.open(drawn).convert('RGB').quantize(COLOURS)
-        write_whole(self._out / file, lambda png: image.save(png, 'PNG', optimize=True))
+        write_whole(self._out / file, lambda png: figure.savefig(png, format='png', dpi=110))
         self._parts.append(f'![{caption}]({file})\n\n{caption}')
         print(f'{self._out / file}: {caption}\n')
 

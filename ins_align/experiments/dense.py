@@ -33,6 +33,10 @@ from ins_align.geometry.rotation import Array, Index, skew
 from ins_align.gnss.messages import ENU_FROM_NED
 from ins_align.simulation.simulate import Simulation
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
+from scipy.interpolate import CubicSpline
+from scipy.linalg import cholesky, solve_triangular
+from scipy.spatial.transform import Rotation
 
 # Places of the unknowns.
 ATTITUDE, GYRO_BIAS, ACCEL_BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -107,9 +111,7 @@ class Path:
 
 def cumulative(time: Array, values: Array) -> Array:
     """Integral by the trapezoidal rule along the first axis."""
-    h = np.diff(time).reshape((-1,) + (1,) * (values.ndim - 1))
-    return np.concatenate([np.zeros_like(values[:1]),
-                           np.cumsum(h / 2 * (values[1:] + values[:-1]), axis=0)])
+    return np.asarray(cumulative_trapezoid(values, time, axis=0, initial=0))
 
 
 def path_along(time: Array, C: Array, omega: Array, f: Array, at: Array, C_n0n: Array,
@@ -150,8 +152,6 @@ def grid_of(imu_ns: np.ndarray, epochs_ns: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def interpolated(stamps_ns: np.ndarray, values: Array, wanted_ns: np.ndarray) -> Array:
-    from scipy.interpolate import CubicSpline
-
     origin = stamps_ns[0]
     return CubicSpline((stamps_ns - origin) * 1e-9, values)((wanted_ns - origin) * 1e-9)
 
@@ -180,7 +180,6 @@ def matrices_en(lla: Array) -> Array:
 
 def matrices_earth(time: Array) -> Array:
     from pyins.earth import RATE
-    from scipy.spatial.transform import Rotation
 
     return Rotation.from_rotvec(RATE * time[:, None] * [0.0, 0.0, 1.0]).as_matrix()
 
@@ -279,8 +278,6 @@ def whiten(V: Array, columns: Array) -> Array:
     The first rows of the result depend on the first rows of the problem alone: sums over them are
     those of the problem cut short.
     """
-    from scipy.linalg import cholesky, solve_triangular
-
     return solve_triangular(cholesky(V, lower=True), columns, lower=True)
 
 

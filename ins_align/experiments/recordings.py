@@ -200,10 +200,7 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         f'An alignment starts every {STEP:g} s and runs for up to {LENGTH:g} s with the defaults '
         '(preset mems), the car with its lever arm. note: vif with free_start false; centred: '
         'vif; both are pif where there are no velocities. Errors of the current attitude against '
-        'the reference, in sigmas with that of the reference in quadrature. Targets of the bank: '
-        'of the declared 99 % within 3 sigma, none beyond 5, with a median heading error of 1 deg '
-        f'(UAV, car) and 3 deg (quadrotor); 90 % of the windows with real motion within '
-        f'{MOTION_TIME:g} s.')
+        'the reference, in sigmas with that of the reference in quadrature.')
     report.table(
         f'At the declaration: median / worst. in {MOTION_TIME:g} s: windows with real motion '
         f'(by {MOTION_SPEED:g} m/s in that time) that declare. Then all epochs while ALIGNED',

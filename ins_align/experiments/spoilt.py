@@ -41,6 +41,7 @@ SECOND = 1_000_000_000
 HOUR = 3600 * SECOND
 LATENESS_NS = round(Config().gnss_lateness * SECOND)
 LOT = 100       # IMU samples given at once, in which the lateness of their stamps is taken for one
+BETWEEN_LOT = 7         # the same where attitudes between epochs are judged
 GNSS = 'fix', 'velocity'
 SENSORS = 'imu', *GNSS
 _IMU = np.dtype([('arrival', 'i8'), ('stamp', 'i8'), ('gyro', 'f8', 3), ('accel', 'f8', 3)])
@@ -67,7 +68,8 @@ class Stream:
     config: dict[str, Any] = field(default_factory=dict)        # what else is configured
     resets: list[int] = field(default_factory=list)     # when somebody asks for a new start
     updates: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))  # or for results
-    update_every: float = 0.0       # s, in the mean; 0: regularly, once a second
+    update_every: float = 0.0       # s, in the mean, where they are asked for at random
+    between: bool = False           # or after every message, for the attitude now
     expected: dict[str, int] = field(default_factory=dict)      # counters known beforehand
     # Stamps behind each of the former are off by one of the latter, of which there is one more.
     clock: tuple[Any, Any] = (), (0,)
@@ -160,7 +162,7 @@ class Stream:
             return ['velocity_body_frame'] * len(rows)
 
 
-def stream_of(simulation: Simulation, lot: int = LOT) -> Stream:
+def stream_of(simulation: Simulation, between: bool = False) -> Stream:
     """Return the messages of a simulation, its velocities taken for ENU."""
     imu = np.zeros(len(simulation.imu_stamps_ns), _IMU)
     imu['arrival'] = imu['stamp'] = simulation.imu_stamps_ns
@@ -174,7 +176,8 @@ def stream_of(simulation: Simulation, lot: int = LOT) -> Stream:
     velocity['velocity'] = simulation.velocity
     velocity['covariance'] = simulation.velocity_covariance
     return Stream(imu, fix, velocity, int(simulation.imu_stamps_ns[0]),
-                  int(simulation.imu_stamps_ns[-1]), lot, {'velocity_frame': 'enu'})
+                  int(simulation.imu_stamps_ns[-1]), BETWEEN_LOT if between else LOT,
+                  {'velocity_frame': 'enu'}, between=between)
 
 
 def within(rows: np.ndarray, window: Window) -> np.ndarray:

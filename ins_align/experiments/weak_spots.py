@@ -21,16 +21,16 @@ parameter ``vehicle`` says, and the recorded car if it is there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from itertools import product
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ins_align.config import PRESETS
 from ins_align.experiments.common import (
-    aligned_row, BINS, Case, Groups, JsonDict, parallel, Report, run_case)
+    aligned_row, Case, Groups, JsonDict, parallel, Report, run_case, run_cases)
 from ins_align.experiments.spoilt import directions, GNSS, Random, SECOND, Stream
 from ins_align.geometry.rotation import Array
 from ins_align.simulation.simulate import gauss_markov
@@ -177,17 +177,22 @@ def _bias_jump(stream: Stream, random: Random, sensor: str, size: float, at_s: f
     stream.imu[sensor][np.ix_(later, chosen)] += size * random.choice([-1.0, 1.0], axes)
 
 
-class Spot(NamedTuple):
-    """A row of a table: what is simulated, how its messages are spoilt, what is configured."""
+def _velocities_within(stream: Stream, random: Random, start_s: float, end_s: float) -> None:
+    time = stream.seconds('velocity')
+    stream.keep('velocity', (time >= start_s) & (time < end_s))
 
-    name: str
-    motions: tuple[tuple[str, str], ...]    # scenario and grade of IMU, run in turn
-    spoil: Callable[[Stream, Random], Any] | None = None
-    simulate: JsonDict = {}     # arguments of `simulate`
-    config: JsonDict = {}       # in place of the truth
-    part: int = 1               # there are so many times fewer runs, because they are long
-    between: bool = False       # the attitude between epochs is judged
-    drawn: Callable[[int], JsonDict] = lambda index: {}     # arguments that the seed draws
+
+def _no_numbers(stream: Stream, random: Random, name: str, field: str, axis: int,
+                start_s: float = 0.0) -> None:
+    getattr(stream, name)[field][stream.seconds(name) >= start_s, axis] = np.nan
+
+
+def _half_rates(stream: Stream, random: Random) -> None:
+    stream.imu['gyro'] *= 0.5
+
+
+def _late_gyros(stream: Stream, random: Random) -> None:
+    stream.imu['gyro'][2:] = stream.imu['gyro'][:-2].copy()
 
 
 CAR, FLIGHT, HOVER, LAUNCH = (((scenario, 'mems'),)
@@ -201,94 +206,92 @@ AWAY = {'duration': 300.0, 'outages': ((60.0, 300.0),)}
 GARAGE = {'duration': 2040.0, 'stand_still': 1980.0, 'outages': ((0.55, 1980.0),)}
 BUMPY = {'duration': 390.0, 'stand_still': 300.0, 'gnss_delay': 0.15}
 
-SPOTS = (
-    Spot('nothing wrong', MIXED),
-    Spot('a throw, nothing wrong', LAUNCH),
+SPOTS = tuple(case._replace(simulate={'duration': DURATION, **case.simulate}) for case in (
+    Case('nothing wrong', MIXED),
+    Case('a throw, nothing wrong', LAUNCH),
     # Told wrongly
-    Spot('told for certain, and right', MIXED, config=TOLD),
-    *(Spot(f'told for certain, delay {by:g} s off', MIXED, simulate={'gnss_delay': by},
+    Case('told for certain, and right', MIXED, config=TOLD),
+    *(Case(f'told for certain, delay {by:g} s off', MIXED, simulate={'gnss_delay': by},
            config=TOLD) for by in (0.05, 0.1, 0.2)),
-    *(Spot(f'told for certain, lever arm {off:g} m off', MIXED, partial(_told_lever, off=off),
+    *(Case(f'told for certain, lever arm {off:g} m off', MIXED, partial(_told_lever, off=off),
            config=TOLD) for off in (1.0, 2.0)),
-    Spot('MEMS told to be tactical', CAR + FLIGHT, None, LONG, {'imu_grade': 'tactical'}),
-    Spot('tactical told to be navigation', (('car', 'tactical'), ('flight', 'tactical')), None,
+    Case('MEMS told to be tactical', CAR + FLIGHT, None, LONG, {'imu_grade': 'tactical'}),
+    Case('tactical told to be navigation', (('car', 'tactical'), ('flight', 'tactical')), None,
          LONG, {'imu_grade': 'navigation'}),
     # Noise of GNSS
-    *(Spot(f'velocity errors that last {time:g} s', MIXED, partial(_lasting, time_s=time),
+    *(Case(f'velocity errors that last {time:g} s', MIXED, partial(_lasting, time_s=time),
            EXACT) for time in (1.0, 2.0)),
-    Spot('multipath: 0.5 m/s for 5 to 15 s, every 20 to 100 s', CAR,
+    Case('multipath: 0.5 m/s for 5 to 15 s, every 20 to 100 s', CAR,
          partial(_multipath, size=0.5), HOURS, part=4),
-    Spot('velocities of 0.03, 0.1, 0.5 m/s in turn, stated 0.1', CAR, _stepping,
+    Case('velocities of 0.03, 0.1, 0.5 m/s in turn, stated 0.1', CAR, _stepping,
          {**HOURS, **EXACT}, part=4),
-    Spot('vertical velocity 10 times as noisy as stated', CAR, partial(_states, std=0.1),
+    Case('vertical velocity 10 times as noisy as stated', CAR, partial(_states, std=0.1),
          {'velocity_std_vertical': 1.0}),
-    *(Spot(f'{rest / 60:g} min at rest, noise {factor:g} times as stated', CAR + LAUNCH,
+    *(Case(f'{rest / 60:g} min at rest, noise {factor:g} times as stated', CAR + LAUNCH,
            partial(_states, std=0.1 / factor),
            {'duration': rest + 60.0, 'stand_still': rest}, part=part)
       for rest, part in ((120.0, 2), (600.0, 6)) for factor in (1.2, 1.5)),
-    Spot('positions alone, wander by 1.5 m, stated 0.5 m', CAR + FLIGHT, _positions,
+    Case('positions alone, wander by 1.5 m, stated 0.5 m', CAR + FLIGHT, _positions,
          {**LONG, **WANDERING}),
-    Spot('positions alone, wander by 1.5 m, stated so', CAR + FLIGHT,
+    Case('positions alone, wander by 1.5 m, stated so', CAR + FLIGHT,
          partial(_positions, stated=1.58), {**LONG, **WANDERING}),
-    Spot('positions alone, 5 m off for 5 to 15 s, stated 0.05 m', CAR + FLIGHT,
+    Case('positions alone, 5 m off for 5 to 15 s, stated 0.05 m', CAR + FLIGHT,
          partial(_positions, offsets=5.0), {**LONG, **RTK}),
     # GNSS that comes and goes
-    Spot('GNSS every 5 s, navigation grade', (('flight', 'navigation'),), None,
+    Case('GNSS every 5 s, navigation grade', (('flight', 'navigation'),), None,
          {'gnss_rate': 0.2, 'duration': 100.0}),
-    Spot('1 Hz sent again at 5 Hz', CAR + FLIGHT, _resent),
-    Spot('GNSS stays away after 60 s', CAR + FLIGHT, None, AWAY, part=3),
-    Spot('GNSS stays away after 60 s, vif', (('flight', 'tactical'),), None,
+    Case('1 Hz sent again at 5 Hz', CAR + FLIGHT, _resent),
+    Case('GNSS stays away after 60 s', CAR + FLIGHT, None, AWAY, part=3),
+    Case('GNSS stays away after 60 s, vif', (('flight', 'tactical'),), None,
          {**AWAY, 'duration': 600.0, 'outages': ((60.0, 600.0),)}, {'method': 'vif'}, part=6),
-    Spot('tunnels of 60 to 150 s, last velocity beside no fix', CAR, _tunnels,
+    Case('tunnels of 60 to 150 s, last velocity beside no fix', CAR, _tunnels,
          {'duration': 600.0}, part=4),
-    Spot('no fix at 0, 0 for 20 s', CAR + FLIGHT, _looking),
-    Spot('three epochs, then 33 min in a garage', CAR, None, GARAGE, part=12),
-    Spot('velocities stop after 30 s, positions 1 m', CAR, lambda stream, random: stream.keep(
-        'velocity', stream.seconds('velocity') < 30.0), {**LATER, 'position_std': 1.0}),
-    Spot('velocities from 5 s on, positions wander', HOVER, lambda stream, random: stream.keep(
-        'velocity', stream.seconds('velocity') >= 5.0), WANDERING),
-    Spot('vertical velocity is no number', CAR + FLIGHT, lambda stream, random: np.copyto(
-        stream.velocity['velocity'][:, 2], np.nan)),
+    Case('no fix at 0, 0 for 20 s', CAR + FLIGHT, _looking),
+    Case('three epochs, then 33 min in a garage', CAR, None, GARAGE, part=12),
+    Case('velocities stop after 30 s, positions 1 m', CAR,
+         partial(_velocities_within, start_s=0.0, end_s=30.0), {**LATER, 'position_std': 1.0}),
+    Case('velocities from 5 s on, positions wander', HOVER,
+         partial(_velocities_within, start_s=5.0, end_s=math.inf), WANDERING),
+    Case('vertical velocity is no number', CAR + FLIGHT,
+         partial(_no_numbers, name='velocity', field='velocity', axis=2)),
     # Clocks
-    Spot('IMU stamped in bunches of 2 to 5', CAR + FLIGHT, _bunches),
-    Spot('IMU stamped late by 4 ms, exponential', CAR + FLIGHT,
+    Case('IMU stamped in bunches of 2 to 5', CAR + FLIGHT, _bunches),
+    Case('IMU stamped late by 4 ms, exponential', CAR + FLIGHT,
          partial(_late_stamps, mean_s=0.004)),
-    Spot('one IMU stamp 5 s ahead', CAR + FLIGHT, partial(_one_stamp, at_s=50.5, wild_s=5.0)),
-    Spot('IMU stamps stand still after 60 s', CAR + FLIGHT, partial(_one_stamp, at_s=60.0)),
-    Spot('delay steps by 80 ms at 60 s', HOVER, partial(_gnss_clock, at_s=60.0, by_s=0.08),
+    Case('one IMU stamp 5 s ahead', CAR + FLIGHT, partial(_one_stamp, at_s=50.5, wild_s=5.0)),
+    Case('IMU stamps stand still after 60 s', CAR + FLIGHT, partial(_one_stamp, at_s=60.0)),
+    Case('delay steps by 80 ms at 60 s', HOVER, partial(_gnss_clock, at_s=60.0, by_s=0.08),
          LONG),
-    Spot('clocks drift apart by 100 ppm', CAR + FLIGHT, partial(_gnss_clock, part=1e-4),
+    Case('clocks drift apart by 100 ppm', CAR + FLIGHT, partial(_gnss_clock, part=1e-4),
          HOURS, part=4),
     # The IMU
-    Spot('IMU sends no numbers after 60 s', CAR + FLIGHT, lambda stream, random: np.copyto(
-        stream.imu['gyro'][:, 1], np.nan, where=stream.seconds('imu') >= 60.0)),
-    Spot('parked for 3 h, IMU silent, biases walked', FLIGHT,
+    Case('IMU sends no numbers after 60 s', CAR + FLIGHT,
+         partial(_no_numbers, name='imu', field='gyro', axis=1, start_s=60.0)),
+    Case('parked for 3 h, IMU silent, biases walked', FLIGHT,
          partial(_parked, at_s=60.0, hours=3.0), LONG),
-    Spot('IMU losses of 50 to 450 ms every 10 s', CAR, partial(_gaps, length=(0.05, 0.45)),
+    Case('IMU losses of 50 to 450 ms every 10 s', CAR, partial(_gaps, length=(0.05, 0.45)),
          LONG),
-    Spot('IMU losses of 50 to 600 ms, attitude between epochs', LAUNCH + FLIGHT,
+    Case('IMU losses of 50 to 600 ms, attitude between epochs', LAUNCH + FLIGHT,
          partial(_gaps, length=(0.05, 0.6)), between=True),
-    Spot('nothing wrong, attitude between epochs', LAUNCH + FLIGHT + HOVER, between=True),
-    *(Spot(f'gyros warm up by 0.5 deg/s in 60 s, {motions[0][0]}', motions, _warm_up, LONG)
+    Case('nothing wrong, attitude between epochs', LAUNCH + FLIGHT + HOVER, between=True),
+    *(Case(f'gyros warm up by 0.5 deg/s in 60 s, {motions[0][0]}', motions, _warm_up, LONG)
       for motions in (CAR, FLIGHT)),
-    *(Spot(f'white vibration, 1 m/s^2 and 3 deg/s, from {start:g} s on', CAR + FLIGHT,
+    *(Case(f'white vibration, 1 m/s^2 and 3 deg/s, from {start:g} s on', CAR + FLIGHT,
            partial(_vibration, start_s=start), LATER) for start in (0.0, 25.0, 85.0)),
-    Spot('vibration at 27 Hz, IMU at 25 Hz', CAR + FLIGHT, partial(_vibration, tone_hz=27.0),
+    Case('vibration at 27 Hz, IMU at 25 Hz', CAR + FLIGHT, partial(_vibration, tone_hz=27.0),
          {'imu_rate': 25.0}),
-    Spot('5 min at rest, vibration 0.2 m/s^2 and 0.3 deg/s, delay 0.15 s', CAR + LAUNCH,
+    Case('5 min at rest, vibration 0.2 m/s^2 and 0.3 deg/s, delay 0.15 s', CAR + LAUNCH,
          partial(_vibration, force=0.2, rate_deg=0.3), BUMPY, part=4),
-    *(Spot(f'gyro {axis} alone reversed, {motions[0][0]}', motions, None, {'flip_gyro': axis})
+    *(Case(f'gyro {axis} alone reversed, {motions[0][0]}', motions, None, {'flip_gyro': axis})
       for axis, motions in (('x', LAUNCH), ('z', LAUNCH), ('z', CAR))),
-    Spot('gyros with half their rates', CAR, lambda stream, random: np.multiply(
-        stream.imu['gyro'], 0.5, out=stream.imu['gyro'])),
-    Spot('gyros 20 ms later than accelerometers', LAUNCH, lambda stream, random: np.copyto(
-        stream.imu['gyro'][2:], stream.imu['gyro'][:-2].copy())),
-    *(Spot(f'gyro bias jumps by 0.1 deg/s at {at_s:g} s, {axes} of 3', CAR, partial(
+    Case('gyros with half their rates', CAR, _half_rates),
+    Case('gyros 20 ms later than accelerometers', LAUNCH, _late_gyros),
+    *(Case(f'gyro bias jumps by 0.1 deg/s at {at_s:g} s, {axes} of 3', CAR, partial(
         _bias_jump, sensor='gyro', size=np.radians(0.1), at_s=at_s, axes=axes), LONG)
       for axes, at_s in ((1, 60.0), (3, 30.0))),
-    Spot('accelerometer bias jumps by 0.1 m/s^2 at 60 s, 1 of 3', HOVER,
+    Case('accelerometer bias jumps by 0.1 m/s^2 at 60 s, 1 of 3', HOVER,
          partial(_bias_jump, sensor='accel', size=0.1, at_s=60.0), LONG),
-)
+))
 
 
 # What a vehicle knows of its motion
@@ -302,8 +305,8 @@ def _mounted(seed: int, mount_deg: tuple[float, ...] = ()) -> JsonDict:
 
 
 def _vehicle(name: str, scenario: str, arguments: JsonDict, vehicle: str = 'car',
-             mount_deg: tuple[float, ...] = (), trust: bool = True) -> Spot:
-    return Spot(name, ((scenario, 'mems'),), None, arguments, {
+             mount_deg: tuple[float, ...] = (), trust: bool = True) -> Case:
+    return Case(name, ((scenario, 'mems'),), None, arguments, {
         'vehicle': vehicle, 'mount_yaw_std': MOUNT_STD_DEG, 'trust_imu_axes': trust,
         'heading_std_threshold': 2.0}, drawn=partial(_mounted, mount_deg=mount_deg))
 
@@ -336,35 +339,13 @@ RECORDED: dict[str, JsonDict] = {
 
 # Runs
 
-def draw(name: str, index: int) -> Case:
-    """Draw a run of the spot with a name."""
-    spot = next(spot for spot in (*SPOTS, *VEHICLE_SPOTS) if spot.name == name)
-    scenario, grade = spot.motions[index % len(spot.motions)]
-    return Case(name, scenario, {
-        'imu_grade': grade, 'seed': index, 'duration': DURATION, **spot.drawn(index),
-        **spot.simulate}, spot.config, spot.spoil and (lambda stream: spot.spoil(
-            stream, np.random.default_rng([6, index]))), spot.between)
-
-
-def run_spots(spots: Sequence[Spot], runs: int, jobs: int | None) -> Groups:
-    """Run every spot so many times, or a part of them."""
-    return list(zip((spot.name for spot in spots), parallel(run_case, [
-        [(draw, spot.name, index) for index in range(max(1, runs // spot.part))]
-        for spot in spots], jobs, 'spots')))
-
-
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``weak-spots``."""
-    found = run_spots(SPOTS, runs, jobs)
+    found = run_cases(run_case, SPOTS, runs, jobs)
     report.text(
         f'{runs} runs of each case, fewer where they are long, of {DURATION:g} s unless the case '
         'needs more. Car and flight in turn, or a hover, a throw, all of these; MEMS grade unless '
-        'said otherwise; nothing is told to the aligner but what the case says. Errors of the '
-        'current attitude against truth, the worst of tilt and heading in stated sigmas: at the '
-        f'first declaration, and at any time at which it was called ALIGNED; runs beyond '
-        f'{BINS[0]:g} and {BINS[1]:g}, the seconds beyond {BINS[1]:g} of the longest, the worst '
-        'error in sigmas and, of heading, in degrees, the part of the time at which it was '
-        'ALIGNED, and after how many seconds of data it was declared, the median.')
+        'said otherwise; nothing is configured but what the case says.')
     report.table('Weak spots', [aligned_row(*each) for each in found])
     return {'runs': runs, 'cases': dict(found)}
 
@@ -373,7 +354,7 @@ def run_vehicle(report: Report, runs: int, jobs: int | None, data: Path | None) 
     """Run ``vehicle``, and the recorded car if it is there."""
     from ins_align.experiments.recordings import declared_row, run_window, STEP, windows_of
 
-    found = run_spots(VEHICLE_SPOTS, runs, jobs)
+    found = run_cases(run_case, VEHICLE_SPOTS, runs, jobs)
     report.text(
         f'{runs} runs of each case, MEMS, GNSS velocity 0.1 m/s at 5 Hz, the mounting off by '
         f'{MOUNT_STD_DEG:g} deg (1 sigma, pitch and yaw) and stated so, `vehicle: car` unless the '

@@ -129,19 +129,14 @@ FEED_BLOCK = 200
 
 def feed(aligner: Any, simulation: Simulation, *, fix: bool = True,
          velocity: bool = True) -> list[Any]:
-    """Give a whole recording to an aligner; return the epochs of all updates (see `epochs_of`)."""
-    return list(epochs_of(aligner, simulation, fix=fix, velocity=velocity))
-
-
-def epochs_of(aligner: Any, simulation: Simulation, *, fix: bool = True,
-              velocity: bool = True) -> Iterator[Any]:
-    """Feed an aligner in the order of arrival, and yield the epochs as they come."""
+    """Give a recording to an aligner in the order of arrival; return the epochs of all updates."""
+    epochs = []
     for count, (kind, payload) in enumerate(simulation.messages()):
         if kind == 'imu' or (fix if kind == 'fix' else velocity):
             give(aligner, kind, payload)
         if count % FEED_BLOCK == 0:
-            yield from aligner.update()
-    yield from aligner.flush()
+            epochs += aligner.update()
+    return epochs + aligner.flush()
 
 
 def give(aligner: Any, kind: str, payload: Any) -> None:
