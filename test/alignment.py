@@ -20,10 +20,11 @@ from ins_align.experiments.common import exact_config_for
 from ins_align.geometry.rotation import log_so3, matrix_from_quaternion
 from ins_align.imu.preintegration import Noise, preintegrate, split_at_epochs
 from ins_align.imu.recent import AGES, Recent
-from ins_align.simulation.simulate import feed, simulate
+from ins_align.simulation.simulate import give, simulate
 import numpy as np
 
 LEVER = (1.0, 1.0, 1.0)
+FEED_BLOCK = 200    # messages between two updates of a fed aligner: many at a time are quicker
 
 
 @lru_cache(maxsize=64)
@@ -36,6 +37,17 @@ def config_for(simulation, **changes):
     """Return a configuration that states the truth about a simulation, lever arm and all."""
     settings = {'gnss_delay': float(simulation.meta['gnss_delay']), 'gnss_lateness': 1.0}
     return exact_config_for(simulation, **{**settings, **changes})
+
+
+def feed(aligner, simulation, *, fix=True, velocity=True):
+    """Give a recording to an aligner in the order of arrival; return the epochs of all updates."""
+    epochs = []
+    for count, (kind, payload) in enumerate(simulation.messages()):
+        if kind == 'imu' or (fix if kind == 'fix' else velocity):
+            give(aligner, kind, payload)
+        if count % FEED_BLOCK == 0:
+            epochs += aligner.update()
+    return epochs + aligner.flush()
 
 
 def aligned(simulation, *, fix=True, velocity=True, **changes):

@@ -17,13 +17,14 @@ from dataclasses import replace
 import math
 import re
 
-from alignment import aligned, config_for, error_deg, error_of, LEVER, normalised_error, simulated
+from alignment import (
+    aligned, config_for, error_deg, error_of, feed, LEVER, normalised_error, simulated)
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config, ConfigError, ImuNoise, PRESETS
 from ins_align.geometry.rotation import exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw
 from ins_align.results import Severity
 from ins_align.simulation.scenarios import Motion, Scenario, SCENARIOS
-from ins_align.simulation.simulate import feed, give
+from ins_align.simulation.simulate import give
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -865,16 +866,14 @@ def test_gyros_with_too_small_a_range_do_not_lead_astray(scenario, share, monkey
     assert aligned > 0
 
 
-def whirling(duration):
+def whirling(time, duration):
     """Drive in circles and spin around within 2 s now and then."""
-    def motion(time):
-        course = 0.3 * time
-        speed = 8.0 + 2.0 * np.sin(0.3 * time)
-        spin = sum(7.5 / (1 + np.exp(-(time - start) / 0.3)) for start in (20.0, 40.0))
-        velocity = np.stack([speed * np.cos(course), speed * np.sin(course), 0.0 * time], axis=-1)
-        swing = 0.1 * np.sin(1.9 * time)
-        return Motion(velocity, np.stack([swing, 0.8 * swing, course + spin], axis=-1))
-    return motion
+    course = 0.3 * time
+    speed = 8.0 + 2.0 * np.sin(0.3 * time)
+    spin = sum(7.5 / (1 + np.exp(-(time - start) / 0.3)) for start in (20.0, 40.0))
+    velocity = np.stack([speed * np.cos(course), speed * np.sin(course), 0.0 * time], axis=-1)
+    swing = 0.1 * np.sin(1.9 * time)
+    return Motion(velocity, np.stack([swing, 0.8 * swing, course + spin], axis=-1))
 
 
 def test_gnss_clock_that_is_off_is_named_and_not_declared():

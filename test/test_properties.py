@@ -13,12 +13,12 @@
 # limitations under the License.
 """What must not matter: frames, clocks, callbacks, order of arrival."""
 
-from alignment import aligned, config_for, error_of, LEVER, simulated
+from alignment import aligned, config_for, error_of, feed, LEVER, simulated
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from ins_align.aligner import Aligner
 from ins_align.geometry.rotation import exp_so3, matrix_from_quaternion
-from ins_align.simulation.simulate import feed, give
+from ins_align.simulation.simulate import give
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -19,6 +19,7 @@ from pathlib import Path
 import re
 import sqlite3
 
+from alignment import feed
 import ins_align
 from ins_align.aligner import Aligner, Attitude
 from ins_align.config import Config
@@ -27,7 +28,7 @@ from ins_align.offline import replay
 from ins_align.recordings import bag
 from ins_align.recordings.decode import ImuSamples
 from ins_align.results import CSV_HEADER, Reference
-from ins_align.simulation.simulate import feed, simulate, write_bag
+from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
 import pytest
 from recordings import real_recording, write_recording

@@ -16,11 +16,12 @@
 from dataclasses import replace
 import math
 
+from alignment import feed
 from ins_align.config import config_from_mapping, ImuNoise, load_params, PRESETS
 from ins_align.geometry.rotation import log_so3, matrix_from_quaternion, matrix_from_rpy
 from ins_align.gnss.messages import ENU_FROM_NED, Fix, Velocity
 from ins_align.simulation.scenarios import FLU_FROM_FRD, START_NS
-from ins_align.simulation.simulate import feed, SCENARIOS, simulate, SimulationError, write_bag
+from ins_align.simulation.simulate import SCENARIOS, simulate, SimulationError, write_bag
 import numpy as np
 import pytest
 

@@ -13,13 +13,14 @@
 # limitations under the License.
 """What a vehicle knows of its motion: a heading on a straight road, and none that is wrong."""
 
+from alignment import feed
 from ins_align.aligner import Aligner
 from ins_align.config import Config, ConfigError
 from ins_align.geometry.rotation import matrix_from_rpy, Transform
 from ins_align.offline import replay
 from ins_align.results import State
 from ins_align.simulation.scenarios import Motion, Scenario, SCENARIOS
-from ins_align.simulation.simulate import feed, simulate, write_bag
+from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
 import pytest
 
@@ -103,12 +104,12 @@ def test_motion_that_contradicts_the_vehicle_is_found(scenario, options):
 
 def test_direction_of_a_slow_car_is_said_to_be_ambiguous_until_its_speed_changes(monkeypatch):
     """At a constant 2 m/s nothing tells whether it goes backwards; it does, then it stops."""
-    def motion(time):
+    def motion(time, duration):
         speed = -2.0 + 2.0 * np.clip((time - 20.0) / 3.0, 0.0, 1.0)
         zero = np.zeros_like(time)
         return Motion(np.stack([speed, zero, zero], axis=-1), np.zeros((len(time), 3)))
 
-    monkeypatch.setitem(SCENARIOS, 'slow', Scenario(lambda duration: motion, 40.0, 1.0))
+    monkeypatch.setitem(SCENARIOS, 'slow', Scenario(motion, 40.0, 1.0))
     _, epochs, _ = aligned(simulate('slow', seed=6, duration=40.0))
     ambiguous = ['forwards and backwards are both possible' in epoch.reason for epoch in epochs]
     times = np.array([epoch.stamp_ns - epochs[0].stamp_ns for epoch in epochs]) * 1e-9

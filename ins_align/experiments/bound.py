@@ -56,14 +56,15 @@ POSITIONS = {'use_velocity': False}
 # In the order of the tables. What has a sigma in the configuration is unknown to the bound too.
 CASES = (
     *(case_of('velocity', *moving) for moving in MOVING),
-    *(case_of('velocity, gyro bias 0.5 deg/s', scenario, 'mems', {}, 2,
+    *(case_of('velocity, gyro bias 0.5 deg/s', scenario, 'mems', part=2,
               gyro_bias_std=np.radians(0.5)) for scenario in ('flight', 'car')),
-    *(case_of('RTK 2 cm, 5 Hz', *moving, POSITIONS, 2, position_std=0.02) for moving in MOVING),
-    *(case_of('position 1 m white, 1 Hz', *moving, POSITIONS, 4, position_std=1.0, gnss_rate=1.0)
+    *(case_of('RTK 2 cm, 5 Hz', *moving, POSITIONS, part=2, position_std=0.02)
       for moving in MOVING),
+    *(case_of('position 1 m white, 1 Hz', *moving, POSITIONS, part=4, position_std=1.0,
+              gnss_rate=1.0) for moving in MOVING),
     *(case_of('unknown lever arm', 'flight', grade, {
-        'lever_arm': (0.0, 0.0, 0.0), 'lever_arm_std': LEVER_STD}, 2) for grade in GRADES),
-    *(case_of('unknown delay', 'flight', grade, {'gnss_delay_std': DELAY_STD}, 2,
+        'lever_arm': (0.0, 0.0, 0.0), 'lever_arm_std': LEVER_STD}, part=2) for grade in GRADES),
+    *(case_of('unknown delay', 'flight', grade, {'gnss_delay_std': DELAY_STD}, part=2,
               gnss_delay=DELAY) for grade in GRADES),
     case_of('standing: north from the Earth rate', 'static', 'navigation', part=4))
 

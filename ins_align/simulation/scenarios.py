@@ -62,7 +62,7 @@ class Motion(NamedTuple):
 class Scenario(NamedTuple):
     """One kind of motion."""
 
-    motion: Callable[[float], Callable[[Array], Motion]]  # of the time that it must last, s
+    motion: Callable[[Array, float], Motion]  # of times (n,), and how long it must last, s
     duration: float  # s, unless told otherwise
     set_off: float   # s from a stand still to full motion
 
@@ -76,7 +76,6 @@ def motion_function(name: str, duration: float, heading: float = 0.0, crab: floa
     after some seconds at rest.
     """
     scenario = SCENARIOS[name]
-    motion = scenario.motion(duration)
     turn = matrix_from_rpy([0.0, 0.0, heading])
 
     def at(time: Array) -> Motion:
@@ -85,7 +84,7 @@ def motion_function(name: str, duration: float, heading: float = 0.0, crab: floa
             # The same path, passed along slowly at first.
             pace = _step(time, stand_still, scenario.set_off)
             time = _step_integral(time, stand_still, scenario.set_off)
-        velocity, rpy = motion(time)
+        velocity, rpy = scenario.motion(time, duration)
         return Motion(velocity * pace[:, None] @ turn.T, rpy + [0.0, 0.0, heading + crab])
 
     return at
@@ -121,6 +120,7 @@ def _profile(durations: Sequence[float], values: Sequence[float], width: float) 
     return PPoly(coefficients, breaks)
 
 
+@lru_cache(maxsize=8)
 def _course(first: _Rows, block: _Rows, duration: float, width: float) -> tuple[Any, Any]:
     """Acceleration and turn rate of `first` and then `block` again and again."""
     rows = list(first)
@@ -142,92 +142,69 @@ def _wave(time: Array, amplitude: float, period: float, phase: float = 0.0) -> A
     return amplitude * np.sin(2 * np.pi * time / period + phase)
 
 
-def _flight(duration: float) -> Callable[[Array], Motion]:
+def _flight(time: Array, duration: float) -> Motion:
     """Fly S-turns at 100 m/s, banked, with oscillations of a few degrees about all axes."""
     turn, period = np.radians(25.0), 40.0
-
-    def motion(time: Array) -> Motion:
-        speed = 100.0 + _wave(time, 3.0, 61.0)
-        course = turn * (1 - np.cos(2 * np.pi * time / period))
-        rate = _wave(time, turn * 2 * np.pi / period, period)
-        climb = _wave(time, 0.03, 27.0)
-        roll = -np.arctan(speed * rate / _GRAVITY) + _wave(time, 0.05, 4.3)
-        pitch = -climb - 0.03 + _wave(time, 0.05, 5.7, 1.0)
-        yaw = course + _wave(time, 0.035, 7.1, 2.0)
-        return Motion(_along(speed, course, climb), np.stack([roll, pitch, yaw], axis=-1))
-
-    return motion
+    speed = 100.0 + _wave(time, 3.0, 61.0)
+    course = turn * (1 - np.cos(2 * np.pi * time / period))
+    rate = _wave(time, turn * 2 * np.pi / period, period)
+    climb = _wave(time, 0.03, 27.0)
+    roll = -np.arctan(speed * rate / _GRAVITY) + _wave(time, 0.05, 4.3)
+    pitch = -climb - 0.03 + _wave(time, 0.05, 5.7, 1.0)
+    yaw = course + _wave(time, 0.035, 7.1, 2.0)
+    return Motion(_along(speed, course, climb), np.stack([roll, pitch, yaw], axis=-1))
 
 
-def _road(first: _Rows, duration: float) -> Callable[[Array], Motion]:
+def _road(time: Array, duration: float, first: _Rows = ()) -> Motion:
     """Drive through streets, corners, bends and traffic lights, after what comes first."""
     acceleration, rate = _course(first, _CITY, duration, 0.8)
-    speed_along, heading = acceleration.antiderivative(), rate.antiderivative()
-    distance = speed_along.antiderivative()
-
-    def motion(time: Array) -> Motion:
-        speed, d, turn = speed_along(time), distance(time), rate(time)
-        yaw = heading(time)
-        # Slopes and bumps belong to places: a car at rest does not move on them.
-        slope = _wave(d, 0.03, 310.0) + _wave(d, 0.004, 9.7)
-        roll = 0.006 * speed * turn + _wave(d, 0.02, 170.0) + _wave(d, 0.005, 8.3)
-        pitch = -slope - 0.006 * acceleration(time) + _wave(d, 0.003, 11.9)
-        return Motion(_along(speed, yaw, slope), np.stack([roll, pitch, yaw], axis=-1))
-
-    return motion
+    speed_along = acceleration.antiderivative()
+    speed, d = speed_along(time), speed_along.antiderivative()(time)
+    yaw, turn = rate.antiderivative()(time), rate(time)
+    # Slopes and bumps belong to places: a car at rest does not move on them.
+    slope = _wave(d, 0.03, 310.0) + _wave(d, 0.004, 9.7)
+    roll = 0.006 * speed * turn + _wave(d, 0.02, 170.0) + _wave(d, 0.005, 8.3)
+    pitch = -slope - 0.006 * acceleration(time) + _wave(d, 0.003, 11.9)
+    return Motion(_along(speed, yaw, slope), np.stack([roll, pitch, yaw], axis=-1))
 
 
-def _launch(duration: float) -> Callable[[Array], Motion]:
+def _launch(time: Array, duration: float) -> Motion:
     """Rest in a hand, be thrown with 3 g for half a second, climb and turn."""
-    acceleration = _profile(*_THROW, 0.1)
+    speed = _profile(*_THROW, 0.1).antiderivative()(time)
     _, rate = _course(((6.0, 0.0, 0.0),), _CIRCUIT, duration, 1.5)
-    speed_along, heading = acceleration.antiderivative(), rate.antiderivative()
-
-    def motion(time: Array) -> Motion:
-        speed = speed_along(time)
-        free = _step(time, 2.6, 3.0)
-        yaw = heading(time)
-        climb = 0.2 - 0.15 * _step(time, 6.0, 6.0)
-        roll = -np.arctan(speed * rate(time) / _GRAVITY) + free * _wave(time, 0.05, 2.9)
-        pitch = -climb - free * (0.05 + _wave(time, 0.04, 3.7))
-        yaw_body = yaw + free * _wave(time, 0.03, 4.9)
-        return Motion(_along(speed, yaw, climb), np.stack([roll, pitch, yaw_body], axis=-1))
-
-    return motion
+    yaw = rate.antiderivative()(time)
+    free = _step(time, 2.6, 3.0)
+    climb = 0.2 - 0.15 * _step(time, 6.0, 6.0)
+    roll = -np.arctan(speed * rate(time) / _GRAVITY) + free * _wave(time, 0.05, 2.9)
+    pitch = -climb - free * (0.05 + _wave(time, 0.04, 3.7))
+    yaw_body = yaw + free * _wave(time, 0.03, 4.9)
+    return Motion(_along(speed, yaw, climb), np.stack([roll, pitch, yaw_body], axis=-1))
 
 
-def _hover(duration: float) -> Callable[[Array], Motion]:
+def _hover(time: Array, duration: float) -> Motion:
     """Wander about a point as a quadrotor does: it leans where it accelerates, yaws slowly."""
     waves = ((0, 0.7, 7.3, 0.3), (0, 0.5, 12.1, 1.1), (1, 0.8, 9.1, 2.0), (1, 0.4, 5.9, 0.0),
              (2, 0.2, 8.3, 0.7))
-
-    def motion(time: Array) -> Motion:
-        velocity = np.zeros((len(time), 3))
-        lift = np.tile([0.0, 0.0, _GRAVITY], (len(time), 1))
-        for axis, amplitude, period, phase in waves:
-            velocity[:, axis] += _wave(time, amplitude, period, phase)
-            lift[:, axis] += _wave(time, amplitude * 2 * np.pi / period, period,
-                                   phase + np.pi / 2)
-        yaw = _wave(time, 0.35, 53.0)
-        ahead = np.cos(yaw) * lift[:, 0] + np.sin(yaw) * lift[:, 1]
-        left = np.cos(yaw) * lift[:, 1] - np.sin(yaw) * lift[:, 0]
-        pitch = np.arctan2(ahead, lift[:, 2])
-        roll = -np.arctan2(left, np.hypot(ahead, lift[:, 2]))
-        return Motion(velocity, np.stack([roll, pitch, yaw], axis=-1))
-
-    return motion
+    velocity = np.zeros((len(time), 3))
+    lift = np.tile([0.0, 0.0, _GRAVITY], (len(time), 1))
+    for axis, amplitude, period, phase in waves:
+        velocity[:, axis] += _wave(time, amplitude, period, phase)
+        lift[:, axis] += _wave(time, amplitude * 2 * np.pi / period, period, phase + np.pi / 2)
+    yaw = _wave(time, 0.35, 53.0)
+    ahead = np.cos(yaw) * lift[:, 0] + np.sin(yaw) * lift[:, 1]
+    left = np.cos(yaw) * lift[:, 1] - np.sin(yaw) * lift[:, 0]
+    pitch = np.arctan2(ahead, lift[:, 2])
+    roll = -np.arctan2(left, np.hypot(ahead, lift[:, 2]))
+    return Motion(velocity, np.stack([roll, pitch, yaw], axis=-1))
 
 
-def _steady(speed: float, waves: Sequence[tuple[int, float, float, float]],
-            duration: float) -> Callable[[Array], Motion]:
+def _steady(time: Array, duration: float, speed: float,
+            waves: Sequence[tuple[int, float, float, float]] = ()) -> Motion:
     """Hold speed and course; waves (axis, amplitude, period, phase) swing the attitude alone."""
-    def motion(time: Array) -> Motion:
-        rpy = np.zeros((len(time), 3))
-        for axis, *wave in waves:
-            rpy[:, axis] += _wave(time, *wave)
-        return Motion(np.tile([speed, 0.0, 0.0], (len(time), 1)), rpy)
-
-    return motion
+    rpy = np.zeros((len(time), 3))
+    for axis, *wave in waves:
+        rpy[:, axis] += _wave(time, *wave)
+    return Motion(np.tile([speed, 0.0, 0.0], (len(time), 1)), rpy)
 
 
 # Gusts push the nose of a car on a highway off its course, by a degree.
@@ -237,14 +214,14 @@ _GUSTS = ((0, 0.005, 2.3, 0.0), (0, 0.01, 17.0, 0.0), (1, 0.005, 1.7, 0.0), (2, 
 _SEA = ((0, 0.05, 4.7, 0.0), (1, 0.03, 6.1, 0.0), (2, np.radians(20.0), 11.0, 0.0))
 SCENARIOS = {
     'flight': Scenario(_flight, 100.0, 40.0),
-    'car': Scenario(partial(_road, ()), 100.0, 1.0),
-    'straight': Scenario(partial(_steady, 30.0, ()), 100.0, 15.0),
-    'static': Scenario(partial(_steady, 0.0, ()), 60.0, 1.0),
+    'car': Scenario(_road, 100.0, 1.0),
+    'straight': Scenario(partial(_steady, speed=30.0), 100.0, 15.0),
+    'static': Scenario(partial(_steady, speed=0.0), 60.0, 1.0),
     'hover': Scenario(_hover, 60.0, 2.0),
     'launch': Scenario(_launch, 60.0, 2.0),
-    'reverse': Scenario(partial(_road, _BACK_OUT), 100.0, 1.0),
-    'swing': Scenario(partial(_steady, 5.0, _SEA), 100.0, 5.0),
-    'highway': Scenario(partial(_steady, 10.0, _GUSTS), 60.0, 5.0),
+    'reverse': Scenario(partial(_road, first=_BACK_OUT), 100.0, 1.0),
+    'swing': Scenario(partial(_steady, speed=5.0, waves=_SEA), 100.0, 5.0),
+    'highway': Scenario(partial(_steady, speed=10.0, waves=_GUSTS), 60.0, 5.0),
 }
 
 

@@ -123,22 +123,6 @@ class Simulation:
         return Velocity(int(self.gnss_stamps_ns[k]), self.velocity[k], self.velocity_covariance)
 
 
-# Messages between two updates of a fed aligner: many at a time are quicker.
-FEED_BLOCK = 200
-
-
-def feed(aligner: Any, simulation: Simulation, *, fix: bool = True,
-         velocity: bool = True) -> list[Any]:
-    """Give a recording to an aligner in the order of arrival; return the epochs of all updates."""
-    epochs = []
-    for count, (kind, payload) in enumerate(simulation.messages()):
-        if kind == 'imu' or (fix if kind == 'fix' else velocity):
-            give(aligner, kind, payload)
-        if count % FEED_BLOCK == 0:
-            epochs += aligner.update()
-    return epochs + aligner.flush()
-
-
 def give(aligner: Any, kind: str, payload: Any) -> None:
     """Give an aligner one of the messages of a simulation."""
     if kind == 'imu':
