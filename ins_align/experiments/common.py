@@ -333,38 +333,34 @@ def aligned_row(name: str, runs: list[JsonDict]) -> JsonDict:
 
 
 class Report:
-    """Collects the text of an experiment, prints it, writes it with the command that makes it."""
+    """Collects the page of an experiment, then prints and writes it, with its numbers beside."""
 
     def __init__(self, name: str, title: str, out: Path, command: str = '') -> None:
-        """Start with the title and the command."""
-        self._name = name
-        self._out = out
+        """Start with the title and the command that makes it."""
+        self._name, self._out = name, out
         self._parts = [f'# {title}', f'`ins_align experiment {name} --out DIR{command}`']
-        print(f'{title}\n')
 
     def text(self, text: str) -> None:
         """Add a paragraph."""
         self._parts.append(text)
-        print(text + '\n')
 
     def table(self, title: str, rows: Iterable[JsonDict]) -> None:
         """Add a table of rows with the same titles; None is a dash."""
         rows = list(rows)
         table = format_table([[*row.values()] for row in rows], [*rows[0]])
         self._parts.append(f'{title}\n\n```text\n{table}\n```')
-        print(f'{title}\n\n{table}\n', flush=True)
 
     def figure(self, figure: Any, caption: str) -> None:
         """Write a figure as PNG and refer to it."""
         file = f'{self._name}.png'
         write_whole(self._out / file, lambda png: figure.savefig(png, format='png', dpi=110))
         self._parts.append(f'![{caption}]({file})\n\n{caption}')
-        print(f'{self._out / file}: {caption}\n')
 
     def write(self, numbers: Any) -> None:
-        """Write the text and the numbers."""
-        for suffix, text in (('md', '\n\n'.join(self._parts)),
-                             ('json', json.dumps(_plain(numbers), indent=1))):
+        """Print the page, and write it and the numbers."""
+        page = '\n\n'.join(self._parts)
+        print(page)
+        for suffix, text in (('md', page), ('json', json.dumps(_plain(numbers), indent=1))):
             content = f'{text}\n'.encode()
             write_whole(self._out / f'{self._name}.{suffix}', lambda file: file.write(content))
 

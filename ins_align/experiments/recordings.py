@@ -130,41 +130,36 @@ def run_window(task: tuple[Path, float, float, JsonDict]) -> JsonDict:
     part = recording.part(start_s, duration)
     result = align(**part, **{**recording.config, **config})
     epochs = [epoch for epoch in result.epochs if not epoch.dry]
-    stamps, velocities = _velocities(**part)
-    minute = velocities[stamps <= stamps[:1] + round(MOTION_TIME * SECOND)]
     return {'start_s': start_s, 'state': result.status.state.value,
-            'moves': _change(minute) >= MOTION_SPEED,
+            'moves': _moves(**part),
             'covers_minute': min(recording.duration - start_s, duration) >= MOTION_TIME,
             'at': at_times(recording, epochs),
             **while_aligned(epochs, int(part['stamps'][0]), recording.attitudes_at,
                             recording.reference_std_deg)}
 
 
-def _velocities(stamps: np.ndarray, fixes: list[Fix], velocities: list[Velocity], **imu: Array,
-                ) -> tuple[np.ndarray, Array]:
-    """Horizontal velocities of a window, stamps and ENU; from positions where there are none."""
+def _moves(stamps: np.ndarray, fixes: list[Fix], velocities: list[Velocity], **imu: Array) -> bool:
+    """Tell whether the horizontal velocity, or that of the positions, changes in a minute."""
     measured = [m for m in velocities if np.isfinite(m.velocity).all()]
     if measured:
-        return (np.array([m.stamp_ns for m in measured]),
-                np.array([m.velocity[:2] for m in measured]))
-    rows = np.array([[m.stamp_ns - stamps[0], m.latitude_deg, m.longitude_deg, m.altitude_m]
-                     for m in fixes]).reshape(-1, 4)
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    if len(rows) < 3:
-        return np.zeros(0, np.int64), np.zeros((0, 2))
-    time, places = track(series_of(rows[:, 0] / SECOND, rows[:, 1:]))
-    # Over half a second, against the noise of a fix.
-    step = max(1, int(round(0.25 / np.median(np.diff(time)))))
-    moved = (places[2 * step:] - places[:-2 * step])[:, :2]
-    return (stamps[0] + np.rint(time[step:-step] * SECOND).astype(np.int64),
-            moved / (time[2 * step:] - time[:-2 * step])[:, None])
-
-
-def _change(velocities: Any) -> float:
-    """Largest difference of two velocities, shape (N, 2), m/s, to 1 %."""
-    angles = np.radians(np.arange(0.0, 180.0, 15.0))
-    extents = np.asarray(velocities).reshape(-1, 2) @ [np.cos(angles), np.sin(angles)]
-    return float(np.max(np.ptp(extents, axis=0))) if len(extents) else 0.0
+        times = np.array([m.stamp_ns for m in measured])
+        v = np.array([m.velocity[:2] for m in measured])
+    else:
+        rows = np.array([[m.stamp_ns - stamps[0], m.latitude_deg, m.longitude_deg, m.altitude_m]
+                         for m in fixes]).reshape(-1, 4)
+        rows = rows[np.isfinite(rows).all(axis=1)]
+        if len(rows) < 3:
+            return False
+        time, places = track(series_of(rows[:, 0] / SECOND, rows[:, 1:]))
+        # Over half a second, against the noise of a fix.
+        step = max(1, int(round(0.25 / np.median(np.diff(time)))))
+        times = stamps[0] + np.rint(time[step:-step] * SECOND).astype(np.int64)
+        v = ((places[2 * step:] - places[:-2 * step])[:, :2]
+             / (time[2 * step:] - time[:-2 * step])[:, None])
+    v = v[times <= times[:1] + round(MOTION_TIME * SECOND)]
+    angles = np.radians(np.arange(0.0, 180.0, 15.0))    # the largest difference to 1 %
+    extents = np.ptp(v @ [np.cos(angles), np.sin(angles)], axis=0) if len(v) else np.zeros(1)
+    return bool(extents.max() >= MOTION_SPEED)
 
 
 def at_times(recording: Recording, epochs: list[Epoch]) -> dict[str, JsonDict]:
