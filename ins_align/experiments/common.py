@@ -14,9 +14,9 @@
 """
 What the experiments share: cases and their runs, errors against truth, tables and pages.
 
-A case is a simulated vehicle whose messages are spoilt, aligned and judged against the truth.
-Every campaign draws cases from numbers, `run_case` runs them in the same way, and its tables have
-a row for all runs of a name.
+A case is a simulated vehicle whose messages are spoilt, aligned and judged against the truth. Each
+experiment has a table of cases or draws them from numbers; all are prepared and followed in the
+same way, and tables have a row for all runs of a name.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def combination(index: int, seed: Sequence[int], *axes: Iterable[Any]) -> Any:
     return combinations[order[place]]
 
 
-def setup(random: np.random.Generator) -> JsonDict:
+def setup(random: Random) -> JsonDict:
     """Draw heading, latitude, lever arm and mount as arguments of `simulate`."""
     return {'heading_deg': random.uniform(-180, 180), 'latitude_deg': random.uniform(-75, 75),
             'lever_arm': random.uniform(-1.5, 1.5, 3).tolist(),

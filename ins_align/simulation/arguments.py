@@ -35,14 +35,14 @@ _MAX_SAMPLES = 20_000_000
 # As far as the parameters of the aligner go that make up for them.
 _MOST = {parameter.name: parameter.maximum for parameter in parameters()
          if parameter.maximum is not None}
-# Errors that an IMU has by default because of its grade; the others have noise and biases alone.
-# The estimator takes misalignment and the errors of the accelerometers for 3 tenths of the gyros'
-# scale factor errors.
+# Errors that a chip has by default; the other grades have noise and biases alone. The estimator
+# takes misalignment and the errors of the accelerometers for 3 tenths of the gyros' scale factor
+# errors.
 _CHIP = PRESETS['chip']
-_OF_GRADE = {'chip': {
+_OF_CHIP = {
     'gyro_scale_std': _CHIP.gyro_scale_std, 'rate_random_walk': _CHIP.rate_random_walk,
     **dict.fromkeys(('gyro_misalignment_std', 'accel_scale_std', 'accel_misalignment_std'),
-                    0.3 * _CHIP.gyro_scale_std)}}
+                    0.3 * _CHIP.gyro_scale_std)}
 
 
 class SimulationError(ValueError):
@@ -182,17 +182,15 @@ class Arguments:
         if self.duration * rate > _MAX_SAMPLES:
             raise SimulationError(f'{self.duration:g} s at {rate:g} Hz are too many '
                                   f'samples, the limit is {_MAX_SAMPLES}')
-        of_grade = {} if isinstance(grade, ImuNoise) else _OF_GRADE.get(grade, {})
-        for name in _OF_GRADE['chip']:
+        for name, of_chip in _OF_CHIP.items():
             if getattr(self, name) is None:
-                object.__setattr__(self, name, of_grade.get(name, 0.0))
+                object.__setattr__(self, name, of_chip if grade == 'chip' else 0.0)
 
     @property
     def imu_noise(self) -> ImuNoise:
         """Return what the errors of the IMU are drawn from, in SI units."""
         noise = PRESETS[self.imu_grade] if isinstance(self.imu_grade, str) else self.imu_grade
-        own = {'gyro_bias_std': self.gyro_bias_std, 'accel_bias_std': self.accel_bias_std,
-               'gyro_scale_std': self.gyro_scale_std, 'rate_random_walk': self.rate_random_walk}
+        own = {name: getattr(self, name, None) for name in ImuNoise._fields}
         return noise._replace(**{name: value for name, value in own.items() if value is not None})
 
 

@@ -67,27 +67,22 @@ class Scenario(NamedTuple):
     set_off: float   # s from a stand still to full motion
 
 
-def motion_function(name: str, duration: float, heading: float = 0.0, crab: float = 0.0,
-                    stand_still: float = 0.0) -> Callable[[Array], Motion]:
+def motion_of(time: Array, scenario: Scenario, duration: float, heading: float, crab: float,
+              stand_still: float) -> Motion:
     """
-    Return the motion of one of `SCENARIOS` as a function of times (n,), for so many seconds.
+    Return the motion of a scenario at times (n,), for so many seconds.
 
     Heading turns the whole trajectory about the vertical, crab the nose alone; the motion begins
     after some seconds at rest.
     """
-    scenario = SCENARIOS[name]
+    pace = np.ones_like(time)
+    if stand_still > 0:
+        # The same path, passed along slowly at first.
+        pace = _step(time, stand_still, scenario.set_off)
+        time = _step_integral(time, stand_still, scenario.set_off)
+    velocity, rpy = scenario.motion(time, duration)
     turn = matrix_from_rpy([0.0, 0.0, heading])
-
-    def at(time: Array) -> Motion:
-        pace = np.ones_like(time)
-        if stand_still > 0:
-            # The same path, passed along slowly at first.
-            pace = _step(time, stand_still, scenario.set_off)
-            time = _step_integral(time, stand_still, scenario.set_off)
-        velocity, rpy = scenario.motion(time, duration)
-        return Motion(velocity * pace[:, None] @ turn.T, rpy + [0.0, 0.0, heading + crab])
-
-    return at
+    return Motion(velocity * pace[:, None] @ turn.T, rpy + [0.0, 0.0, heading + crab])
 
 
 def _step(time: Array, start: float, width: float) -> Array:
@@ -307,8 +302,9 @@ def trajectory_of(
     from pyins.transform import mat_from_rph
     from scipy.interpolate import CubicHermiteSpline
 
-    motion = motion_function(scenario, duration, math.radians(heading_deg),
-                             math.radians(crab_deg), stand_still)
+    motion = partial(motion_of, scenario=SCENARIOS[scenario], duration=duration,
+                     heading=math.radians(heading_deg), crab=math.radians(crab_deg),
+                     stand_still=stand_still)
     index = np.arange(-_PADDING, int(duration * imu_rate + 1e-6) + 1 + _PADDING, dtype=float)
     if imu_jitter > 0:
         jitter = np.random.default_rng(_JITTER_SEED)
