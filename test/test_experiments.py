@@ -13,9 +13,11 @@
 # limitations under the License.
 """The experiments: small runs whose numbers are known, and the errors a user can make."""
 
+from concurrent.futures.process import BrokenProcessPool
 import itertools
 import json
 import math
+import os
 
 from ins_align import experiments
 from ins_align.aligner import Aligner, Attitude, State
@@ -31,7 +33,7 @@ pytest.importorskip('pyins')
 
 
 def square(number):
-    """Be a function that another process can import."""
+    """Return a square; another process can import this."""
     return number * number
 
 
@@ -40,6 +42,19 @@ def test_parallel_keeps_the_order_in_any_number_of_processes():
     for jobs in (1, 2):
         assert common.parallel(square, [tasks, [], tasks[:2]], jobs) == [
             [n * n for n in tasks], [], [0, 1]]
+
+
+def leave(status):
+    """End the process."""
+    os._exit(status)
+
+
+def test_parallel_ends_with_whoever_fails():
+    for jobs in (1, 2):
+        with pytest.raises(TypeError):
+            common.parallel(square, [[1, None, 2]], jobs)
+    with pytest.raises(BrokenProcessPool):
+        common.parallel(leave, [[1, 1]], 2)
 
 
 def test_error_is_counted_in_stated_sigmas():

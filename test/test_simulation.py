@@ -16,10 +16,9 @@
 from dataclasses import replace
 import math
 
-from alignment import feed
 from ins_align.config import config_from_mapping, ImuNoise, load_params, PRESETS
 from ins_align.geometry.rotation import log_so3, matrix_from_quaternion, matrix_from_rpy
-from ins_align.gnss.messages import ENU_FROM_NED, Fix, Velocity
+from ins_align.gnss.messages import ENU_FROM_NED
 from ins_align.simulation.scenarios import FLU_FROM_FRD, START_NS
 from ins_align.simulation.simulate import SCENARIOS, simulate, SimulationError, write_bag
 import numpy as np
@@ -381,52 +380,25 @@ def test_faults():
     assert_same(simulate('car', duration=5.0, accel_sign=-1).accel, -plain.accel)
 
 
-class Recorder:
-    """Keeps what an aligner is given."""
-
-    def __init__(self):
-        self.log = []
-
-    def add_imu(self, stamps, gyro, accel):
-        assert gyro.shape == accel.shape == (len(stamps), 3)
-        self.log.append(('imu', stamps[0], stamps[-1]))
-
-    def add_fix(self, fix):
-        self.log.append(fix)
-
-    def add_velocity(self, velocity):
-        self.log.append(velocity)
-
-    def update(self):
-        return ['epoch']
-
-    def flush(self):
-        return ['last']
-
-
-def test_feed_gives_everything_once_in_the_order_of_arrival():
+def test_messages_come_once_in_the_order_of_arrival():
     s = simulate('car', duration=5.0, gnss_latency=0.25)
-    recorder = Recorder()
-    epochs = feed(recorder, s)
-    imu = [entry for entry in recorder.log if not isinstance(entry, (Fix, Velocity))]
-    assert epochs == ['epoch'] * (len(epochs) - 1) + ['last']
-    assert imu[0][1] == s.imu_stamps_ns[0] and imu[-1][2] == s.imu_stamps_ns[-1]
+    of_kind = {'imu': [], 'fix': [], 'velocity': []}
     newest = 0
-    for entry in recorder.log:
-        if isinstance(entry, (Fix, Velocity)):
-            # An epoch that would arrive after the last sample comes last.
-            assert newest <= entry.stamp_ns + 250_000_000
-            assert newest > entry.stamp_ns + 239_000_000 or newest == s.imu_stamps_ns[-1]
+    for kind, payload in s.messages():
+        of_kind[kind].append(payload)
+        if kind == 'imu':
+            assert payload[0][0] > newest
+            newest = payload[0][-1]
         else:
-            assert entry[1] > newest
-            newest = entry[2]
-    fixes = [entry for entry in recorder.log if isinstance(entry, Fix)]
-    velocities = [entry for entry in recorder.log if isinstance(entry, Velocity)]
-    np.testing.assert_array_equal([fix[1:4] for fix in fixes], s.lla_deg)
-    np.testing.assert_array_equal([v.velocity for v in velocities], s.velocity)
-    assert [fix.stamp_ns for fix in fixes] == s.gnss_stamps_ns.tolist()
-    feed(recorder := Recorder(), s, velocity=False)
-    assert not any(isinstance(entry, Velocity) for entry in recorder.log)
+            # An epoch that would arrive after the last sample comes last.
+            assert newest <= payload.stamp_ns + 250_000_000
+            assert newest > payload.stamp_ns + 239_000_000 or newest == s.imu_stamps_ns[-1]
+    for given, sent in zip(zip(*of_kind['imu']), (s.imu_stamps_ns, s.gyro, s.accel), strict=True):
+        np.testing.assert_array_equal(np.concatenate(given), sent)
+    np.testing.assert_array_equal([fix[1:4] for fix in of_kind['fix']], s.lla_deg)
+    np.testing.assert_array_equal([v.velocity for v in of_kind['velocity']], s.velocity)
+    for kind in 'fix', 'velocity':
+        assert [each.stamp_ns for each in of_kind[kind]] == s.gnss_stamps_ns.tolist()
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])

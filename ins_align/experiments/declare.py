@@ -32,8 +32,9 @@ from ins_align.aligner import State
 from ins_align.config import Config, PRESETS
 from ins_align.experiments.bound import bound_of
 from ins_align.experiments.common import (
-    Case, cell, combination, follow, GRADES, groups_of, JsonDict, moment_row, parallel,
-    prepare, Report, run_case, setup)
+    Case, cell, combination, follow, GRADES, groups_of, JsonDict, moment_row, parallel, prepare,
+    Report, run_case, setup)
+from ins_align.experiments.spoilt import Random
 from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
 
@@ -81,25 +82,25 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
 
 # Part 1: faults
 
-def _outliers(random: np.random.Generator) -> JsonDict:
+def _outliers(random: Random) -> JsonDict:
     return {'outlier_rate': random.uniform(0.01, 0.1),
             'outlier_velocity': random.uniform(0.5, 10.0),
             'outlier_position': random.uniform(10.0, 100.0)}
 
 
-def _outages(random: np.random.Generator) -> JsonDict:
+def _outages(random: Random) -> JsonDict:
     starts = random.uniform(5.0, DURATION - 10.0, random.integers(1, 4))
     return {'outages': [[start, start + random.uniform(2.0, 15.0)] for start in starts]}
 
 
-def _lever(random: np.random.Generator) -> JsonDict:
+def _lever(random: Random) -> JsonDict:
     direction = random.standard_normal(3)
     return {'lever_arm': (random.uniform(0.1, 2.0) * direction
                           / np.linalg.norm(direction)).tolist()}
 
 
 # What each draws to change of the arguments of `simulate`.
-FAULTS: dict[str, Callable[[np.random.Generator], JsonDict]] = {
+FAULTS: dict[str, Callable[[Random], JsonDict]] = {
     'none': lambda random: {}, 'outliers': _outliers, 'outages': _outages,
     'delay': lambda random: {'gnss_delay': random.uniform(0.02, 0.2)},
     'lever arm left out': _lever,
@@ -116,9 +117,8 @@ def draw(index: int) -> Case:
     """Draw a run of ``declare``."""
     fault, scenario, grade = combination(index, [], FAULTS, SCENARIOS, GRADES)
     random = np.random.default_rng([1, index])
-    lever = random.uniform(-1.5, 1.5, 3)
     arguments: JsonDict = {
-        'duration': DURATION, 'lever_arm': lever.tolist(),
+        'duration': DURATION, 'lever_arm': random.uniform(-1.5, 1.5, 3).tolist(),
         'heading_deg': random.uniform(-180, 180), 'latitude_deg': random.uniform(-75, 75),
         'mount_rpy_deg': random.uniform(-20, 20, 3).tolist()}
     return Case(fault, ((scenario, grade),), None, arguments | FAULTS[fault](random),
