@@ -31,8 +31,7 @@ from typing import Any
 from ins_align.config import Config
 from ins_align.experiments import dense
 from ins_align.experiments.common import (
-    Case, error_of, follow, GRADES, JsonDict, parallel, prepare, Report, run_cases,
-    simulated)
+    Case, error_of, follow, GRADES, JsonDict, parallel, prepare, Report, run_cases, simulated)
 from ins_align.geometry.rotation import Array, roll_pitch_yaw
 from ins_align.report import new_figure
 import numpy as np
@@ -77,9 +76,8 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
                for each in results_of(case, limit, found)]
     report.text(
         'GNSS 5 Hz, 0.1 m/s, lever arm [1 1 1] m unless said otherwise. Errors of the attitude at '
-        't0; tilt: both axes. '
-        'NEES/3: mean normalised squared error of the three angles, 1 when sigma is right. '
-        'Chance alone (1 sigma) moves a ratio by the root of 1/(2 runs), NEES/3 by that of '
+        't0; tilt: both axes. NEES/3: mean normalised squared error of the three angles, 1 when '
+        'sigma is right. Chance alone (1 sigma) moves a ratio by the root of 1/(2 runs), NEES/3 by that of '
         '2/(3 runs). The aligner is told the noise and that lever arm and delay are known, but '
         f'where they are the unknown (prior {LEVER_STD:g} m per axis; true {DELAY:g} s, prior '
         f'{DELAY_STD:g} s).')
@@ -111,7 +109,7 @@ def run_exact(task: tuple[Case, int]) -> JsonDict:
     (K, 3) and of roll, pitch, yaw (K, 3), degrees, and the normalised squared error (K,).
     """
     case, seed = task
-    if 'lever_arm_std' in case.config:      # another one in each run
+    if 'lever_arm_std' in case.config:      # another one in each run, that of the bound is fixed
         case = case._replace(drawn=_lever_arm)
     simulation, stream, aligner = prepare(case, seed)
     rows = []
