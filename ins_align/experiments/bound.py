@@ -77,10 +77,10 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     report.text(
         'GNSS 5 Hz, 0.1 m/s, lever arm [1 1 1] m unless said otherwise. Errors of the attitude at '
         't0; tilt: both axes. NEES/3: mean normalised squared error of the three angles, 1 when '
-        'sigma is right. Chance alone (1 sigma) moves a ratio by the root of 1/(2 runs), NEES/3 by that of '
-        '2/(3 runs). The aligner is told the noise and that lever arm and delay are known, but '
-        f'where they are the unknown (prior {LEVER_STD:g} m per axis; true {DELAY:g} s, prior '
-        f'{DELAY_STD:g} s).')
+        'sigma is right. Chance alone (1 sigma) moves a ratio by the root of 1/(2 runs), NEES/3 '
+        'by that of 2/(3 runs). The aligner is told the noise and that lever arm and delay are '
+        f'known, but where they are the unknown (prior {LEVER_STD:g} m per axis; true {DELAY:g} '
+        f's, prior {DELAY_STD:g} s).')
     report.table(
         f'Targets: ratio of error and bound at most {RATIO_LIMIT:g}, NEES/3 within '
         f'{NEES_RANGE[0]:g} to {NEES_RANGE[1]:g}; beyond chance: by more than two of its sigmas',
