@@ -24,8 +24,9 @@ depend on the messages alone and not on when `update` is called.
 """
 
 from collections import Counter
+import dataclasses
 
-from ins_align.config import Config, ConfigError, parameters
+from ins_align.config import Config, ConfigError
 from ins_align.estimation.bank import Bank, Learnt
 from ins_align.estimation.declaration import Declaration, Fit
 from ins_align.estimation.formula import NoteMethod
@@ -173,11 +174,10 @@ class Aligner:
 
     def reconfigure(self, config: Config) -> None:
         """Change thresholds and hold time; ConfigError if anything else differs."""
-        for parameter in parameters():
-            if parameter.read_only and (getattr(config, parameter.name)
-                                        != getattr(self.config, parameter.name)):
-                raise ConfigError(f'{parameter.name} cannot change while running: set it at '
-                                  'start')
+        for own in dataclasses.fields(Config):
+            if own.metadata['read_only'] and (getattr(config, own.name)
+                                              != getattr(self.config, own.name)):
+                raise ConfigError(f'{own.name} cannot change while running: set it at start')
         self.config = self._declaration.config = config
 
     # Processing: steps 3 to 8

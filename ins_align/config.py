@@ -69,8 +69,8 @@ PRESETS = {
 }
 
 
-def _parameter(default: Any, description: str, unit: str = '', *, minimum: float | None = None,
-               maximum: float | None = None, choices: tuple[Any, ...] = (),
+def _parameter(default: Any, description: str, unit: str = '', minimum: float | None = None,
+               maximum: float | None = None, *, choices: tuple[Any, ...] = (),
                runtime: bool = False) -> Any:
     return dataclasses.field(default=default, metadata={
         'description': description, 'unit': unit, 'minimum': minimum, 'maximum': maximum,
@@ -83,17 +83,16 @@ class Config:
     Everything that a user can set, checked.
 
     Each field's metadata holds ``description``, ``unit``, ``minimum`` and ``maximum`` (inclusive,
-    None: no limit or not a number), ``choices`` and ``read_only``; `parameters` lists them. A
-    value of the wrong type, outside its range or that contradicts another one is a ConfigError.
+    None: not a number), ``choices`` and ``read_only``. A value of the wrong type, outside its
+    range or that contradicts another one is a ConfigError.
     """
 
     lever_arm: tuple[float, float, float] = _parameter(
         (0.0, 0.0, 0.0), 'lever arm from the IMU to the GNSS antenna, in the IMU frame '
-        '(x forward, y left, z up); each number with a point: 0.0', 'm',
-        minimum=-1000.0, maximum=1000.0)
+        '(x forward, y left, z up); each number with a point: 0.0', 'm', -1000.0, 1000.0)
     lever_arm_std: float = _parameter(
         1.0, 'how well the lever arm is known, 1 sigma per axis; above 0 it is estimated too',
-        'm', minimum=0.0, maximum=100.0)
+        'm', 0.0, 100.0)
     lever_arm_from_tf: str | bool = _parameter(
         'auto', 'take the lever arm from the transform between the frame_ids of IMU and position '
         'messages (/tf_static); auto: where there is one and lever_arm is not set, or zero; true: '
@@ -108,10 +107,10 @@ class Config:
         choices=('none', 'car', 'boat', 'aeroplane'))
     vehicle_velocity_std: float = _parameter(
         0.0, 'velocity sideways and upwards that lasts (slip, leeway, wind), 1 sigma; 0: of a car '
-        '0.1, of a boat 1, of an aeroplane 10', 'm/s', minimum=0.0, maximum=100.0)
+        '0.1, of a boat 1, of an aeroplane 10', 'm/s', 0.0, 100.0)
     mount_yaw_std: float = _parameter(
         1.0, 'how well the x axis is known to point along the motion, sideways and upwards, 1 '
-        'sigma; no heading from it is better', 'deg', minimum=0.0, maximum=30.0)
+        'sigma; no heading from it is better', 'deg', 0.0, 30.0)
     use_velocity: str | bool = _parameter(
         'auto', 'align with GNSS velocities; auto: when they arrive', choices=AUTO_OR_BOOL)
     use_position: str | bool = _parameter(
@@ -131,60 +130,48 @@ class Config:
         'measured', 'absent: the receiver does not measure the vertical velocity and sends 0, as '
         'NMEA drivers do', choices=('measured', 'absent'))
     gnss_delay: float = _parameter(
-        0.0, 'a GNSS measurement is older than its stamp by this much', 's',
-        minimum=-10.0, maximum=10.0)
+        0.0, 'a GNSS measurement is older than its stamp by this much', 's', -10.0, 10.0)
     gnss_delay_std: float = _parameter(
-        0.1, 'how well the delay is known, 1 sigma; above 0 it is estimated too', 's',
-        minimum=0.0, maximum=10.0)
+        0.1, 'how well the delay is known, 1 sigma; above 0 it is estimated too', 's', 0.0, 10.0)
     gnss_lateness: float = _parameter(
         1.0, 'how much later than newer IMU samples a GNSS or IMU message may arrive and '
-        'still be used', 's', minimum=0.0, maximum=60.0)
+        'still be used', 's', 0.0, 60.0)
     imu_grade: str = _parameter(
         'mems', 'preset of the six figures below; custom: the first four must be given',
         choices=(*PRESETS, 'custom'))
     angle_random_walk: float = _parameter(
-        0.0, "angle random walk of the gyroscopes; 0: the preset's", 'deg/sqrt(h)',
-        minimum=0.0, maximum=1000.0)
+        0.0, "angle random walk of the gyroscopes; 0: the preset's", 'deg/sqrt(h)', 0.0, 1000.0)
     velocity_random_walk: float = _parameter(
         0.0, "velocity random walk of the accelerometers; 0: the preset's", 'm/s/sqrt(h)',
-        minimum=0.0, maximum=1000.0)
+        0.0, 1000.0)
     gyro_bias_std: float = _parameter(
-        0.0, "gyroscope bias, 1 sigma per axis; 0: the preset's", 'deg/s',
-        minimum=0.0, maximum=100.0)
+        0.0, "gyroscope bias, 1 sigma per axis; 0: the preset's", 'deg/s', 0.0, 100.0)
     accel_bias_std: float = _parameter(
-        0.0, "accelerometer bias, 1 sigma per axis; 0: the preset's", 'm/s^2',
-        minimum=0.0, maximum=10.0)
+        0.0, "accelerometer bias, 1 sigma per axis; 0: the preset's", 'm/s^2', 0.0, 10.0)
     gyro_scale_std: float = _parameter(
         0.0, 'scale factor error of the gyroscopes, 1 sigma per axis, 0.01 is one percent; 0: the '
         "preset's; where that is above 0 it is estimated, as are, 3 tenths of it, misalignment "
-        'and the errors of the accelerometers', '1',
-        minimum=0.0, maximum=0.5)
+        'and the errors of the accelerometers', '1', 0.0, 0.5)
     rate_random_walk: float = _parameter(
         0.0, "rate random walk of the gyroscopes: how their biases change; 0: the preset's",
-        'deg/s/sqrt(h)', minimum=0.0, maximum=100.0)
+        'deg/s/sqrt(h)', 0.0, 100.0)
     velocity_std: float = _parameter(
         0.3, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none, and '
-        'where its estimate starts then', 'm/s',
-        minimum=1e-4, maximum=100.0)
+        'where its estimate starts then', 'm/s', 1e-4, 100.0)
     velocity_std_vertical: float = _parameter(
-        0.6, 'vertical GNSS velocity, 1 sigma, where messages carry none', 'm/s',
-        minimum=1e-4, maximum=100.0)
+        0.6, 'vertical GNSS velocity, 1 sigma, where messages carry none', 'm/s', 1e-4, 100.0)
     position_std: float = _parameter(
         2.5, 'horizontal GNSS position, 1 sigma per axis, where messages carry none, and '
-        'where its estimate starts then', 'm',
-        minimum=1e-4, maximum=1000.0)
+        'where its estimate starts then', 'm', 1e-4, 1000.0)
     position_std_vertical: float = _parameter(
-        5.0, 'vertical GNSS position, 1 sigma, where messages carry none', 'm',
-        minimum=1e-4, maximum=1000.0)
+        5.0, 'vertical GNSS position, 1 sigma, where messages carry none', 'm', 1e-4, 1000.0)
     heading_std_threshold: float = _parameter(
-        1.0, 'declare the heading when its sigma is below', 'deg',
-        minimum=1e-4, maximum=180.0, runtime=True)
+        1.0, 'declare the heading when its sigma is below', 'deg', 1e-4, 180.0, runtime=True)
     tilt_std_threshold: float = _parameter(
-        0.5, 'declare roll and pitch when their sigmas are below', 'deg',
-        minimum=1e-4, maximum=90.0, runtime=True)
+        0.5, 'declare roll and pitch when their sigmas are below', 'deg', 1e-4, 90.0, runtime=True)
     hold_time: float = _parameter(
         1.0, 'every condition must have held for this long before a declaration', 's',
-        minimum=0.0, maximum=3600.0, runtime=True)
+        0.0, 3600.0, runtime=True)
     trust_imu_axes: bool = _parameter(
         False, 'the axes and signs of the IMU are known to be right: declare a heading without '
         'waiting for motion that shows it, also at rest', choices=(True, False))
@@ -236,59 +223,27 @@ class Config:
                           in zip(own, PRESETS[self.imu_grade])))
 
 
-class Parameter(NamedTuple):
-    """One field of `Config` as a ROS parameter is described."""
-
-    name: str
-    default: Any
-    description: str
-    unit: str
-    minimum: float | None
-    maximum: float | None
-    choices: tuple[Any, ...]
-    read_only: bool
-
-
-def parameters() -> tuple[Parameter, ...]:
-    """List the parameters in the order of the documentation."""
-    return tuple(Parameter(field.name, field.default, **field.metadata)
-                 for field in dataclasses.fields(Config))
-
-
 def config_from_mapping(values: Mapping[str, Any]) -> Config:
-    """
-    Make a configuration from names and values, the defaults for the rest.
-
-    A ConfigError names those that come close to a name that is not known, or says what is wrong.
-    """
-    known = [field.name for field in dataclasses.fields(Config)]
-    for name in values:
-        if name not in known:
-            hint = _did_you_mean(name) or f'the parameters are {", ".join(known)}'
-            raise ConfigError(f'unknown parameter {reprlib.repr(name)}: {hint}')
-    return Config(**values)
+    """Make a configuration of names and values; a ConfigError names what is wrong."""
+    known, unknown = without_unknown(values)
+    if unknown:
+        raise ConfigError(unknown[0])
+    return Config(**known)
 
 
 def without_unknown(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """
-    Return the values whose names are known, and a warning of each of the others.
+    Return the values whose names are known, and a sentence on each of the others.
 
     A file with parameters for many nodes is not wrong; a slip of the pen must not pass unseen.
     """
-    known = {field.name for field in dataclasses.fields(Config)}
-    warnings = []
-    for name in sorted(map(str, values.keys() - known)):
-        hint = _did_you_mean(name)
-        warnings.append(f'parameter {name!r} is not known and has no effect'
-                        + (hint and f': {hint}'))
-    return {name: value for name, value in values.items() if name in known}, warnings
-
-
-def _did_you_mean(name: str) -> str:
-    """Ask for the parameters that come close to a name; empty where none does."""
-    close = difflib.get_close_matches(
-        str(name), [field.name for field in dataclasses.fields(Config)])
-    return f'did you mean {" or ".join(close)}?' if close else ''
+    known = [field.name for field in dataclasses.fields(Config)]
+    sentences = []
+    for name in sorted(str(name) for name in values if name not in known):
+        close = difflib.get_close_matches(name, known)
+        hint = f': did you mean {" or ".join(close)}?' if close else ''
+        sentences.append(f'parameter {reprlib.repr(name)} is not known{hint}')
+    return {name: value for name, value in values.items() if name in known}, sentences
 
 
 def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -388,9 +343,7 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
             value = value.lower() == 'true'
         # 1 == True, but a number is neither a word nor a truth value.
         fits = any(type(value) is type(choice) and value == choice for choice in choices)
-        expected = 'one of ' + ', '.join(
-            str(choice).lower() if isinstance(choice, bool) else str(choice) or '""'
-            for choice in choices)
+        expected = f'one of {listed_choices(choices)}'
     elif isinstance(default, str):
         expected = 'a name without spaces and without a leading slash'
         fits = value == default == '' or isinstance(value, str) and bool(
@@ -412,6 +365,12 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
         got = ' '.join(reprlib.repr(value).split())
         raise ConfigError(f'{field.name} must be {expected}, got {got}')
     return value
+
+
+def listed_choices(choices: Iterable[Any]) -> str:
+    """List what a parameter can be, as it is written in YAML."""
+    return ', '.join(str(choice).lower() if isinstance(choice, bool) else str(choice) or '""'
+                     for choice in choices)
 
 
 def _range(line: Mapping[str, Any]) -> str:

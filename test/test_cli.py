@@ -469,7 +469,7 @@ def test_parameters_of_others_in_a_file_are_told(flight, tmp_path, capsys):
         text + '/**:\n  ros__parameters:\n    map_frame: map\n    hold_tme: 2.0\n')
     assert main(['replay', str(flight), '--params', str(path)]) == 0
     said = capsys.readouterr().err
-    assert "parameter 'map_frame'" in said and 'has no effect: did you mean hold_time?' in said
+    assert "parameter 'map_frame'" in said and 'is not known: did you mean hold_time?' in said
 
 
 @pytest.mark.parametrize('command, encoding, name, shown', [

@@ -15,6 +15,7 @@
 
 import ast
 import configparser
+import dataclasses
 from importlib import import_module
 import math
 from pathlib import Path
@@ -23,7 +24,7 @@ import subprocess
 import sys
 
 from catkin_pkg.package import parse_package
-from ins_align.config import parameters
+from ins_align.config import Config
 import numpy as np
 import pytest
 
@@ -125,10 +126,9 @@ def test_page_lists_every_parameter_with_its_default():
     page = read('docs/parameters.md')
     rows = dict(re.findall(r'^\| `(\w+)` \| `([^`]+)` \|', page, re.MULTILINE))
     defaults = {}
-    for parameter in parameters():
-        value = list(parameter.default) if isinstance(parameter.default, tuple) \
-            else parameter.default
-        defaults[parameter.name] = (
+    for field in dataclasses.fields(Config):
+        value = list(field.default) if isinstance(field.default, tuple) else field.default
+        defaults[field.name] = (
             str(value).lower() if isinstance(value, bool) else str(value) or "''")
     assert rows == defaults
 

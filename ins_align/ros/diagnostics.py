@@ -16,11 +16,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+import dataclasses
 import re
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Vector3Stamped
-from ins_align.config import Config, Parameter, parameters
+from ins_align.config import Config, listed_choices
 from ins_align.gnss.drivers import type_in_words
 from ins_align.mounting import Mounting
 from ins_align.results import Status, status_values
@@ -78,7 +80,7 @@ def inputs_in_words(node: Node, inputs: Mapping[str, type], config: Config) -> s
                        for topic, msg_type in inputs.items())
     default = Config()
     changed = ''.join(
-        f', {own.name} {getattr(config, own.name)}' for own in parameters()
+        f', {own.name} {getattr(config, own.name)}' for own in dataclasses.fields(Config)
         if own.name != 'lever_arm'
         and getattr(config, own.name) != getattr(default, own.name))
     return (f'reads {topics}; lever_arm {list(config.lever_arm)} m{changed}, '
@@ -108,18 +110,17 @@ def topic_faults(node: Node, inputs: Mapping[str, type], expected: Sequence[str]
         yield f'{name} is published as {type_in_words(other)}, not {type_in_words(wanted)}{hint}'
 
 
-def parameter_descriptor(parameter: Parameter) -> ParameterDescriptor:
+def parameter_descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
     """Describe one field of `Config` to ROS."""
-    unit = f' [{parameter.unit}]' if parameter.unit else ''
+    line = field.metadata
+    unit = f' [{line["unit"]}]' if line['unit'] else ''
     descriptor = ParameterDescriptor(
-        description=parameter.description + unit, read_only=parameter.read_only)
-    if parameter.choices:
-        descriptor.additional_constraints = 'one of: ' + ', '.join(
-            str(choice).lower() if isinstance(choice, bool) else choice
-            for choice in parameter.choices)
-    if parameter.minimum is not None and parameter.maximum is not None:
+        description=line['description'] + unit, read_only=line['read_only'])
+    if line['choices']:
+        descriptor.additional_constraints = f'one of: {listed_choices(line["choices"])}'
+    if line['maximum'] is not None:
         descriptor.floating_point_range = [FloatingPointRange(
-            from_value=parameter.minimum, to_value=parameter.maximum)]
+            from_value=line['minimum'], to_value=line['maximum'])]
     return descriptor
 
 

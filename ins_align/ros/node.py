@@ -33,8 +33,7 @@ from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
 from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
 from ins_align.checks import InputChecks
 from ins_align.config import (
-    Config, config_from_mapping, ConfigError, NODE_NAME, parameters, RCLPY_PARAMETERS,
-    without_unknown)
+    Config, config_from_mapping, ConfigError, NODE_NAME, RCLPY_PARAMETERS, without_unknown)
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
 from ins_align.mounting import Mounting, MountingSearch
@@ -429,7 +428,7 @@ class AlignmentNode(Node):
         for name in declared:
             if name not in RCLPY_PARAMETERS:
                 self.undeclare_parameter(name)
-        for own in parameters():
+        for own in dataclasses.fields(Config):
             self.declare_parameter(own.name, getattr(config, own.name), parameter_descriptor(own),
                                    ignore_override=True)
         self.add_on_set_parameters_callback(self._check_parameters)

@@ -24,7 +24,7 @@ from numbers import Real
 import reprlib
 from typing import Any
 
-from ins_align.config import checked, ConfigError, ImuNoise, parameters, PRESETS
+from ins_align.config import checked, Config, ConfigError, ImuNoise, PRESETS
 
 IMU_AXES = {'': (1.0, 1.0, 1.0), 'x': (-1.0, 1.0, 1.0), 'y': (1.0, -1.0, 1.0),
             'z': (1.0, 1.0, -1.0)}
@@ -33,8 +33,8 @@ LATENESS_MARGIN = 0.5  # s, of gnss_lateness over the latency
 _MAX_SAMPLES = 20_000_000
 
 # As far as the parameters of the aligner go that make up for them.
-_MOST = {parameter.name: parameter.maximum for parameter in parameters()
-         if parameter.maximum is not None}
+_MOST = {field.name: field.metadata['maximum'] for field in dataclasses.fields(Config)
+         if field.metadata['maximum'] is not None}
 # Errors that a chip has by default; the other grades have noise and biases alone. The estimator
 # takes misalignment and the errors of the accelerometers for 3 tenths of the gyros' scale factor
 # errors.
