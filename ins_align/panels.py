@@ -15,8 +15,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import groupby
+from collections.abc import Callable, Iterator
 import math
 from operator import attrgetter
 from pathlib import Path
@@ -25,7 +24,7 @@ from typing import Any, TYPE_CHECKING
 from ins_align.geometry.rotation import Array
 from ins_align.recordings import one_line
 from ins_align.report import new_figure
-from ins_align.results import Epoch, Result, State
+from ins_align.results import Attitude, Result, State
 import numpy as np
 
 if TYPE_CHECKING:
@@ -41,7 +40,6 @@ COLOURS = '#0072B2', '#CC79A7', '#D55E00'  # roll, pitch, yaw; x, y, z; east, no
 HEADING = COLOURS[2]
 INNOVATION_LIMIT = 5.0  # sigmas shown at least
 METRES_PER_DEGREE = 6_371_000.0 * math.pi / 180.0  # of latitude, mean sphere: good for a picture
-BREAK_INTERVALS = 5.0  # a line ends where epochs are further apart than so many usual distances
 LOST_SIGMA_DEG = 60.0  # above this a heading is not worth drawing
 THIN = {'linewidth': 0.8, 'linestyle': ':'}  # of a limit
 
@@ -86,60 +84,43 @@ def plot(result: Result) -> Figure:
     return figure
 
 
-def spans_of(epochs: Iterable[Epoch], state: State) -> list[tuple[float, float]]:
-    """Return the first and the last epoch of each time in a state, s since the first t0."""
-    runs = [list(run) for present, run in groupby(epochs, attrgetter('state'))
-            if present is state]
-    return [(run[0].t_s, run[-1].t_s) for run in runs]
-
-
 class _Series:
     """
-    A result's epochs with an attitude, as arrays over time.
+    A result's epochs as arrays over time.
 
-    Where an alignment starts over or hears nothing for long lies a row of nan, so that nothing is
-    drawn across.
+    Epochs without GNSS and those without an attitude, as where an alignment starts over, are rows
+    of nan, so that nothing is drawn across them.
     """
 
     def __init__(self, result: Result) -> None:
-        epochs = [epoch for epoch in result.epochs if not epoch.dry]
-        pairs = [(epoch, epoch.initial, epoch.current) for epoch in epochs
-                 if epoch.current is not None and epoch.initial is not None]
-        time = np.array([epoch.t_s for epoch, _, _ in pairs])
-        breaks = _breaks(epochs, time)
+        epochs = result.epochs
+        known = np.array([not epoch.dry and epoch.initial is not None
+                          and epoch.current is not None for epoch in epochs], bool)
 
-        def rows(values: Sequence[Any]) -> np.ndarray:
-            return np.insert(np.array(values, float).reshape(-1, 3), breaks, np.nan, axis=0)
+        def rows(value: Callable[[Any], Any]) -> np.ndarray:
+            found = np.full((len(epochs), 3), np.nan)
+            for place in np.flatnonzero(known):
+                found[place] = value(epochs[place])
+            return found
 
-        self.time = np.insert(time, breaks, np.nan)
-        self.angles = rows([[now.roll_deg, now.pitch_deg, now.yaw_deg] for _, _, now in pairs])
-        # Roll and pitch turn about axes in the plane of level: the larger sigma holds for both.
-        self.sigma, self.initial_sigma = (
-            np.column_stack([*[rows(sigma)[:, :2].max(axis=1, initial=0.0)] * 2,
-                             rows(sigma)[:, 2]])
-            for sigma in ([now.sigma_deg for _, _, now in pairs],
-                          [first.sigma_deg for _, first, _ in pairs]))
+        self.time = np.where(known, [epoch.t_s for epoch in epochs], np.nan)
+        self.angles = rows(lambda epoch: epoch.current.roll_pitch_yaw_deg)
+        self.sigma = rows(lambda epoch: _sigma(epoch.current))
+        self.initial_sigma = rows(lambda epoch: _sigma(epoch.initial))
         self.innovations, self.gyro_bias, self.accel_bias = (
-            rows([getattr(epoch, name) for epoch, _, _ in pairs])
-            for name in ('innovation', 'gyro_bias', 'accel_bias'))
-        self.aligned = np.insert(
-            np.array([epoch.state is State.ALIGNED for epoch, _, _ in pairs], bool), breaks, False)
+            rows(attrgetter(name)) for name in ('innovation', 'gyro_bias', 'accel_bias'))
+        self.aligned = known & np.array([epoch.state is State.ALIGNED for epoch in epochs], bool)
         self.errors = self.reference = None
         if result.reference is not None:
-            errors = [result.reference.errors_deg(now) for _, _, now in pairs]
-            self.errors = rows([np.full(3, np.nan) if error is None else error
-                                for error in errors])
+            errors_deg = result.reference.errors_deg
+            self.errors = rows(lambda epoch: errors_deg(epoch.current))
             self.reference = np.remainder(self.angles - self.errors + 180.0, 360.0) - 180.0
 
 
-def _breaks(epochs: Sequence[Epoch], time: np.ndarray) -> np.ndarray:
-    """Return before which of the epochs with an attitude, at these times, a line ends."""
-    steps = np.diff(time)
-    far = steps > BREAK_INTERVALS * np.median(steps) if steps.size else steps > 0.0
-    # What starts over has no attitude at t0 for some epochs.
-    there = np.flatnonzero([epoch.current is not None and epoch.initial is not None
-                            for epoch in epochs])
-    return 1 + np.flatnonzero(far | (np.diff(there) > 1))
+def _sigma(attitude: Attitude) -> list[float]:
+    """Return sigmas of roll, pitch and yaw, degrees: of the first two the larger one of level."""
+    east, north, up = attitude.sigma_deg.tolist()
+    return [max(east, north), max(east, north), up]
 
 
 def _broken_at_wraps(angle: Array, *arrays: Array) -> Iterator[Array]:
@@ -152,7 +133,7 @@ def _angles(axes: Axes, label: str, series: _Series, result: Result,
             columns: dict[str, int]) -> None:
     """Draw angles with the reference, and as they were declared: at their t0."""
     axes.set_ylabel(label)
-    if not series.time.size:
+    if not np.isfinite(series.time).any():
         axes.text(0.5, 0.5, 'no attitude', transform=axes.transAxes, ha='center')
         return
     bands = []
@@ -167,11 +148,9 @@ def _angles(axes: Axes, label: str, series: _Series, result: Result,
             axes.plot(*_broken_at_wraps(angle, series.time, angle), 'k--', linewidth=0.8,
                       label='reference')
     if (declared := result.declared) is not None:
-        angles = declared.roll_deg, declared.pitch_deg, declared.yaw_deg
-        level, up = declared.sigma_deg[:2].max(), declared.sigma_deg[2]
         for column in columns.values():
-            axes.errorbar(result.t_s(declared.stamp_ns), angles[column],
-                          up if column == 2 else level, fmt='kD', markersize=4.0, capsize=3.0,
+            axes.errorbar(result.t_s(declared.stamp_ns), declared.roll_pitch_yaw_deg[column],
+                          _sigma(declared)[column], fmt='kD', markersize=4.0, capsize=3.0,
                           label='declared, at its t0')
     limits = axes.get_ylim()  # the first sigmas would make flat lines of the angles
     for name, column, time, low, high in bands:
@@ -211,15 +190,16 @@ def _innovations(axes: Axes, series: _Series, result: Result) -> None:
 def _biases(axes: Axes, label: str, time: Array, biases: Array, std: Array) -> None:
     """Draw three biases, and at the end how well they are known."""
     axes.set_ylabel(label)
-    if not time.size:
+    known = np.flatnonzero(np.isfinite(time))
+    if not known.size:
         return
     for name, colour, values in zip('xyz', COLOURS, biases.T):
         axes.plot(time, values, color=colour, linewidth=1.2, label=name)
-    for colour, value, sigma in zip(COLOURS, biases[-1], std):
-        axes.errorbar(time[-1], value, sigma, fmt='none', ecolor=colour, capsize=3.0,
+    for colour, value, sigma in zip(COLOURS, biases[known[-1]], std):
+        axes.errorbar(time[known[-1]], value, sigma, fmt='none', ecolor=colour, capsize=3.0,
                       label='1 sigma at the end')
-    settled = biases[len(biases) // 10:]  # the first seconds tell nothing yet
-    low, high = np.nanmin(settled) - std.max(), np.nanmax(settled) + std.max()
+    settled = biases[known[len(known) // 10:]]  # the first seconds tell nothing yet
+    low, high = settled.min() - std.max(), settled.max() + std.max()
     margin = 0.1 * (high - low) or 1.0
     axes.set_ylim(low - margin, high + margin)
 
@@ -274,9 +254,9 @@ def _shade(axes: Axes, result: Result, named: bool) -> None:
     """Shade the times that were declared; one legend with the names is enough."""
     for words, state in (('roll and pitch declared', State.LEVELLED),
                          ('declared aligned', State.ALIGNED)):
-        for start, end in spans_of(result.epochs, state):
-            axes.axvspan(start, end, color=STATE_COLOURS[state], alpha=0.1, linewidth=0)
-            axes.axvline(start, color=STATE_COLOURS[state], linewidth=1.2,
+        for first, last in result.spans_of(state):
+            axes.axvspan(first.t_s, last.t_s, color=STATE_COLOURS[state], alpha=0.1, linewidth=0)
+            axes.axvline(first.t_s, color=STATE_COLOURS[state], linewidth=1.2,
                          label=words if named else None)
 
 

@@ -73,11 +73,11 @@ def summary(result: Result) -> str:
             continue
         row = [name, f'{result.t_s(attitude.stamp_ns):.1f}']
         row += [f'{angle:.3f}' for angle in (
-            attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg, attitude.heading_deg)]
+            *attitude.roll_pitch_yaw_deg, attitude.heading_deg)]
         row += [f'{sigma:.3f}' for sigma in attitude.sigma_deg]
         if result.reference is not None:
-            errors = result.reference.errors_deg(attitude)
-            row += ['-'] * 3 if errors is None else [f'{error:+.3f}' for error in errors]
+            row += ['-' if math.isnan(error) else f'{error:+.3f}'
+                    for error in result.reference.errors_deg(attitude)]
         rows.append(row)
     if rows:
         header = ['attitude, deg', 'at, s', 'roll', 'pitch', 'yaw', 'heading', 'sigma e',
@@ -94,8 +94,8 @@ def summary(result: Result) -> str:
 
 def _list_of_changes(result: Result) -> list[str]:
     """Tell each change of the state, of many the first and the last."""
-    told = [_wrapped(f'{change.state.value}: {change.reason}', f'  {change.t_s:8.1f} s  ')
-            for change in result.changes]
+    told = [_wrapped(f'{span.first.state.value}: {span.reason}', f'  {span.first.t_s:8.1f} s  ')
+            for span in result.spans]
     if len(told) < 2:
         return []  # what it says is the state at the end
     left_out = len(told) - 2 * CHANGES_AT_ENDS

@@ -15,14 +15,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 import dataclasses
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-from itertools import dropwhile, groupby, pairwise
+from itertools import pairwise
 import math
-from operator import attrgetter
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from ins_align.config import Config
@@ -92,23 +91,24 @@ class Attitude:
         return quaternion_from_matrix(self.C_nb)
 
     @cached_property
-    def _rpy_deg(self) -> list[float]:
+    def roll_pitch_yaw_deg(self) -> list[float]:
+        """Degrees; nose down is positive pitch (REP-103), yaw is counter-clockwise from east."""
         return list(np.degrees(roll_pitch_yaw(self.C_nb)).tolist())
 
     @property
     def roll_deg(self) -> float:
         """Roll, degrees."""
-        return self._rpy_deg[0]
+        return self.roll_pitch_yaw_deg[0]
 
     @property
     def pitch_deg(self) -> float:
         """Pitch, degrees; nose down is positive (REP-103)."""
-        return self._rpy_deg[1]
+        return self.roll_pitch_yaw_deg[1]
 
     @property
     def yaw_deg(self) -> float:
         """Heading as yaw: degrees counter-clockwise from east."""
-        return self._rpy_deg[2]
+        return self.roll_pitch_yaw_deg[2]
 
     @property
     def heading_deg(self) -> float:
@@ -141,13 +141,16 @@ class Epoch:
     started_over: str = ''
 
 
-class Change(NamedTuple):
-    """An epoch with another state than the one before, or of an alignment that started over."""
+class Span(NamedTuple):
+    """Consecutive epochs of one alignment in one state: the first and the last of them."""
 
-    stamp_ns: int
-    t_s: float
-    state: State
-    reason: str
+    first: Epoch
+    last: Epoch
+
+    @property
+    def reason(self) -> str:
+        """Return why it began: for the state, and where the alignment started over."""
+        return '; '.join(filter(None, [self.first.started_over, self.first.reason]))
 
 
 @dataclass(frozen=True)
@@ -213,11 +216,11 @@ class Reference:
         return exp_so3((stamp_ns - start) / (end - start) * log_so3(C_after @ C_before.T)) \
             @ C_before
 
-    def errors_deg(self, attitude: Attitude) -> Array | None:
-        """Return roll, pitch, yaw less the reference's, degrees, (3,); None where it is not."""
+    def errors_deg(self, attitude: Attitude) -> Array:
+        """Return roll, pitch, yaw less the reference's, degrees, (3,); nan where it is not."""
         C_reference = self.attitude_at(attitude.stamp_ns)
         if C_reference is None:
-            return None
+            return np.full(3, np.nan)
         difference = roll_pitch_yaw(attitude.C_nb) - roll_pitch_yaw(C_reference)
         return np.degrees(np.remainder(difference + np.pi, 2.0 * np.pi) - np.pi)
 
@@ -255,39 +258,35 @@ class Result:
     @property
     def declared(self) -> Attitude | None:
         """Return the initial attitude as the node publishes it at the last declaration."""
-        starts = [next(run) for state, run in groupby(self.epochs, attrgetter('state'))
-                  if state is State.ALIGNED]
-        return starts[-1].initial if starts else None
+        aligned = self.spans_of(State.ALIGNED)
+        return aligned[-1].first.initial if aligned else None
 
-    @property
-    def changes(self) -> list[Change]:
-        """Return the changes of the state, from the first epoch on, with their reasons."""
-        changes, before = [], None
+    @cached_property
+    def spans(self) -> list[Span]:
+        """Return how the state changed, from the first epoch on."""
+        spans: list[Span] = []
         for epoch in self.epochs:
-            if epoch.state is not before or epoch.started_over:
-                reason = '; '.join(filter(None, [epoch.started_over, epoch.reason]))
-                changes.append(Change(epoch.stamp_ns, epoch.t_s, epoch.state, reason))
-            before = epoch.state
-        return changes
+            if spans and spans[-1].first.state is epoch.state and not epoch.started_over:
+                spans[-1] = Span(spans[-1].first, epoch)
+            else:
+                spans.append(Span(epoch, epoch))
+        return spans
+
+    def spans_of(self, state: State) -> list[Span]:
+        """Return the times in a state."""
+        return [span for span in self.spans if span.first.state is state]
 
     @property
     def state_in_words(self) -> str:
-        """Return the state at the end, and when ALIGNED was declared and withdrawn: s since t0."""
-        # The times of the first declaration, of its end, of the next declaration ...
-        times = [next(changes).t_s for _, changes in groupby(
-            dropwhile(lambda change: change.state is not State.ALIGNED, self.changes),
-            lambda change: change.state is State.ALIGNED)]
-        if not times:
-            return self.status.state.value
-        words, withdrawals = f'after {times[0]:.1f} s', len(times) // 2
-        if withdrawals:
-            words += '; withdrawn ' if self.aligned else ', withdrawn '
-            words += f'{withdrawals} times, first ' if withdrawals > 1 else ''
-            words += f'at {times[1]:.1f} s'
-        if withdrawals and len(times) > 2 * withdrawals:
-            words += f', again after {times[-1]:.1f} s'
-        return f'ALIGNED {words}' if self.aligned else (
-            f'{self.status.state.value} (aligned {words})')
+        """Return the state at the end, when ALIGNED was declared first, s since the first t0."""
+        state, aligned = self.status.state.value, self.spans_of(State.ALIGNED)
+        if not aligned:
+            return state
+        after = f'after {aligned[0].first.t_s:.1f} s'
+        withdrawn = len(aligned) - (self.epochs[-1].state is State.ALIGNED)
+        if self.aligned and not withdrawn:
+            return f'{state} {after}'
+        return f'{state} (first ALIGNED {after}, withdrawals: {withdrawn})'
 
     def __repr__(self) -> str:
         now = self.current
@@ -318,8 +317,9 @@ class Result:
             'aligned': self.aligned,
             'state': status.state.value,
             'reason': status.reason,
-            'changes': [{'stamp': change.stamp_ns, 't_s': change.t_s, 'state': change.state.value,
-                         'reason': change.reason} for change in self.changes],
+            'changes': [{'stamp': span.first.stamp_ns, 't_s': span.first.t_s,
+                         'state': span.first.state.value, 'reason': span.reason}
+                        for span in self.spans],
             't0': status.t0_ns,
             'time_to_align_s': status.time_to_align_s,
             'initial_attitude': attitude_json(status.initial),
@@ -338,22 +338,17 @@ class Result:
 
     def to_csv(self) -> str:
         """Return the table that ``--csv`` writes, a row per GNSS epoch."""
-        epochs = [epoch for epoch in self.epochs if not epoch.dry]
-        rows = zip([f'{epoch.stamp_ns},{epoch.t_s:.9f},{epoch.state.value}' for epoch in epochs],
-                   _attitude_cells([epoch.initial for epoch in epochs]),
-                   _attitude_cells([epoch.current for epoch in epochs]))
-        return '\n'.join([CSV_HEADER, *map(','.join, rows), ''])
+        rows = [','.join([f'{epoch.stamp_ns},{epoch.t_s:.9f},{epoch.state.value}',
+                          *_attitude_cells(epoch.initial), *_attitude_cells(epoch.current)])
+                for epoch in self.epochs if not epoch.dry]
+        return '\n'.join([CSV_HEADER, *rows, ''])
 
 
-def _attitude_cells(attitudes: Sequence[Attitude | None]) -> Iterator[str]:
-    """Yield the columns of each attitude, all converted at a time; empty where there is none."""
-    known = [attitude for attitude in attitudes if attitude is not None]
-    quaternions = quaternion_from_matrix(np.array([each.C_nb for each in known]).reshape(-1, 3, 3))
-    variances = np.array([np.diagonal(each.covariance) for each in known]).reshape(-1, 3)
-    numbers = iter(np.hstack([quaternions, np.degrees(np.sqrt(variances))]).tolist())
-    for attitude in attitudes:
-        yield ','.join(repr(number) if math.isfinite(number) else '' for number in (
-            [math.nan] * 7 if attitude is None else next(numbers)))
+def _attitude_cells(attitude: Attitude | None) -> list[str]:
+    """Return an attitude's columns of `CSV_HEADER`; empty where it, or a number, is not known."""
+    numbers = [math.nan] * 7 if attitude is None else [
+        *attitude.quaternion_xyzw.tolist(), *attitude.sigma_deg.tolist()]
+    return [repr(number) if math.isfinite(number) else '' for number in numbers]
 
 
 def in_order_of_time(epochs: Iterable[Epoch]) -> tuple[Epoch, ...]:
@@ -378,10 +373,9 @@ def attitude_json(attitude: Attitude | None, stamped: bool = False) -> dict[str,
     """Return an attitude as ``--json`` writes it."""
     if attitude is None:
         return None
-    roll, pitch, yaw = _finite([attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg])
     return {**({'stamp': attitude.stamp_ns} if stamped else {}),
-            'quaternion_xyzw': _finite(attitude.quaternion_xyzw), 'roll_deg': roll,
-            'pitch_deg': pitch, 'yaw_deg': yaw, 'sigma_deg': _finite(attitude.sigma_deg)}
+            **{name: _finite(getattr(attitude, name)) for name in (
+                'quaternion_xyzw', 'roll_deg', 'pitch_deg', 'yaw_deg', 'sigma_deg')}}
 
 
 def _finite(value: Any) -> Any:
@@ -397,32 +391,29 @@ def level_of(state: State) -> int:
 
 
 def status_values(status: Status, base_frame: str = '', base: Transform | None = None,
-                  ) -> Iterator[tuple[str, str]]:
-    """List a status, with the attitude of a base, as names and texts, angles in degrees."""
-
-    def text(value: Any) -> str:
-        return '' if value is None else ' '.join(
-            f'{number:.6g}' for number in np.atleast_1d(value))
-
-    def angles(attitude: Attitude | None) -> str:
-        return text(attitude and (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))
-
-    yield 'state', status.state.value
-    yield 'reason', status.reason
-    for name, stamp_ns in (('stamp_ns', status.stamp_ns), ('t0_ns', status.t0_ns)):
-        yield name, '' if stamp_ns is None else str(stamp_ns)
-    yield 'time_to_align_s', text(status.time_to_align_s)
+                  ) -> dict[str, str]:
+    """Return a status, with the attitude of a base, as names and texts, angles in degrees."""
+    values: dict[str, Any] = {
+        'state': status.state.value, 'reason': status.reason, 'stamp_ns': status.stamp_ns,
+        't0_ns': status.t0_ns, 'time_to_align_s': status.time_to_align_s}
     attitudes = ('initial', status.initial), ('current', status.current)
     for name, attitude in attitudes:
-        yield f'{name}_roll_pitch_yaw_deg', angles(attitude)
-        yield f'{name}_sigma_east_north_up_deg', text(attitude and attitude.sigma_deg)
-    yield 'current_heading_deg', text(status.current and status.current.heading_deg)
+        values[f'{name}_roll_pitch_yaw_deg'] = attitude and attitude.roll_pitch_yaw_deg
+        values[f'{name}_sigma_east_north_up_deg'] = attitude and attitude.sigma_deg
+    values['current_heading_deg'] = status.current and status.current.heading_deg
     for name, unit in ESTIMATES.items():
-        yield f'{name}_{unit}', text(getattr(status, name))
-        yield f'{name}_std_{unit}', text(getattr(status, f'{name}_std'))
-    for name, count in status.counts.items():
-        yield name, str(count)
+        values[f'{name}_{unit}'] = getattr(status, name)
+        values[f'{name}_std_{unit}'] = getattr(status, f'{name}_std')
+    values.update(status.counts)
     if base_frame:
-        yield 'base_frame', base_frame
+        values['base_frame'] = base_frame
         for name, attitude in attitudes:
-            yield f'base_{name}_roll_pitch_yaw_deg', angles(base_attitude(attitude, base))
+            of_base = base_attitude(attitude, base)
+            values[f'base_{name}_roll_pitch_yaw_deg'] = of_base and of_base.roll_pitch_yaw_deg
+    return {name: _text(value) for name, value in values.items()}
+
+
+def _text(value: Any) -> str:
+    if value is None or isinstance(value, (str, int)):
+        return '' if value is None else str(value)
+    return ' '.join(f'{number:.6g}' for number in np.atleast_1d(value))

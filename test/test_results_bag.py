@@ -116,7 +116,7 @@ def test_status_is_that_of_the_result(drive):
     states = [values['state'] for _, values in statuses]
     for state in {epoch.state.value for epoch in result.epochs}:
         assert state in states
-    told = [f'{change.state.value}: {change.reason}' for change in result.changes]
+    told = [f'{span.first.state.value}: {span.reason}' for span in result.spans]
     assert len(told) >= 2 and set(told) <= {status.message for status, _ in statuses}
     assert len(statuses) >= 45  # one a second
 

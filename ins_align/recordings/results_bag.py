@@ -138,7 +138,7 @@ class _Results:
                 ATTITUDE, self._header(first.stamp_ns), self._quaternion(first.quaternion_xyzw))
         if now is not None:
             for name, values in (
-                    ('roll_pitch_yaw_deg', (now.roll_deg, now.pitch_deg, now.yaw_deg)),
+                    ('roll_pitch_yaw_deg', now.roll_pitch_yaw_deg),
                     ('sigma_deg', now.sigma_deg.tolist())):
                 yield name, time_ns, self._make(
                     VECTOR, self._header(now.stamp_ns), self._make(XYZ, *values))
@@ -168,7 +168,7 @@ class _Results:
         return self._make(STATUS, self._header(status.stamp_ns or 0), [self._make(
             'diagnostic_msgs/msg/DiagnosticStatus', level_of(status.state),
             'ins_align: alignment', f'{status.state.value}: {status.reason}'.removesuffix(': '),
-            '', [self._make('diagnostic_msgs/msg/KeyValue', *each) for each in values])])
+            '', [self._make('diagnostic_msgs/msg/KeyValue', *each) for each in values.items()])])
 
     def _header(self, stamp_ns: int, source: Any = None) -> Any:
         """Return a header; its frame_id is that of a source, or the world's."""

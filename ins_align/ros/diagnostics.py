@@ -141,4 +141,4 @@ def diagnostic_status(name: str, hardware_id: str, level: int, status: Status,
         level=bytes([level]), name=f'{name.lstrip("/")}: alignment', hardware_id=hardware_id,
         message=f'{status.state.value}: {status.reason}',
         values=[KeyValue(key=key, value=value) for key, value in status_values(
-            status, *((mounting.config.base_frame, mounting.base) if mounting else ()))])
+            status, *((mounting.config.base_frame, mounting.base) if mounting else ())).items()])

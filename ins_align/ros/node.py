@@ -320,7 +320,7 @@ class AlignmentNode(Node):
         if now is None:
             return
         for publisher, values in (
-                (self._angles_publisher, (now.roll_deg, now.pitch_deg, now.yaw_deg)),
+                (self._angles_publisher, now.roll_pitch_yaw_deg),
                 (self._sigma_publisher, now.sigma_deg)):
             if publisher.get_subscription_count() > 0:
                 publisher.publish(vector_msg(now.stamp_ns, self._config.world_frame_id, values))
