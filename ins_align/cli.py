@@ -21,6 +21,7 @@ from dataclasses import fields
 from functools import partial
 import gc
 import io
+from itertools import chain
 import json
 import os
 from pathlib import Path
@@ -28,8 +29,8 @@ import sys
 from typing import Any, NoReturn, TYPE_CHECKING
 
 from ins_align.outputs import (
-    check_plot, check_writable, labels, Outcome, process, STANDARD_OUTPUT, survey, Task,
-    UsageError, with_label, write_whole)
+    check_plot, check_writable, names_for, not_aligned, Outcome, process, STANDARD_OUTPUT,
+    survey, Task, UsageError, write_whole)
 from ins_align.processes import keep_to_one, processors, run_all, run_on_cluster
 
 if TYPE_CHECKING:
@@ -49,14 +50,7 @@ BAG_HELP = 'rosbag2 directory or file (.mcap, .db3), or ROS 1 .bag'
 
 DESCRIPTION = """\
 Finds roll, pitch and true heading of a moving IMU with a GNSS receiver.
-
-commands:
-  info        tell what recordings hold and how to align them, before any run
-  replay      align recordings (rosbag2 mcap and sqlite3, ROS 1), no ROS needed
-  simulate    write a recording of a simulated vehicle, with truth
-  experiment  repeat a documented experiment: figure and numbers
-
-"ins_align COMMAND --help" explains each.
+"ins_align COMMAND --help" explains a command.
 """
 
 INFO_EPILOG = """\
@@ -138,11 +132,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
-    top = Parser(prog='ins_align', description=DESCRIPTION,
-                 formatter_class=argparse.RawDescriptionHelpFormatter)
+    top = Parser(prog='ins_align', description=DESCRIPTION)
     top.add_argument('--version', action='version', version=f'%(prog)s {_version()}')
     top.set_defaults(run=_help, parser=top)  # without a command
-    commands = top.add_subparsers(dest='command', metavar='COMMAND', help=argparse.SUPPRESS)
+    commands = top.add_subparsers(dest='command', metavar='COMMAND', title='commands')
     _add_info(commands)
     _add_replay(commands)
     _add_simulate(commands)
@@ -159,7 +152,7 @@ def _help(arguments: argparse.Namespace) -> int:
 def _add_command(commands: Any, name: str, run: Callable[[argparse.Namespace], int],
                  description: str, epilog: str) -> argparse.ArgumentParser:
     command: argparse.ArgumentParser = commands.add_parser(
-        name, description=description, epilog=epilog,
+        name, help=description, description=description, epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter)
     command.set_defaults(run=run, parser=command)
     return command
@@ -190,14 +183,16 @@ _seconds, _count = partial(_number, float, 0.0), partial(_number, int, 1)
 
 def _add_info(commands: Any) -> None:
     command = _add_command(commands, 'info', run_info,
-                           'Tell what recordings hold and how to align them.', INFO_EPILOG)
+                           'Tell what recordings hold and how to align them, before any run.',
+                           INFO_EPILOG)
     command.add_argument('bags', nargs='+', metavar='BAG', help=BAG_HELP)
     command.add_argument('--json', metavar='FILE', help='write what is known, for programs; '
                          '-: to standard output, instead of the text')
 
 
 def _add_replay(commands: Any) -> None:
-    command = _add_command(commands, 'replay', run_replay, 'Align recordings.', REPLAY_EPILOG)
+    command = _add_command(commands, 'replay', run_replay, 'Align recordings, without ROS.',
+                           REPLAY_EPILOG)
     command.add_argument('bags', nargs='+', metavar='BAG', help=BAG_HELP)
     group = command.add_argument_group('parameters')
     group.add_argument('--params', metavar='FILE', help='parameter file of the node (YAML)')
@@ -286,8 +281,7 @@ def _add_experiment(commands: Any) -> None:
 
 def run_info(arguments: argparse.Namespace) -> int:
     """Run ``ins_align info``."""
-    if arguments.json:
-        check_writable(arguments.json, arguments.bags)
+    _check_outputs(arguments, {})
     return _tell(arguments, map(survey, arguments.bags))
 
 
@@ -295,19 +289,17 @@ def run_replay(arguments: argparse.Namespace) -> int:
     """Run ``ins_align replay``."""
     keep_to_one()
     gc.set_threshold(100_000)  # rows and results by the thousand, none of which is garbage
-    names = labels(arguments.bags) if len(arguments.bags) > 1 else ['']
-    files = [{option: with_label(path, label) for option in ('csv', 'plot', 'results')
-              if (path := getattr(arguments, option))} for label in names]
+    files = {option: names_for(path, arguments.bags) for option in ('csv', 'plot', 'results')
+             if (path := getattr(arguments, option))}
     _check_outputs(arguments, files)
-    config = _config(arguments)
+    settings = {'config': _config(arguments), **{
+        name: getattr(arguments, name) for name in (
+            'imu_topic', 'fix_topic', 'velocity_topic', 'start', 'duration')}}
     if arguments.plot:
         check_plot(arguments.plot)
-    tasks = [Task(bag, {
-        'path': os.path.abspath(bag), 'config': config, **{
-            name: getattr(arguments, name) for name in (
-                'imu_topic', 'fix_topic', 'velocity_topic', 'start', 'duration')}},
-        **{option: os.path.abspath(path) for option, path in of_bag.items()})
-        for bag, of_bag in zip(arguments.bags, files)]
+    tasks = [Task(bag, {'path': os.path.abspath(bag), **settings}, **{
+        option: os.path.abspath(paths[place]) for option, paths in files.items()})
+        for place, bag in enumerate(arguments.bags)]
     found: Iterable[Outcome | Exception]
     if arguments.dask is not None:
         found = run_on_cluster(process, tasks, arguments.dask)
@@ -316,7 +308,9 @@ def run_replay(arguments: argparse.Namespace) -> int:
     else:
         found = [_with_a_bar(tasks[0])]
     return _tell(arguments, (
-        Outcome.lost(task.name, outcome) if isinstance(outcome, Exception) else outcome
+        not_aligned(task.name, f'a process died on the way ({type(outcome).__name__}), perhaps '
+                    'for want of memory; --jobs 1 takes less')
+        if isinstance(outcome, Exception) else outcome
         for task, outcome in zip(tasks, found)))
 
 
@@ -329,19 +323,19 @@ def _with_a_bar(task: Task) -> Outcome:
         return process(task, lambda part: bar.update(part - bar.n))
 
 
-def _check_outputs(arguments: argparse.Namespace, files: Sequence[dict[str, str]]) -> None:
-    """Find out before the work whether all files of a replay can be written."""
-    for option in ('csv', 'plot'):
-        if getattr(arguments, option) == STANDARD_OUTPUT:
-            raise UsageError(f'--{option} needs the name of a file')
-    given = arguments.json, arguments.csv, arguments.plot, arguments.results
-    outputs = list(filter(None, given))
-    for of_bag in files:
-        if os.path.exists(path := of_bag.get('results', '')):
+def _check_outputs(arguments: argparse.Namespace, files: dict[str, list[str]]) -> None:
+    """Find out before the work whether all files, by option one each recording, can be written."""
+    if STANDARD_OUTPUT in [getattr(arguments, option) for option in files]:
+        raise UsageError('nothing but --json can go to standard output: give the name of a file')
+    for path in files.get('results', ()):
+        if os.path.exists(path):
             raise UsageError(f'cannot write {path}: it exists already, choose another name')
-        outputs += of_bag.values() if len(files) > 1 else ()
+    outputs = list(chain(*files.values()))
+    if arguments.json != STANDARD_OUTPUT:
+        outputs += filter(None, [arguments.json])
+    inputs = [*arguments.bags, *filter(None, [getattr(arguments, 'params', None)])]
     for path in outputs:
-        check_writable(path, [*arguments.bags, *filter(None, [arguments.params])])
+        check_writable(path, inputs)
         if outputs.count(path) > 1:
             raise UsageError(f'{path} is given for two outputs')
 
@@ -353,10 +347,10 @@ def _tell(arguments: argparse.Namespace, outcomes: Iterable[Outcome]) -> int:
     # To the very end: a pool of processes that is dropped on the way is torn down in a race.
     for outcome in outcomes:
         objects.append(outcome.json)
-        if outcome.error:
+        if error := outcome.json.get('error'):
             if not several:
-                raise UsageError(outcome.error)
-            print(f'ins_align {arguments.command}: {outcome.error}', file=sys.stderr)
+                raise UsageError(error)
+            print(f'ins_align {arguments.command}: {error}', file=sys.stderr)
             statuses.append(UNUSABLE)
             continue
         for warning in outcome.warnings:

@@ -48,24 +48,16 @@ class Task:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a recording: either an error in one sentence or a text to print."""
+    """What came of a recording."""
 
-    json: dict[str, Any]  # what --json writes of it
-    text: str = ''
+    json: dict[str, Any]  # what --json writes of it; with an "error" there is nothing else
+    text: str = ''  # to print
     warnings: tuple[str, ...] = ()
-    error: str = ''
 
-    @classmethod
-    def failed(cls, bag: str, error: str) -> Outcome:
-        """Return the outcome of a recording that could not be aligned for want of something."""
-        sentence = about(bag, error)
-        return cls({'bag': bag, 'aligned': False, 'error': sentence}, error=sentence)
 
-    @classmethod
-    def lost(cls, bag: str, error: Exception) -> Outcome:
-        """Return the outcome of a recording whose process is gone."""
-        return cls.failed(bag, f'a process died on the way ({type(error).__name__}), perhaps for '
-                               'want of memory; --jobs 1 takes less')
+def not_aligned(bag: str, error: str) -> Outcome:
+    """Return the outcome of a recording that an error kept from being aligned."""
+    return Outcome({'bag': bag, 'aligned': False, 'error': about(bag, error)})
 
 
 def process(task: Task, progress: Callable[[float], None] | None = None) -> Outcome:
@@ -90,9 +82,9 @@ def process(task: Task, progress: Callable[[float], None] | None = None) -> Outc
             write_whole(task.plot, partial(
                 plot(result).savefig, format=Path(task.plot).suffix[1:].lower(), dpi=120))
     except BagError as error:
-        return Outcome.failed(task.name, named(error))
+        return not_aligned(task.name, named(error))
     except OSError as error:
-        return Outcome.failed(task.name, f'cannot write {error.filename}: {error.strerror}')
+        return not_aligned(task.name, f'cannot write {error.filename}: {error.strerror}')
     warnings = tuple(about(task.name, named(text)) for text in result.warnings)
     return Outcome(result.to_json(), summary(result), warnings)
 
@@ -105,7 +97,7 @@ def survey(bag: str) -> Outcome:
     try:
         info = inspect(bag)
     except BagError as error:
-        return Outcome({'bag': bag, 'error': about(bag, str(error))}, error=about(bag, str(error)))
+        return Outcome({'bag': bag, 'error': about(bag, str(error))})
     return Outcome(info.to_json(), describe(info),
                    tuple(about(bag, warning) for warning in info.warnings))
 
@@ -130,18 +122,15 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any])
         unfinished.unlink(missing_ok=True)
 
 
-def labels(bags: Sequence[str]) -> list[str]:
-    """Name the recordings, all differently, for the names of output files."""
-    names = [Path(bag).resolve().name.split('.')[0] or 'bag' for bag in bags]
-    if len(set(names)) == len(names):
-        return names
-    return [f'{name}_{number}' for number, name in enumerate(names, 1)]
-
-
-def with_label(path: str, label: str) -> str:
-    """Put the name of a recording into that of a file."""
-    return str(Path(path).with_stem(f'{Path(path).stem}_{label}')) \
-        if label and Path(path).name else path
+def names_for(path: str, bags: Sequence[str]) -> list[str]:
+    """Name an output of each recording: of several, their own names come before the suffix."""
+    if len(bags) == 1:
+        return [path]
+    labels = [Path(bag).resolve().name.split('.')[0] or 'bag' for bag in bags]
+    if len(set(labels)) < len(labels):
+        labels = [f'{label}_{number}' for number, label in enumerate(labels, 1)]
+    root, suffix = os.path.splitext(path)
+    return [f'{root}_{label}{suffix}' for label in labels]
 
 
 def about(bag: str, text: str) -> str:
@@ -158,32 +147,27 @@ def about(bag: str, text: str) -> str:
 
 def check_writable(path: str, inputs: Sequence[str]) -> None:
     """Find out before the work whether its result can be written, and spoils no input."""
-    if path == STANDARD_OUTPUT:
-        return
-    target = Path(os.path.realpath(path))
-    folder = target.parent
-    if Path(path).exists() and not Path(path).is_file():
-        raise UsageError(f'cannot write {path}: it is a directory or a device, no file')
-    if spoilt := _spoilt(target, list(map(os.path.realpath, inputs))):
-        raise UsageError(f'cannot write {path}: {spoilt}, choose another name')
-    if not folder.is_dir():
-        raise UsageError(f'cannot write {path}: there is no directory {folder}')
-    if not os.access(folder, os.W_OK):
-        raise UsageError(f'cannot write {path}: no permission to write to {folder}')
+    if what := _in_the_way(Path(os.path.realpath(path)), list(map(os.path.realpath, inputs))):
+        raise UsageError(f'cannot write {path}: {what}')
 
 
-def _spoilt(target: Path, inputs: Sequence[str]) -> str:
-    """Say what would be lost if something were written there; both without links."""
+def _in_the_way(target: Path, inputs: Sequence[str]) -> str:
+    """Say why nothing should be written there; both without links."""
     from ins_align.recordings.bag import begins_like_a_recording, STORAGE_NAME
 
+    folder = target.parent
+    if target.exists() and not target.is_file():
+        return 'it is a directory or a device, no file'
     if str(target) in inputs:
-        return 'it is to be read'
+        return 'it is to be read, choose another name'
     if begins_like_a_recording(target):
-        return 'it is a recording and would be lost'
-    if str(target.parent) in inputs and (STORAGE_NAME.search(target.name)
-                                         or target.name == 'metadata.yaml'):
-        return 'it would become a part of the recording around it'
-    return ''
+        return 'it is a recording and would be lost, choose another name'
+    if str(folder) in inputs and (STORAGE_NAME.search(target.name)
+                                  or target.name == 'metadata.yaml'):
+        return 'it would become a part of the recording around it, choose another name'
+    if not folder.is_dir():
+        return f'there is no directory {folder}'
+    return '' if os.access(folder, os.W_OK) else f'no permission to write to {folder}'
 
 
 def check_plot(path: str) -> None:

@@ -283,10 +283,9 @@ class Result:
         if not aligned:
             return state
         after = f'after {aligned[0].first.t_s:.1f} s'
-        withdrawn = len(aligned) - (self.epochs[-1].state is State.ALIGNED)
-        if self.aligned and not withdrawn:
+        if self.aligned and len(aligned) == 1:
             return f'{state} {after}'
-        return f'{state} (first ALIGNED {after}, withdrawals: {withdrawn})'
+        return f'{state} (first ALIGNED {after}, declarations: {len(aligned)})'
 
     def __repr__(self) -> str:
         now = self.current

@@ -28,7 +28,7 @@ import sys
 import termios
 
 from ins_align.cli import main, SCENARIOS
-from ins_align.outputs import labels
+from ins_align.outputs import names_for
 from ins_align.simulation.scenarios import trajectory_of
 import pytest
 from recordings import FIX, messages_of, real_recording, TWIST, write_recording
@@ -200,16 +200,16 @@ def test_same_name_twice(standing, tmp_path, capsys):
     ['x/a', 'y/a_1', 'z/a'], ['x/a', 'y/a_3', 'z/a'], ['a', 'a', 'a_2', 'a_1', 'a_2_2'],
     ['a', 'b.mcap', 'c.0.db3'], ['a_1', 'a', 'a_1', 'a']])
 def test_no_recording_writes_over_the_files_of_another(bags):
-    names = labels(bags)
+    names = names_for('x/out.csv', bags)
     assert len(set(names)) == len(bags)
-    for bag, label in zip(bags, names):
-        assert label.startswith(Path(bag).name.split('.')[0])
+    for bag, name in zip(bags, names):
+        assert name.startswith(f'x/out_{Path(bag).name.split(".")[0]}') and name.endswith('.csv')
 
 
 def test_without_a_command_it_shows_the_help(capsys):
     assert main([]) == 2
     captured = capsys.readouterr()
-    assert captured.err == '' and 'align recordings (rosbag2' in captured.out
+    assert captured.err == '' and 'replay' in captured.out
 
 
 @pytest.mark.parametrize('command', ['info', 'replay'])
@@ -230,7 +230,7 @@ def test_one_spelling_of_the_lever_arm(standing, capsys):
 
 
 @pytest.mark.parametrize('arguments, message', [
-    (['--csv', '-'], '--csv needs the name of a file'),
+    (['--csv', '-'], 'nothing but --json can go to standard output'),
     (['--set', 'lever_arm=[1,2]'], 'lever_arm must be 3 finite numbers in m from -1000'),
     (['--set', 'lever_arm=[1,2,.nan]'], 'finite'),
     (['--set', 'lever_arm=[1,2,.inf]'], 'finite'),

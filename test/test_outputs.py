@@ -98,7 +98,6 @@ def test_killed_simulation_leaves_no_recording(tmp_path):
 @pytest.mark.parametrize('arguments, reason', [
     (['info', '--json', 'a.db3', 'b.db3'], 'a.db3: it is a recording and would be lost'),
     (['replay', '--json', 'a.db3', 'b.db3'], 'a.db3: it is a recording and would be lost'),
-    (['replay', '--csv', 'a.db3', 'b.db3', 'b.db3'], 'a.db3: it is a recording and would be lost'),
     (['replay', '--json', 'link', 'b.db3'], 'link: it is a recording and would be lost'),
     (['replay', '--csv', 'x.json', 'a.db3', 'b.db3', '--json', 'x_a.json'],
      'x_a.json is given for two outputs'),
