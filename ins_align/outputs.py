@@ -64,7 +64,7 @@ def process(task: Task, progress: Callable[[float], None] | None = None) -> Outc
     """Replay one recording and write its files; whatever the user can put right is an error."""
     from ins_align.offline import replay
     from ins_align.recordings import BagError
-    from ins_align.report import summary
+    from ins_align.report import plot, summary
 
     def named(error: object) -> str:
         return str(error).replace(str(task.arguments['path']), task.name)
@@ -78,7 +78,6 @@ def process(task: Task, progress: Callable[[float], None] | None = None) -> Outc
         if task.csv:
             write_whole(task.csv, lambda file: file.write(result.to_csv().encode()))
         if task.plot:
-            from ins_align.panels import plot
             write_whole(task.plot, partial(
                 plot(result).savefig, format=Path(task.plot).suffix[1:].lower(), dpi=120))
     except BagError as error:

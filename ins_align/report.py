@@ -11,23 +11,40 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What a person sees of a result: tables of plain text and figures."""
+"""What a person sees of a result: the table and the picture of a replay."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 import itertools
 import math
+from operator import attrgetter
+from pathlib import Path
 import shutil
 import textwrap
 from typing import Any, TYPE_CHECKING
 
-from ins_align.results import Result
+from ins_align.geometry.rotation import Array
+from ins_align.recordings import one_line
+from ins_align.results import Attitude, Result, State
+import numpy as np
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 CHANGES_AT_ENDS = 3  # of the state: the first and the last so many are in the table
+# Okabe and Ito's palette, which the colour-blind can tell apart.
+STATE_COLOURS = {
+    State.WAITING_FOR_IMU: '#999999', State.WAITING_FOR_GNSS: '#999999',
+    State.ALIGNING: '#E69F00', State.LEVELLED: '#56B4E9', State.ALIGNED: '#009E73',
+    State.FAULT: '#D55E00'}
+COLOURS = '#0072B2', '#CC79A7', '#D55E00'  # roll, pitch, yaw; x, y, z; east, north, up
+HEADING = COLOURS[2]
+INNOVATION_LIMIT = 5.0  # sigmas shown at least
+METRES_PER_DEGREE = 6_371_000.0 * math.pi / 180.0  # of latitude, mean sphere: good for a picture
+LOST_SIGMA_DEG = 60.0  # above this a heading is not worth drawing
+THIN = {'linewidth': 0.8, 'linestyle': ':'}  # of a limit
 
 
 def format_table(rows: Sequence[Sequence[Any]], header: Sequence[str] = (),
@@ -115,19 +132,16 @@ def _wrapped(text: str, begin: str) -> list[str]:
 def _nuisance_table(result: Result) -> str:
     status = result.status
     rows = []
-    for name, scale, values, stds in (
+    for name, scale, value, std in (
             ('gyro bias, deg/s', math.degrees(1.0), status.gyro_bias, status.gyro_bias_std),
             ('accel bias, m/s^2', 1.0, status.accel_bias, status.accel_bias_std),
-            ('lever arm, m', 1.0, status.lever_arm, status.lever_arm_std)):
-        rows.append([name, *(f'{value * scale:+.4f}' for value in values),
-                     *(_sigma(std * scale) for std in stds)])
-    rows.append(['GNSS delay, s', f'{status.gnss_delay:+.4f}', '', '',
-                 _sigma(status.gnss_delay_std)])
+            ('lever arm, m', 1.0, status.lever_arm, status.lever_arm_std),
+            ('GNSS delay, s', 1.0, status.gnss_delay, status.gnss_delay_std)):
+        values, sigmas = np.atleast_1d(value) * scale, np.atleast_1d(std) * scale
+        rows.append([name, *(f'{number:+.4f}' for number in values), *[''] * (3 - len(values)),
+                     # 0: given, not estimated
+                     *(f'{sigma:.4f}' if sigma else '-' for sigma in sigmas)])
     return format_table(rows, ['estimate', 'x', 'y', 'z', 'sigma x', 'y', 'z'], '  ')
-
-
-def _sigma(value: float) -> str:
-    return f'{value:.4f}' if value else '-'  # 0: given, not estimated
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -138,3 +152,230 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), layout='constrained')
     FigureCanvasAgg(figure)
     return figure
+
+
+def plot(result: Result) -> Figure:
+    """
+    Draw the picture of a recording.
+
+    Attitude with its sigma, where it was declared, the sigmas against their thresholds, normalised
+    innovations, biases, the error where there is a reference, and the track by state.
+    """
+    series = _Series(result)
+    figure = new_figure(16.0, 11.0)
+    figure.suptitle(f'{one_line(Path(result.bag).name or result.bag)}: {result.state_in_words}',
+                    fontsize=13, parse_math=False)
+    left, right = map(figure.add_subfigure, figure.add_gridspec(1, 2, width_ratios=(3, 2)))
+    tilt, yaw, sigmas, innovations = left.subplots(4, 1, sharex=True)
+    heights = [1.0] * (2 if series.errors is None else 3) + [2.2]
+    gyro, accel, *error, track = right.subplots(len(heights), 1, height_ratios=heights)
+    _angles(tilt, 'roll, pitch (deg)', series, result, {'roll': 0, 'pitch': 1})
+    _angles(yaw, 'yaw (deg, counter-\nclockwise from east)', series, result, {'yaw': 2})
+    _sigmas(sigmas, series, result)
+    _innovations(innovations, series, result)
+    _biases(gyro, 'gyro bias (deg/s)', series.time, np.degrees(series.gyro_bias),
+            np.degrees(result.status.gyro_bias_std))
+    _biases(accel, 'accelerometer\nbias (m/s\u00b2)', series.time, series.accel_bias,
+            result.status.accel_bias_std)
+    for axes in error:
+        _errors(axes, series)
+    _track(track, result)
+    upper = [gyro, accel, *error]
+    for axes in upper[:-1]:
+        axes.sharex(upper[-1])
+        axes.tick_params(labelbottom=False)
+    for axes in (innovations, upper[-1]):
+        axes.set_xlabel('time since t0 (s)')
+    for axes in (tilt, yaw, sigmas, innovations, *upper):
+        _shade(axes, result, named=axes is tilt)
+    for axes in (tilt, yaw, sigmas, innovations, *upper, track):
+        axes.grid(alpha=0.3)
+        _add_legend(axes, columns=7 if axes.figure is left else 5)
+    return figure
+
+
+class _Series:
+    """
+    A result's epochs as arrays over time.
+
+    Epochs without GNSS and those without an attitude, as where an alignment starts over, are rows
+    of nan, so that nothing is drawn across them.
+    """
+
+    def __init__(self, result: Result) -> None:
+        epochs = result.epochs
+        known = np.array([not epoch.dry and epoch.initial is not None
+                          and epoch.current is not None for epoch in epochs], bool)
+
+        def rows(value: Callable[[Any], Any]) -> np.ndarray:
+            found = np.full((len(epochs), 3), np.nan)
+            for place in np.flatnonzero(known):
+                found[place] = value(epochs[place])
+            return found
+
+        self.time = np.where(known, [epoch.t_s for epoch in epochs], np.nan)
+        self.angles = rows(lambda epoch: epoch.current.roll_pitch_yaw_deg)
+        self.sigma = rows(lambda epoch: _sigma(epoch.current))
+        self.initial_sigma = rows(lambda epoch: _sigma(epoch.initial))
+        self.innovations, self.gyro_bias, self.accel_bias = (
+            rows(attrgetter(name)) for name in ('innovation', 'gyro_bias', 'accel_bias'))
+        self.aligned = known & np.array([epoch.state is State.ALIGNED for epoch in epochs], bool)
+        self.errors = self.reference = None
+        if result.reference is not None:
+            errors_deg = result.reference.errors_deg
+            self.errors = rows(lambda epoch: errors_deg(epoch.current))
+            self.reference = np.remainder(self.angles - self.errors + 180.0, 360.0) - 180.0
+
+
+def _sigma(attitude: Attitude) -> list[float]:
+    """Return sigmas of roll, pitch and yaw, degrees: of the first two the larger one of level."""
+    east, north, up = attitude.sigma_deg.tolist()
+    return [max(east, north), max(east, north), up]
+
+
+def _broken_at_wraps(angle: Array, *arrays: Array) -> Iterator[Array]:
+    """Put a gap into arrays where a line would run from one end of the scale to the other."""
+    wraps = np.flatnonzero(np.abs(np.diff(angle)) > 180.0) + 1
+    return (np.insert(array, wraps, np.nan) for array in arrays)
+
+
+def _angles(axes: Axes, label: str, series: _Series, result: Result,
+            columns: dict[str, int]) -> None:
+    """Draw angles with the reference, and as they were declared: at their t0."""
+    axes.set_ylabel(label)
+    if not np.isfinite(series.time).any():
+        axes.text(0.5, 0.5, 'no attitude', transform=axes.transAxes, ha='center')
+        return
+    bands = []
+    for name, column in columns.items():
+        sigma = series.sigma[:, column]
+        angle = np.where(sigma < LOST_SIGMA_DEG, series.angles[:, column], np.nan)
+        time, angle, sigma = _broken_at_wraps(angle, series.time, angle, sigma)
+        axes.plot(time, angle, color=COLOURS[column], linewidth=2.0, label=name)
+        bands.append((name, column, time, angle - sigma, angle + sigma))
+    if series.reference is not None:
+        for angle in series.reference[:, [*columns.values()]].T:
+            axes.plot(*_broken_at_wraps(angle, series.time, angle), 'k--', linewidth=0.8,
+                      label='reference')
+    if (declared := result.declared) is not None:
+        for column in columns.values():
+            axes.errorbar(result.t_s(declared.stamp_ns), declared.roll_pitch_yaw_deg[column],
+                          _sigma(declared)[column], fmt='kD', markersize=4.0, capsize=3.0,
+                          label='declared, at its t0')
+    limits = axes.get_ylim()  # the first sigmas would make flat lines of the angles
+    for name, column, time, low, high in bands:
+        axes.fill_between(time, low, high, color=COLOURS[column], alpha=0.25, linewidth=0,
+                          label=f'{name}, 1 sigma')
+    axes.set_ylim(limits)
+
+
+def _sigmas(axes: Axes, series: _Series, result: Result) -> None:
+    axes.set_ylabel('1 sigma (deg)')
+    axes.set_yscale('log')
+    for name, column, threshold in (('tilt', 0, result.config.tilt_std_threshold),
+                                    ('heading', 2, result.config.heading_std_threshold)):
+        colour = COLOURS[column]
+        axes.plot(series.time, series.sigma[:, column], color=colour, linewidth=1.2,
+                  label=f'{name}, current')
+        axes.plot(series.time, series.initial_sigma[:, column], ':', color=colour, linewidth=1.0,
+                  label=f'{name}, at t0')
+        axes.axhline(threshold, color=colour, linestyle='--', linewidth=0.8, label='threshold')
+
+
+def _innovations(axes: Axes, series: _Series, result: Result) -> None:
+    kind = 'velocity' if result.topics and result.topics.velocity else 'position'
+    axes.set_ylabel(f'innovation of the\n{kind} (sigma)')
+    if not np.isfinite(series.innovations).any():
+        return
+    # Outliers may be anything: they are drawn at the edge.
+    limit = max(INNOVATION_LIMIT, 1.5 * float(np.nanquantile(np.abs(series.innovations), 0.99)))
+    for name, colour, values in zip(('east', 'north', 'up'), COLOURS, series.innovations.T):
+        axes.plot(series.time, values.clip(-limit, limit), '.', color=colour, markersize=3.0,
+                  label=name)
+    for level in (3.0, -3.0):
+        axes.axhline(level, color='black', label='3 sigma', **THIN)
+    axes.set_ylim(-1.05 * limit, 1.05 * limit)
+
+
+def _biases(axes: Axes, label: str, time: Array, biases: Array, std: Array) -> None:
+    """Draw three biases, and at the end how well they are known."""
+    axes.set_ylabel(label)
+    known = np.flatnonzero(np.isfinite(time))
+    if not known.size:
+        return
+    for name, colour, values in zip('xyz', COLOURS, biases.T):
+        axes.plot(time, values, color=colour, linewidth=1.2, label=name)
+    for colour, value, sigma in zip(COLOURS, biases[known[-1]], std):
+        axes.errorbar(time[known[-1]], value, sigma, fmt='none', ecolor=colour, capsize=3.0,
+                      label='1 sigma at the end')
+    settled = biases[known[len(known) // 10:]]  # the first seconds tell nothing yet
+    low, high = settled.min() - std.max(), settled.max() + std.max()
+    margin = 0.1 * (high - low) or 1.0
+    axes.set_ylim(low - margin, high + margin)
+
+
+def _errors(axes: Axes, series: _Series) -> None:
+    axes.set_ylabel('error against\nreference (deg)')
+    errors = series.errors
+    assert errors is not None
+    finite = np.isfinite(errors).all(axis=1)
+    if not finite.any():
+        axes.text(0.5, 0.5, 'the reference does not cover these epochs',
+                  transform=axes.transAxes, ha='center')
+        return
+    for name, colour, values in zip(('roll', 'pitch', 'yaw'), COLOURS, errors.T):
+        axes.plot(series.time, values, color=colour, linewidth=1.0, label=name)
+    for level in (3.0, -3.0):
+        axes.plot(series.time, level * series.sigma[:, 2], color=HEADING,
+                  label='heading, 3 sigma', **THIN)
+    # What is seen of an error is its end: its first seconds, of every start, are as large as an
+    # angle can be.
+    settled = finite & (series.aligned if series.aligned.any()
+                        else series.time >= np.median(series.time[finite]))
+    limit = max(1.0, 2.0 * float(np.abs(errors[settled if settled.any() else finite]).max()))
+    axes.set_ylim(-limit, limit)
+
+
+def _track(axes: Axes, result: Result) -> None:
+    """Draw the fixes by the state at each."""
+    axes.set_xlabel('east (m)')
+    axes.set_ylabel('north (m)')
+    axes.set_aspect('equal', adjustable='datalim')
+    track = result.track[np.isfinite(result.track).all(axis=1)]
+    if not len(track):
+        return
+    latitude, longitude = track[0, 1:]
+    north = (track[:, 1] - latitude) * METRES_PER_DEGREE
+    east = (np.remainder(track[:, 2] - longitude + 180.0, 360.0) - 180.0) \
+        * METRES_PER_DEGREE * math.cos(math.radians(latitude))
+    stamps = np.array([epoch.stamp_ns - result.first_fix_ns for epoch in result.epochs])
+    index = np.searchsorted(stamps, track[:, 0], side='right') - 1
+    states = [result.epochs[i].state if i >= 0 else State.WAITING_FOR_GNSS for i in index]
+    axes.plot(east, north, color='#cccccc', linewidth=0.8)
+    for state, colour in STATE_COLOURS.items():
+        if state in states:
+            there = [one is state for one in states]
+            axes.plot(east[there], north[there], '.', color=colour, markersize=5.0,
+                      label=state.value)
+    axes.plot(east[0], north[0], 'k^', markersize=8.0, label='start')
+
+
+def _shade(axes: Axes, result: Result, named: bool) -> None:
+    """Shade the times that were declared; one legend with the names is enough."""
+    for words, state in (('roll and pitch declared', State.LEVELLED),
+                         ('declared aligned', State.ALIGNED)):
+        for first, last in result.spans_of(state):
+            axes.axvspan(first.t_s, last.t_s, color=STATE_COLOURS[state], alpha=0.1, linewidth=0)
+            axes.axvline(first.t_s, color=STATE_COLOURS[state], linewidth=1.2,
+                         label=words if named else None)
+
+
+def _add_legend(axes: Axes, columns: int) -> None:
+    """Put a legend above the axes, where nothing that is drawn can lie under it."""
+    handles: dict[str, Any] = {}
+    for handle, name in zip(*axes.get_legend_handles_labels()):
+        handles.setdefault(name, handle)
+    if handles:
+        axes.legend(handles.values(), handles.keys(), loc='lower left', bbox_to_anchor=(0.0, 1.0),
+                    fontsize=8, frameon=False, ncols=columns, borderpad=0.2, columnspacing=1.2,
+                    handletextpad=0.5)

@@ -22,10 +22,9 @@ from types import SimpleNamespace
 from ins_align.config import Config
 from ins_align.offline import replay
 from ins_align.outputs import process, Task, write_whole
-from ins_align.panels import plot, STATE_COLOURS
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import deserialize
-from ins_align.report import format_table, summary
+from ins_align.report import format_table, plot, STATE_COLOURS, summary
 from ins_align.results import State
 from ins_align.simulation.simulate import simulate, write_bag
 from matplotlib.colors import to_rgb
