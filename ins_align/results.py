@@ -38,6 +38,7 @@ MAX_REFERENCE_GAP_NS = 1_500_000_000  # the reference is not interpolated over m
 
 # Estimates beside the attitude, with the unit as it stands in names.
 ESTIMATES = {'gyro_bias': 'rad_s', 'accel_bias': 'm_s2', 'lever_arm': 'm', 'gnss_delay': 's'}
+FOR_PLOTS = 'roll_pitch_yaw_deg', 'sigma_deg'  # of an attitude: topics too, and of these names
 _ATTITUDE_COLUMNS = 'qx,qy,qz,qw,sigma_e_deg,sigma_n_deg,sigma_u_deg'
 CSV_HEADER = 'stamp_ns,t_s,state,' + ','.join(
     prefix + name for prefix in ('', 'current_') for name in _ATTITUDE_COLUMNS.split(','))

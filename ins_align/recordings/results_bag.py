@@ -29,7 +29,7 @@ from ins_align.imu.prediction import Prediction
 from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import decode_imu, deserialize
-from ins_align.results import Epoch, level_of, Result, State, Status, status_values
+from ins_align.results import Epoch, FOR_PLOTS, level_of, Result, State, Status, status_values
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
@@ -39,7 +39,7 @@ IMU, ATTITUDE = 'sensor_msgs/msg/Imu', 'geometry_msgs/msg/QuaternionStamped'
 STATUS, VECTOR = 'diagnostic_msgs/msg/DiagnosticArray', 'geometry_msgs/msg/Vector3Stamped'
 XYZ = 'geometry_msgs/msg/Vector3'
 TOPICS = {'imu': IMU, 'initial_attitude': ATTITUDE, 'status': STATUS,
-          'roll_pitch_yaw_deg': VECTOR, 'sigma_deg': VECTOR}
+          **dict.fromkeys(FOR_PLOTS, VECTOR)}
 STATUS_PERIOD_NS = 1_000_000_000  # and whenever the state is another one
 # Without GNSS there is an epoch every 2 s: what is older is not carried on with the gyros.
 MAX_AGE_NS = 2_500_000_000
@@ -137,11 +137,9 @@ class _Results:
             yield 'initial_attitude', time_ns, self._make(
                 ATTITUDE, self._header(first.stamp_ns), self._quaternion(first.quaternion_xyzw))
         if now is not None:
-            for name, values in (
-                    ('roll_pitch_yaw_deg', now.roll_pitch_yaw_deg),
-                    ('sigma_deg', now.sigma_deg.tolist())):
+            for name in FOR_PLOTS:
                 yield name, time_ns, self._make(
-                    VECTOR, self._header(now.stamp_ns), self._make(XYZ, *values))
+                    VECTOR, self._header(now.stamp_ns), self._make(XYZ, *getattr(now, name)))
         if epoch.state is not self._state or epoch.stamp_ns >= self._status_ns + STATUS_PERIOD_NS:
             self._status_ns = epoch.stamp_ns
             yield 'status', time_ns, self._status(dataclasses.replace(

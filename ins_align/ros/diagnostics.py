@@ -37,36 +37,28 @@ _NUMBER = re.compile(r'[-+]?\d[\d.]*(?:e[-+]?\d+)?')
 
 
 class ReasonLog:
-    """Decides which parts of a reason are worth a line in the log: new ones, those that stay."""
+    """Decides when a state with its reason is worth a line in the log."""
 
     def __init__(self) -> None:
         """Start with nothing logged."""
-        # When kinds of parts that are present, or were lately, were logged last.
-        self._logged: dict[str, float] = {}
+        self._logged: dict[str, float] = {}  # when texts, without their numbers, were logged last
+        self._present = ''
 
-    def note(self, text: str, now: float) -> None:
-        """Take a state with its reason for logged."""
-        self._logged.update(dict.fromkeys(map(_kind, text.split('; ')), now))
-
-    def due(self, parts: Sequence[str], now: float, again: bool) -> list[tuple[str, bool]]:
+    def due(self, text: str, now: float, again: bool) -> bool:
         """
-        Return the parts to log, and whether each was there before; they are taken for logged.
+        Return whether to log a text, which counts as logged then.
 
-        Other numbers in a part make no other kind; `again`: what stays is logged again and again.
+        That is when it has become another one, but for its numbers, or, if it is to be logged
+        `again` and again, has stayed; not within `LOG_AGAIN` of the last time.
         """
-        kinds = {_kind(part): part for part in parts}
-        self._logged = {kind: when for kind, when in self._logged.items()
-                        if kind in kinds or now - when < LOG_AGAIN}
-        found = [(part, kind in self._logged) for kind, part in kinds.items()
-                 if kind not in self._logged
-                 or (again and now - self._logged[kind] >= LOG_AGAIN)]
-        self._logged.update((_kind(part), now) for part, _ in found)
-        return found
-
-
-def _kind(part: str) -> str:
-    """Return a part of a reason without its numbers."""
-    return _NUMBER.sub('#', part)
+        kind = _NUMBER.sub('#', text)
+        stays, self._present = kind == self._present, kind
+        self._logged = {logged: when for logged, when in self._logged.items()
+                        if now - when < LOG_AGAIN}
+        if kind in self._logged or (stays and not again):
+            return False
+        self._logged[kind] = now
+        return True
 
 
 def type_name(msg_type: type) -> str:

@@ -37,7 +37,7 @@ from ins_align.config import (
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
 from ins_align.mounting import Mounting, MountingSearch
-from ins_align.results import level_of, Severity, WARN
+from ins_align.results import FOR_PLOTS, level_of, Severity, WARN
 from ins_align.ros.diagnostics import (
     diagnostic_status, inputs_in_words, parameter_descriptor, ReasonLog, topic_faults, vector_msg)
 from ins_align.ros.inputs import (
@@ -208,7 +208,7 @@ class AlignmentNode(Node):
         events = self._aligner.take_events()
         for event in events:
             self._log(event.severity, event.text)
-            self._reasons.note(event.text, time.monotonic())
+            self._reasons.due(event.text, time.monotonic(), False)
         # By a clock that goes on when simulated time stands still.
         if events or time.monotonic() >= self._next_status:
             self._publish_status()
@@ -319,11 +319,10 @@ class AlignmentNode(Node):
         now = epoch.current
         if now is None:
             return
-        for publisher, values in (
-                (self._angles_publisher, now.roll_pitch_yaw_deg),
-                (self._sigma_publisher, now.sigma_deg)):
+        for name, publisher in self._numbers_publishers.items():
             if publisher.get_subscription_count() > 0:
-                publisher.publish(vector_msg(now.stamp_ns, self._config.world_frame_id, values))
+                publisher.publish(vector_msg(
+                    now.stamp_ns, self._config.world_frame_id, getattr(now, name)))
 
     def _publish_status(self) -> None:
         now = time.monotonic()
@@ -338,7 +337,6 @@ class AlignmentNode(Node):
             more.append(f'no IMU sample for {silent:.0f} s')
         if self._search.waits_for:
             more.append(f'waits for {self._search.waits_for}')
-        reason = f'{status.state.value}: {status.reason}'
         if more:
             level = max(level, WARN)
             status = dataclasses.replace(status, reason='; '.join([status.reason, *more]))
@@ -350,8 +348,11 @@ class AlignmentNode(Node):
         for publisher in self._status_publishers:
             publisher.publish(msg)
         self._state_publisher.publish(UInt8(data=STATE_NUMBERS[status.state]))
-        if not first:
-            self._log_reason(reason.split('; '), more, status.state, now)
+        text = f'{status.state.value}: {status.reason}'
+        again = status.state is not State.ALIGNED or bool(more)
+        if not first and self._reasons.due(text, now, again):
+            severity = Severity.WARNING if more else Severity.INFO
+            self._log(Severity.ERROR if status.state is State.FAULT else severity, text)
 
     def _input_faults(self, status: Status, silent: bool) -> list[str]:
         """Say what is wrong with topics: nobody is there, or their type is another one."""
@@ -362,17 +363,6 @@ class AlignmentNode(Node):
              and not status.counts.get('velocity'))) if wanted]
         return list(topic_faults(self, self._inputs, expected))
 
-    def _log_reason(self, reason: list[str], more: list[str], state: State, now: float) -> None:
-        """Log what is new in the reason, and every 10 s what stays and is not as it should be."""
-        again = bool(more) or state is not State.ALIGNED
-        for part, stays in self._reasons.due([*reason, *more], now, again):
-            if part == reason[0] and state is State.FAULT:
-                self._log(Severity.ERROR, part)
-            elif part in more or (stays and state is not State.ALIGNED):
-                self._log(Severity.WARNING, part)
-            else:
-                self._log(Severity.INFO, part)
-
     # Topics and parameters
 
     def _open_topics(self) -> None:
@@ -380,9 +370,8 @@ class AlignmentNode(Node):
         self._imu_publisher = self._publish_on(Imu, '~/imu', 100)
         self._status_publishers = [self._publish_on(DiagnosticArray, topic, 10)
                                    for topic in ('~/status', '/diagnostics')]
-        self._angles_publisher, self._sigma_publisher = (
-            self._publish_on(Vector3Stamped, topic, 100)
-            for topic in ('~/roll_pitch_yaw_deg', '~/sigma_deg'))
+        self._numbers_publishers = {name: self._publish_on(Vector3Stamped, f'~/{name}', 100)
+                                    for name in FOR_PLOTS}
         self._state_publisher = self._publish_on(UInt8, '~/state', 10)
         gnss = gnss_topics(self._config)
         self._inputs = {IMU_TOPIC: Imu, **gnss}
