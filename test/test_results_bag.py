@@ -112,6 +112,7 @@ def test_status_is_that_of_the_result(drive):
                 for _, message in read(folder / 'out')['/ins_align/status']]
     status, values = statuses[-1]
     assert status.message == f'ALIGNED: {result.status.reason}' and int(status.level) == 0
+    assert status.hardware_id == 'imu'
     assert values['fix'] == str(result.status.counts['fix'])
     states = [values['state'] for _, values in statuses]
     for state in {epoch.state.value for epoch in result.epochs}:

@@ -78,6 +78,7 @@ class _Results:
         assert result.topics is not None
         self._result, self._types = result, types
         self._topic, self._base = result.topics.imu, result.topics.base
+        self._imu_frame: str | None = None  # known from the first message on
         self._state: State | None = None  # of the epoch before
         self._status_ns = -STATUS_PERIOD_NS
         nan = np.full(3, math.nan)  # of what an epoch does not tell
@@ -93,6 +94,9 @@ class _Results:
         before_ns, before = 0, np.zeros(3)
         time_ns = epoch_ns = 0
         for time_ns, data, stamp_ns, gyro, accel in self._samples():
+            if self._imu_frame is None:
+                header = getattr(deserialize(data, self._topic), 'header', None)
+                self._imu_frame = getattr(header, 'frame_id', '')
             while epochs and epochs[0].stamp_ns <= stamp_ns:
                 epoch = epochs.popleft()
                 yield from self._of_epoch(epoch, time_ns)
@@ -150,29 +154,29 @@ class _Results:
 
     def _imu(self, prediction: Prediction, data: bytes, gyro: Any, accel: Any) -> Any:
         """Return the input message with the orientation filled in."""
-        message = deserialize(data, self._topic)
+        orientation = self._quaternion(prediction.quaternion_xyzw)
+        covariance = np.array(prediction.covariance)
         if self._topic.msgtype == IMU:
-            rest = (message.angular_velocity, message.angular_velocity_covariance,
-                    message.linear_acceleration, message.linear_acceleration_covariance)
-        else:  # a driver's own
-            rest = (self._make(XYZ, *gyro.tolist()), np.zeros(9),
-                    self._make(XYZ, *accel.tolist()), np.zeros(9))
+            return dataclasses.replace(deserialize(data, self._topic), orientation=orientation,
+                                       orientation_covariance=covariance)
+        # A driver's own type, which has no header.
         return self._make(
-            IMU, self._header(prediction.stamp_ns, getattr(message, 'header', None)),
-            self._quaternion(prediction.quaternion_xyzw), np.array(prediction.covariance), *rest)
+            IMU, self._header(prediction.stamp_ns), orientation, covariance,
+            self._make(XYZ, *gyro.tolist()), np.zeros(9),
+            self._make(XYZ, *accel.tolist()), np.zeros(9))
 
     def _status(self, status: Status) -> Any:
         values = status_values(status, self._result.config.base_frame, self._base)
         return self._make(STATUS, self._header(status.stamp_ns or 0), [self._make(
             'diagnostic_msgs/msg/DiagnosticStatus', level_of(status.state),
             'ins_align: alignment', f'{status.state.value}: {status.reason}'.removesuffix(': '),
-            '', [self._make('diagnostic_msgs/msg/KeyValue', *each) for each in values.items()])])
+            self._imu_frame or '', [self._make('diagnostic_msgs/msg/KeyValue', *each)
+                                    for each in values.items()])])
 
-    def _header(self, stamp_ns: int, source: Any = None) -> Any:
-        """Return a header; its frame_id is that of a source, or the world's."""
-        frame = self._result.config.world_frame_id if source is None else source.frame_id
+    def _header(self, stamp_ns: int) -> Any:
         return self._make('std_msgs/msg/Header', self._make(
-            'builtin_interfaces/msg/Time', *divmod(stamp_ns, 1_000_000_000)), frame)
+            'builtin_interfaces/msg/Time', *divmod(stamp_ns, 1_000_000_000)),
+            self._result.config.world_frame_id)
 
     def _quaternion(self, xyzw: Any) -> Any:
         return self._make('geometry_msgs/msg/Quaternion', *map(float, xyzw))
