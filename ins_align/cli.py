@@ -54,10 +54,7 @@ Finds roll, pitch and true heading of a moving IMU with a GNSS receiver.
 """
 
 INFO_EPILOG = """\
-It reads the topics that an alignment could use and tells their rates and gaps, how old stamps are
-when recorded, the unit and the noise of the IMU, the frame of the velocity, whether the motion
-shows a heading and from when on, and the "ins_align replay" command with the options that the
-recording needs.
+It ends with the "ins_align replay" command and the options that the recording needs.
 
 exit status:
   0  told, whether it can be aligned or not

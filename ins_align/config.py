@@ -236,10 +236,13 @@ def without_unknown(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str
     Return the values whose names are known, and a sentence on each of the others.
 
     A file with parameters for many nodes is not wrong; a slip of the pen must not pass unseen.
+    What rclpy itself declares on every node is left out without a word.
     """
     known = [field.name for field in dataclasses.fields(Config)]
     sentences = []
     for name in sorted(str(name) for name in values if name not in known):
+        if name.split('.')[0] in RCLPY_PARAMETERS:
+            continue
         close = difflib.get_close_matches(name, known)
         hint = f': did you mean {" or ".join(close)}?' if close else ''
         sentences.append(f'parameter {reprlib.repr(name)} is not known{hint}')
@@ -264,14 +267,13 @@ def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     found = False
     for node, content in _node_sections(_parse_yaml(text, str(path)), ''):
-        if not _is_this_node(node):
+        if node.rsplit('/', 1)[-1] not in (NODE_NAME, '*', '**'):
             continue
         if not isinstance(content, dict):
             raise ConfigError(f'{path}: ros__parameters of {node} must be a mapping of names '
                               'to values')
         found = True
-        values.update((name, value) for name, value in content.items()
-                      if str(name).split('.')[0] not in RCLPY_PARAMETERS)
+        values.update(content)
     if not found:
         raise ConfigError(f'{path} holds no parameters for this node: expected '
                           f'"{NODE_NAME}:" or "/**:" with "ros__parameters:" below')
@@ -322,11 +324,6 @@ def _node_sections(tree: Any, prefix: str, depth: int = 8) -> Iterable[tuple[str
             yield prefix or '/', content
         else:
             yield from _node_sections(content, f'{prefix}/{str(key).strip("/")}', depth - 1)
-
-
-def _is_this_node(name: str) -> bool:
-    """Whether the last part of a full node name is ours or a wildcard."""
-    return name.rsplit('/', 1)[-1] in (NODE_NAME, '*', '**')
 
 
 def checked(field: dataclasses.Field[Any], value: Any) -> Any:

@@ -126,11 +126,11 @@ def vector_msg(stamp_ns: int, frame_id: str, values: Sequence[float] | np.ndarra
     return msg
 
 
-def diagnostic_status(name: str, hardware_id: str, level: int, status: Status,
-                      mounting: Mounting | None = None) -> DiagnosticStatus:
+def diagnostic_status(name: str, hardware_id: str, level: int, status: Status, base_frame: str,
+                      mounting: Mounting | None) -> DiagnosticStatus:
     """Return a status as diagnostics have it, with the attitude of the base if it is known."""
     return DiagnosticStatus(
         level=bytes([level]), name=f'{name.lstrip("/")}: alignment', hardware_id=hardware_id,
         message=f'{status.state.value}: {status.reason}',
         values=[KeyValue(key=key, value=value) for key, value in status_values(
-            status, *((mounting.config.base_frame, mounting.base) if mounting else ())).items()])
+            status, base_frame, mounting and mounting.base).items()])

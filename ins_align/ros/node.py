@@ -344,7 +344,7 @@ class AlignmentNode(Node):
         msg.header.stamp = self.get_clock().now().to_msg()
         msg.status = [diagnostic_status(
             self.get_fully_qualified_name(), self._imu_frame or '', level, status,
-            self._search.mounting)]
+            self._config.base_frame, self._search.mounting)]
         for publisher in self._status_publishers:
             publisher.publish(msg)
         self._state_publisher.publish(UInt8(data=STATE_NUMBERS[status.state]))
@@ -408,9 +408,7 @@ class AlignmentNode(Node):
         """Check the values given at start and declare all parameters with their description."""
         declared = {name: parameter.value
                     for name, parameter in self.get_parameters_by_prefix('').items()}
-        given, warnings = without_unknown({
-            name: value for name, value in declared.items()
-            if name.split('.')[0] not in RCLPY_PARAMETERS})
+        given, warnings = without_unknown(declared)
         config = config_from_mapping(given)
         for warning in warnings:
             self.get_logger().warning(warning)
