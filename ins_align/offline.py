@@ -136,13 +136,11 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
         if progress is not None:
             progress(part.done)
     assert run is not None
-    first_fix_ns = fixes[0][0] if fixes else 0
     return run.result(
-        bag=str(path), warnings=part.warnings, topics=part.topics, first_fix_ns=first_fix_ns,
+        bag=str(path), warnings=part.warnings, topics=part.topics,
         reference=Reference(*references) if any(
             stamps_ns.size for stamps_ns, _ in references) else None,
-        track=np.array([(stamp_ns - first_fix_ns, *place)
-                        for stamp_ns, *place in fixes]).reshape(-1, 3))
+        track=np.array(fixes, float).reshape(-1, 3))
 
 
 def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,

@@ -25,6 +25,7 @@ import textwrap
 from typing import Any, TYPE_CHECKING
 
 from ins_align.geometry.rotation import Array
+from ins_align.gnss.motion import Series, track
 from ins_align.recordings import one_line
 from ins_align.results import Attitude, Result, State
 import numpy as np
@@ -42,7 +43,6 @@ STATE_COLOURS = {
 COLOURS = '#0072B2', '#CC79A7', '#D55E00'  # roll, pitch, yaw; x, y, z; east, north, up
 HEADING = COLOURS[2]
 INNOVATION_LIMIT = 5.0  # sigmas shown at least
-METRES_PER_DEGREE = 6_371_000.0 * math.pi / 180.0  # of latitude, mean sphere: good for a picture
 LOST_SIGMA_DEG = 60.0  # above this a heading is not worth drawing
 THIN = {'linewidth': 0.8, 'linestyle': ':'}  # of a limit
 
@@ -168,7 +168,7 @@ def plot(result: Result) -> Figure:
     left, right = map(figure.add_subfigure, figure.add_gridspec(1, 2, width_ratios=(3, 2)))
     tilt, yaw, sigmas, innovations = left.subplots(4, 1, sharex=True)
     heights = [1.0] * (2 if series.errors is None else 3) + [2.2]
-    gyro, accel, *error, track = right.subplots(len(heights), 1, height_ratios=heights)
+    gyro, accel, *error, way = right.subplots(len(heights), 1, height_ratios=heights)
     _angles(tilt, 'roll, pitch (deg)', series, result, {'roll': 0, 'pitch': 1})
     _angles(yaw, 'yaw (deg, counter-\nclockwise from east)', series, result, {'yaw': 2})
     _sigmas(sigmas, series, result)
@@ -179,7 +179,7 @@ def plot(result: Result) -> Figure:
             result.status.accel_bias_std)
     for axes in error:
         _errors(axes, series)
-    _track(track, result)
+    _track(way, result)
     upper = [gyro, accel, *error]
     for axes in upper[:-1]:
         axes.sharex(upper[-1])
@@ -188,7 +188,7 @@ def plot(result: Result) -> Figure:
         axes.set_xlabel('time since t0 (s)')
     for axes in (tilt, yaw, sigmas, innovations, *upper):
         _shade(axes, result, named=axes is tilt)
-    for axes in (tilt, yaw, sigmas, innovations, *upper, track):
+    for axes in (tilt, yaw, sigmas, innovations, *upper, way):
         axes.grid(alpha=0.3)
         _add_legend(axes, columns=7 if axes.figure is left else 5)
     return figure
@@ -341,15 +341,12 @@ def _track(axes: Axes, result: Result) -> None:
     axes.set_xlabel('east (m)')
     axes.set_ylabel('north (m)')
     axes.set_aspect('equal', adjustable='datalim')
-    track = result.track[np.isfinite(result.track).all(axis=1)]
-    if not len(track):
+    fixes = result.track[np.isfinite(result.track).all(axis=1)]
+    if not len(fixes):
         return
-    latitude, longitude = track[0, 1:]
-    north = (track[:, 1] - latitude) * METRES_PER_DEGREE
-    east = (np.remainder(track[:, 2] - longitude + 180.0, 360.0) - 180.0) \
-        * METRES_PER_DEGREE * math.cos(math.radians(latitude))
-    stamps = np.array([epoch.stamp_ns - result.first_fix_ns for epoch in result.epochs])
-    index = np.searchsorted(stamps, track[:, 0], side='right') - 1
+    east, north = track(Series(fixes[:, 0], fixes[:, 1:])).vectors.T
+    stamps = np.array([epoch.stamp_ns for epoch in result.epochs], float)
+    index = np.searchsorted(stamps, fixes[:, 0], side='right') - 1
     states = [result.epochs[i].state if i >= 0 else State.WAITING_FOR_GNSS for i in index]
     axes.plot(east, north, color='#cccccc', linewidth=0.8)
     for state, colour in STATE_COLOURS.items():

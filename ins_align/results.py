@@ -237,9 +237,8 @@ class Result:
     warnings: tuple[str, ...] = ()
     reference: Reference | None = None
     topics: Topics | None = None
-    #: (K, 3), of usable fixes: stamp, ns since the first; latitude and longitude, degrees.
+    #: (K, 3), of usable fixes: stamp, ns; latitude and longitude, degrees.
     track: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
-    first_fix_ns: int = 0
 
     @property
     def initial(self) -> Attitude | None:
