@@ -120,12 +120,6 @@ def test_not_aligned(standing, tmp_path, capsys):
     assert result['time_to_align_s'] is None
 
 
-def test_start_and_duration(flight, tmp_path, capsys):
-    main(['replay', str(flight), '--start', '10', '--duration', '5', '--json',
-          str(tmp_path / 'a.json')])
-    assert json.loads((tmp_path / 'a.json').read_text())['counts']['imu'] == 500
-
-
 @pytest.mark.parametrize('part, where', [
     (['--start', '1000'], 'after 1000 s'), (['--duration', '0'], 'between 0 s and 0 s'),
     (['--start', '50', '--duration', '10'], 'between 50 s and 60 s')])
@@ -191,11 +185,6 @@ def test_a_process_that_is_killed_on_the_way(flight, monkeypatch, capsys):
     assert len(errors) == 2 and all('a process died on the way' in error for error in errors)
 
 
-def test_same_name_twice(standing, tmp_path, capsys):
-    assert main(['replay', str(standing), str(standing), '--csv', str(tmp_path / 'a.csv')]) == 1
-    assert {path.name for path in tmp_path.iterdir()} == {'a_standing_1.csv', 'a_standing_2.csv'}
-
-
 @pytest.mark.parametrize('bags', [
     ['x/a', 'y/a_1', 'z/a'], ['x/a', 'y/a_3', 'z/a'], ['a', 'a', 'a_2', 'a_1', 'a_2_2'],
     ['a', 'b.mcap', 'c.0.db3'], ['a_1', 'a', 'a_1', 'a']])
@@ -250,31 +239,25 @@ def test_wrong_arguments(standing, capsys, arguments, message):
     assert message in one_sentence(capsys)
 
 
-@pytest.mark.parametrize('arguments', [
-    ['replay'], ['fly'], ['replay', 'x', '--start', '-1'], ['replay', 'x', '--start', 'nan'],
-    ['replay', 'x', '--nothing'], ['replay', 'x', '--jobs', '0'], ['simulate'],
-    ['simulate', 'x', '--seed', 'a'], ['simulate', 'x', '--lever-arm', '1', '2'],
-    ['experiment', 'x']])
-def test_wrong_usage(capsys, arguments):
+@pytest.mark.parametrize('arguments, says', [
+    ('replay', 'arguments are required'), ('simulate', 'arguments are required'),
+    ('fly', 'invalid choice'), ('experiment x', 'arguments are required'),
+    ('replay x --bogus', 'unrecognized arguments: --bogus'),
+    ('info x --bogus 3', 'unrecognized arguments: --bogus 3'),
+    ('replay x --jobs 0', "--jobs: must be a whole number, 1 or above, got '0'"),
+    ('replay x --start a', "--start: must be a number of seconds, 0 or above, got 'a'"),
+    ('replay x --start -1', 'must be a number of seconds'),
+    ('replay x --start nan', 'must be a number of seconds'),
+    ('simulate x --seed a', "invalid int value: 'a'"),
+    ('simulate x --lever-arm 1 2', 'expected 3 arguments')])
+def test_wrong_usage_names_the_help_of_the_command(capsys, arguments, says):
+    command = '' if arguments == 'fly' else f' {arguments.split()[0]}'
     with pytest.raises(SystemExit) as info:
-        main(arguments)
+        main(arguments.split())
     assert info.value.code == 2
-    assert '--help' in one_sentence(capsys)
-
-
-@pytest.mark.parametrize('arguments, sentence', [
-    (['replay', 'x', '--bogus'], 'ins_align replay: unrecognized arguments: --bogus; '
-     'see "ins_align replay --help"'),
-    (['info', 'x', '--bogus', '3'], 'ins_align info: unrecognized arguments: --bogus 3; '
-     'see "ins_align info --help"'),
-    (['replay', 'x', '--jobs', '0'], 'ins_align replay: argument --jobs: must be a whole number, '
-     '1 or above, got \'0\'; see "ins_align replay --help"'),
-    (['replay', 'x', '--start', 'a'], 'ins_align replay: argument --start: must be a number of '
-     'seconds, 0 or above, got \'a\'; see "ins_align replay --help"')])
-def test_wrong_usage_names_the_help_of_the_command(capsys, arguments, sentence):
-    with pytest.raises(SystemExit):
-        main(arguments)
-    assert one_sentence(capsys) == sentence + '\n'
+    sentence = one_sentence(capsys)
+    assert sentence.startswith(f'ins_align{command}: ') and says in sentence
+    assert sentence.endswith(f'; see "ins_align{command} --help"\n')
 
 
 def test_version(capsys):
@@ -293,14 +276,10 @@ def test_help_names_the_experiments(capsys):
     assert {*NAMES, 'all', *MEASUREMENTS} <= set(words)
 
 
-@pytest.mark.parametrize('content, message', [
-    (b'', 'is empty'), (b'x' * 100, 'no recording'), (None, 'does not exist')])
-def test_unusable_files(tmp_path, capsys, content, message):
-    path = tmp_path / 'a.mcap'
-    if content is not None:
-        path.write_bytes(content)
-    assert main(['replay', str(path), '--json', str(tmp_path / 'a.json')]) == 2
-    assert message in one_sentence(capsys)
+def test_unusable_file(tmp_path, capsys):
+    (tmp_path / 'a.mcap').write_bytes(b'x' * 100)
+    assert main(['replay', str(tmp_path / 'a.mcap'), '--json', str(tmp_path / 'a.json')]) == 2
+    assert 'no recording' in one_sentence(capsys)
     assert not (tmp_path / 'a.json').exists()
 
 
@@ -369,16 +348,6 @@ def test_real_recordings(tmp_path, capsys, name, method):
     result = json.loads((tmp_path / 'a.json').read_text())
     assert result['aligned'] == (status == 0)
     assert result['counts']['imu'] > 1000
-
-
-def test_failed_output_leaves_the_old_file(flight, tmp_path, capsys, monkeypatch):
-    from ins_align.results import Result
-    (tmp_path / 'a.csv').write_text('old')
-    monkeypatch.setattr(Result, 'to_csv', lambda self: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        main(['replay', str(flight), '--csv', str(tmp_path / 'a.csv')])
-    assert (tmp_path / 'a.csv').read_text() == 'old'
-    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_simulate_refuses_in_a_sentence(tmp_path, capsys):
