@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What the node says of itself: diagnostics, the reason in the log, numbers for plots, topics."""
+"""What the node says of its topics and parameters, and when the log has a reason again."""
 
 from __future__ import annotations
 
@@ -20,17 +20,11 @@ import dataclasses
 import re
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Vector3Stamped
 from ins_align.config import Config, listed_choices
 from ins_align.gnss.drivers import type_in_words
-from ins_align.mounting import Mounting
-from ins_align.results import Status, status_values
 from ins_align.ros.inputs import VELOCITY_TOPIC, VELOCITY_TYPES
-import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.node import Node
-from rclpy.time import Time
 
 LOG_AGAIN = 10.0  # s after which a reason that has stayed is worth another line
 _NUMBER = re.compile(r'[-+]?\d[\d.]*(?:e[-+]?\d+)?')
@@ -114,23 +108,3 @@ def parameter_descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
         descriptor.floating_point_range = [FloatingPointRange(
             from_value=line['minimum'], to_value=line['maximum'])]
     return descriptor
-
-
-def vector_msg(stamp_ns: int, frame_id: str, values: Sequence[float] | np.ndarray,
-               ) -> Vector3Stamped:
-    """Put three numbers into a message."""
-    msg = Vector3Stamped()
-    msg.header.stamp = Time(nanoseconds=stamp_ns).to_msg()
-    msg.header.frame_id = frame_id
-    msg.vector.x, msg.vector.y, msg.vector.z = map(float, values)
-    return msg
-
-
-def diagnostic_status(name: str, hardware_id: str, level: int, status: Status, base_frame: str,
-                      mounting: Mounting | None) -> DiagnosticStatus:
-    """Return a status as diagnostics have it, with the attitude of the base if it is known."""
-    return DiagnosticStatus(
-        level=bytes([level]), name=f'{name.lstrip("/")}: alignment', hardware_id=hardware_id,
-        message=f'{status.state.value}: {status.reason}',
-        values=[KeyValue(key=key, value=value) for key, value in status_values(
-            status, base_frame, mounting and mounting.base).items()])

@@ -28,8 +28,8 @@ import threading
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Quaternion, QuaternionStamped, Vector3, Vector3Stamped
 from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
 from ins_align.checks import InputChecks
 from ins_align.config import (
@@ -37,9 +37,9 @@ from ins_align.config import (
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
 from ins_align.mounting import Mounting, MountingSearch
-from ins_align.results import FOR_PLOTS, level_of, Severity, WARN
+from ins_align.results import FOR_PLOTS, level_of, Severity, status_values, WARN
 from ins_align.ros.diagnostics import (
-    diagnostic_status, inputs_in_words, parameter_descriptor, ReasonLog, topic_faults, vector_msg)
+    inputs_in_words, parameter_descriptor, ReasonLog, topic_faults)
 from ins_align.ros.inputs import (
     FIX_TOPIC, Gate, gnss_from_msg, gnss_topics, ImuSample, open_static_tf, queued, read_imu,
     REJECTED_AS, VELOCITY_TOPIC, with_orientation)
@@ -56,7 +56,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.time import Time
 from sensor_msgs.msg import Imu
-from std_msgs.msg import UInt8
+from std_msgs.msg import Header, UInt8
 from std_srvs.srv import Trigger
 
 IMU_TOPIC = 'imu/data_raw'
@@ -307,12 +307,13 @@ class AlignmentNode(Node):
             self.destroy_publisher(self._attitude_publisher)
             self._attitude_publisher = self._open_attitude_topic()
             return
-        msg = QuaternionStamped()
-        msg.header.stamp = Time(nanoseconds=attitude.stamp_ns).to_msg()
-        msg.header.frame_id = self._config.world_frame_id
-        turn = msg.quaternion
-        turn.x, turn.y, turn.z, turn.w = attitude.quaternion_xyzw.tolist()
-        self._attitude_publisher.publish(msg)
+        turn = dict(zip('xyzw', attitude.quaternion_xyzw.tolist()))
+        self._attitude_publisher.publish(QuaternionStamped(
+            header=self._header(attitude.stamp_ns), quaternion=Quaternion(**turn)))
+
+    def _header(self, stamp_ns: int) -> Header:
+        return Header(stamp=Time(nanoseconds=stamp_ns).to_msg(),
+                      frame_id=self._config.world_frame_id)
 
     def _publish_numbers(self, epoch: Epoch) -> None:
         """Publish an epoch for plots."""
@@ -321,8 +322,9 @@ class AlignmentNode(Node):
             return
         for name, publisher in self._numbers_publishers.items():
             if publisher.get_subscription_count() > 0:
-                publisher.publish(vector_msg(
-                    now.stamp_ns, self._config.world_frame_id, getattr(now, name)))
+                vector = dict(zip('xyz', map(float, getattr(now, name))))
+                publisher.publish(Vector3Stamped(
+                    header=self._header(now.stamp_ns), vector=Vector3(**vector)))
 
     def _publish_status(self) -> None:
         now = time.monotonic()
@@ -340,15 +342,17 @@ class AlignmentNode(Node):
         if more:
             level = max(level, WARN)
             status = dataclasses.replace(status, reason='; '.join([status.reason, *more]))
-        msg = DiagnosticArray()
-        msg.header.stamp = self.get_clock().now().to_msg()
-        msg.status = [diagnostic_status(
-            self.get_fully_qualified_name(), self._imu_frame or '', level, status,
-            self._config.base_frame, self._search.mounting)]
+        text = f'{status.state.value}: {status.reason}'
+        mounting = self._search.mounting
+        values = status_values(status, self._config.base_frame, mounting and mounting.base)
+        msg = DiagnosticArray(
+            header=Header(stamp=self.get_clock().now().to_msg()), status=[DiagnosticStatus(
+                level=bytes([level]), message=text, hardware_id=self._imu_frame or '',
+                name=f'{self.get_fully_qualified_name().lstrip("/")}: alignment',
+                values=[KeyValue(key=key, value=value) for key, value in values.items()])])
         for publisher in self._status_publishers:
             publisher.publish(msg)
         self._state_publisher.publish(UInt8(data=STATE_NUMBERS[status.state]))
-        text = f'{status.state.value}: {status.reason}'
         again = status.state is not State.ALIGNED or bool(more)
         if not first and self._reasons.due(text, now, again):
             severity = Severity.WARNING if more else Severity.INFO
