@@ -22,8 +22,8 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TwistStamped, Vector3Stamped
 from ins_align.config import Config, ConfigError
 from ins_align.geometry.rotation import matrix_from_quaternion, roll_pitch_yaw
-from ins_align.ros.diagnostics import ReasonLog
 from ins_align.ros.inputs import gnss_from_msg, gnss_topics
+from ins_align.ros.node import ReasonLog
 from ins_align.simulation.simulate import simulate
 from node_harness import (
     Listener, playing, RELIABLE, running_node, script_of, simulated_messages, stamp_ns, values_of)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-What the node reads: IMU messages as bytes, the GNSS topics with their types, /tf_static.
+What the node reads: IMU messages as bytes, the GNSS topics and their faults, /tf_static.
 
 Turning every IMU sample into a Python message and back costs several times what the alignment
 itself does with it, so the node takes its bytes as they arrive and changes them in place.
@@ -20,7 +20,8 @@ itself does with it, so the node takes its bytes as they arrive and changes them
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+import dataclasses
 from importlib import import_module
 import struct
 from typing import Any, NamedTuple
@@ -28,7 +29,7 @@ from typing import Any, NamedTuple
 from geometry_msgs.msg import TwistStamped, TwistWithCovarianceStamped, Vector3Stamped
 from ins_align.config import Config, ConfigError
 from ins_align.geometry.rotation import Transform
-from ins_align.gnss.drivers import LIVE_TYPES, receiver_from_msg
+from ins_align.gnss.drivers import LIVE_TYPES, receiver_from_msg, type_in_words
 from ins_align.gnss.messages import (
     Fix, fixes_from_msgs, imu_from_msg, velocities_from_msgs, Velocity)
 from ins_align.mounting import Lookup, transform_from_msg
@@ -146,6 +147,47 @@ def gnss_topics(config: Config) -> dict[str, type]:
         raise ConfigError(
             f'fix_type is {config.fix_type}, but {package} is not installed: sudo apt install '
             f'ros-$ROS_DISTRO-{package.replace("_", "-")}, or set fix_type to NavSatFix') from None
+
+
+def type_name(msg_type: type) -> str:
+    """Return the full name of a message type: sensor_msgs/msg/Imu."""
+    return f'{msg_type.__module__.split(".")[0]}/msg/{msg_type.__name__}'
+
+
+def inputs_in_words(node: Node, inputs: Mapping[str, type], config: Config) -> str:
+    """Say what a node reads, and with which parameters."""
+    topics = ', '.join(f'{node.resolve_topic_name(topic)} ({type_in_words(type_name(msg_type))})'
+                       for topic, msg_type in inputs.items())
+    default = Config()
+    changed = ''.join(
+        f', {own.name} {getattr(config, own.name)}' for own in dataclasses.fields(Config)
+        if own.name != 'lever_arm'
+        and getattr(config, own.name) != getattr(default, own.name))
+    return (f'reads {topics}; lever_arm {list(config.lever_arm)} m{changed}, '
+            'other parameters at their defaults')
+
+
+def topic_faults(node: Node, inputs: Mapping[str, type], expected: Sequence[str],
+                 ) -> Iterator[str]:
+    """
+    Look at the publishers of the topics that a node reads, and say what is wrong with them.
+
+    `inputs` are message types by topic; topics that are `expected` are worth a word where nobody
+    publishes them.
+    """
+    for topic, msg_type in inputs.items():
+        name = node.resolve_topic_name(topic)
+        types = {info.topic_type for info in node.get_publishers_info_by_topic(topic)}
+        wanted = type_name(msg_type)
+        if not types and topic in expected:
+            yield f'nobody publishes {name}'
+        if not types or wanted in types:
+            continue
+        other = min(types)
+        known = [parameter for parameter, velocity in VELOCITY_TYPES.items()
+                 if topic == VELOCITY_TOPIC and type_name(velocity) == other]
+        hint = f': set velocity_type to {known[0]}' if known else ''
+        yield f'{name} is published as {type_in_words(other)}, not {type_in_words(wanted)}{hint}'
 
 
 def gnss_from_msg(topic: str, msg: Any, config: Config) -> Sequence[Fix | Velocity]:

@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterable
 import dataclasses
 from functools import partial
 from operator import itemgetter
+import re
 import threading
 import time
 from typing import Any
@@ -33,18 +34,17 @@ from geometry_msgs.msg import Quaternion, QuaternionStamped, Vector3, Vector3Sta
 from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
 from ins_align.checks import InputChecks
 from ins_align.config import (
-    Config, config_from_mapping, ConfigError, NODE_NAME, RCLPY_PARAMETERS, without_unknown)
+    Config, config_from_mapping, ConfigError, listed_choices, NODE_NAME, RCLPY_PARAMETERS,
+    without_unknown)
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
 from ins_align.mounting import Mounting, MountingSearch
 from ins_align.results import FOR_PLOTS, level_of, Severity, status_values, WARN
-from ins_align.ros.diagnostics import (
-    inputs_in_words, parameter_descriptor, ReasonLog, topic_faults)
 from ins_align.ros.inputs import (
-    FIX_TOPIC, Gate, gnss_from_msg, gnss_topics, ImuSample, open_static_tf, queued, read_imu,
-    REJECTED_AS, VELOCITY_TOPIC, with_orientation)
+    FIX_TOPIC, Gate, gnss_from_msg, gnss_topics, ImuSample, inputs_in_words, open_static_tf,
+    queued, read_imu, REJECTED_AS, topic_faults, VELOCITY_TOPIC, with_orientation)
 import numpy as np
-from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -68,7 +68,48 @@ STATUS_PERIOD = 1.0  # s
 # Without a sample for so long, by the clock of this machine, the IMU is silent: the status says
 # so, and another one may take its place (s).
 IMU_SILENT = 1.0
+LOG_AGAIN = 10.0  # s after which a reason that has stayed is worth another line
+_NUMBER = re.compile(r'[-+]?\d[\d.]*(?:e[-+]?\d+)?')
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.5)
+
+
+class ReasonLog:
+    """Decides when a state with its reason is worth a line in the log."""
+
+    def __init__(self) -> None:
+        """Start with nothing logged."""
+        self._logged: dict[str, float] = {}  # when texts, without their numbers, were logged last
+        self._present = ''
+
+    def due(self, text: str, now: float, again: bool) -> bool:
+        """
+        Return whether to log a text, which counts as logged then.
+
+        That is when it has become another one, but for its numbers, or, if it is to be logged
+        `again` and again, has stayed; not within `LOG_AGAIN` of the last time.
+        """
+        kind = _NUMBER.sub('#', text)
+        stays, self._present = kind == self._present, kind
+        self._logged = {logged: when for logged, when in self._logged.items()
+                        if now - when < LOG_AGAIN}
+        if kind in self._logged or (stays and not again):
+            return False
+        self._logged[kind] = now
+        return True
+
+
+def parameter_descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
+    """Describe one field of `Config` to ROS."""
+    line = field.metadata
+    unit = f' [{line["unit"]}]' if line['unit'] else ''
+    descriptor = ParameterDescriptor(
+        description=line['description'] + unit, read_only=line['read_only'])
+    if line['choices']:
+        descriptor.additional_constraints = f'one of: {listed_choices(line["choices"])}'
+    if line['maximum'] is not None:
+        descriptor.floating_point_range = [FloatingPointRange(
+            from_value=line['minimum'], to_value=line['maximum'])]
+    return descriptor
 
 
 class AlignmentNode(Node):
