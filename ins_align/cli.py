@@ -24,17 +24,15 @@ import io
 from itertools import chain
 import json
 import os
-from pathlib import Path
 import sys
-from typing import Any, NoReturn, TYPE_CHECKING
+from typing import Any, NoReturn
 
+from ins_align.config import (
+    Config, config_from_mapping, load_params, parse_override, UsageError, without_unknown)
 from ins_align.outputs import (
     check_plot, check_writable, names_for, not_aligned, Outcome, process, STANDARD_OUTPUT,
-    survey, Task, UsageError, write_whole)
+    survey, Task, write_whole)
 from ins_align.processes import keep_to_one, processors, run_all, run_on_cluster
-
-if TYPE_CHECKING:
-    from ins_align.config import Config
 
 # Everything else is imported where it is used: --help must not wait for numpy.
 
@@ -367,21 +365,15 @@ def _tell(arguments: argparse.Namespace, outcomes: Iterable[Outcome]) -> int:
 
 
 def _config(arguments: argparse.Namespace) -> Config:
-    from ins_align.config import (
-        config_from_mapping, ConfigError, load_params, parse_override, without_unknown)
-
-    try:
-        values, warnings = without_unknown(load_params(arguments.params)
-                                           if arguments.params else {})
-        for warning in warnings:
-            print(f'ins_align {arguments.command}: warning: {arguments.params}: {warning}',
-                  file=sys.stderr)
-        values.update(parse_override(text) for text in arguments.overrides)
-        if arguments.lever_arm is not None:
-            values['lever_arm'] = arguments.lever_arm
-        return config_from_mapping(values)
-    except ConfigError as error:
-        raise UsageError(error) from None
+    given = load_params(arguments.params) if arguments.params else {}
+    values, warnings = without_unknown(given)
+    for warning in warnings:
+        print(f'ins_align {arguments.command}: warning: {arguments.params}: {warning}',
+              file=sys.stderr)
+    values.update(parse_override(text) for text in arguments.overrides)
+    if arguments.lever_arm is not None:
+        values['lever_arm'] = arguments.lever_arm
+    return config_from_mapping(values)
 
 
 def _missing(error: ModuleNotFoundError) -> UsageError:
@@ -394,7 +386,6 @@ def _missing(error: ModuleNotFoundError) -> UsageError:
 
 def run_simulate(arguments: argparse.Namespace) -> int:
     """Run ``ins_align simulate``."""
-    from ins_align.simulation.arguments import SimulationError
     from ins_align.simulation.simulate import simulate, write_bag
 
     options = {name: value for name, value in vars(arguments).items()
@@ -402,8 +393,6 @@ def run_simulate(arguments: argparse.Namespace) -> int:
     try:
         write_bag(simulate(arguments.scenario, **options), arguments.out, arguments.storage,
                   arguments.tf)
-    except SimulationError as error:
-        raise UsageError(error) from None
     except OSError as error:
         raise UsageError(f'cannot write {arguments.out}: {error.strerror}') from None
     print(f'{arguments.out}: {arguments.scenario}, {arguments.imu_grade} IMU, '
@@ -415,12 +404,7 @@ def run_experiment(arguments: argparse.Namespace) -> int:
     """Run ``ins_align experiment``."""
     from ins_align import experiments
 
-    try:
-        experiments.run(arguments.name, Path(arguments.out),
-                        data_dir=None if arguments.data is None else Path(arguments.data),
-                        runs=arguments.runs, jobs=arguments.jobs)
-    except experiments.ExperimentError as error:
-        raise UsageError(error) from None
+    experiments.run(arguments.name, arguments.out, arguments.data, arguments.runs, arguments.jobs)
     return 0
 
 

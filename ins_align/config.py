@@ -35,7 +35,11 @@ AUTO_OR_BOOL = ('auto', True, False)
 RCLPY_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 
 
-class ConfigError(ValueError):
+class UsageError(ValueError):
+    """A mistake of the user; the text says in one sentence what is wrong."""
+
+
+class ConfigError(UsageError):
     """A setting is wrong; the text says which one, why, and what would be right."""
 
 

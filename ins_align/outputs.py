@@ -25,14 +25,12 @@ import os
 from pathlib import Path
 from typing import Any, IO
 
+from ins_align.config import UsageError
+
 # Everything else is imported where it is used: --help must not wait for numpy.
 
 STANDARD_OUTPUT = '-'
 PLOT_SUFFIXES = ('.png', '.pdf', '.svg', '.jpg', '.jpeg', '.webp', '.eps', '.tif', '.tiff')
-
-
-class UsageError(Exception):
-    """A wrong command line; the text says what is wrong in one sentence."""
 
 
 @dataclass(frozen=True)

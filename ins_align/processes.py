@@ -24,7 +24,7 @@ import signal
 import threading
 from typing import Any, TypeVar
 
-from ins_align.outputs import UsageError
+from ins_align.config import UsageError
 
 T = TypeVar('T')
 VARIABLES = ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'OMP_NUM_THREADS')

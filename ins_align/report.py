@@ -101,9 +101,9 @@ def summary(result: Result) -> str:
                   'n', 'u']
         if result.reference is not None:
             header += ['error roll', 'pitch', 'yaw']
+        first_t0_s = result.epochs[0].stamp_ns * 1e-9 - result.epochs[0].t_s
         lines += ['', format_table(rows, header, '  '),
-                  '  all times since the first t0, stamp '
-                  f'{(result.first_t0_ns or 0) * 1e-9:.3f} s; declared: '
+                  f'  all times since the first t0, stamp {first_t0_s:.3f} s; declared: '
                   'at its t0, as the node publishes it', '', _nuisance_table(result)]
     counts = ', '.join(f'{name} {count}' for name, count in sorted(status.counts.items()) if count)
     return '\n'.join([*lines, '', f'  counts: {counts or "nothing read"}'])

@@ -295,17 +295,8 @@ class Result:
             f'(tilt +- {now.sigma_deg[:2].max():.2f} deg) at stamp {now.stamp_ns}')
         return f'Result({self.state_in_words}, {attitude}, {len(self.epochs)} epochs)'
 
-    @property
-    def first_t0_ns(self) -> int | None:
-        """Return the stamp from which `Epoch.t_s` is counted; None: there is no epoch."""
-        if not self.epochs:
-            return None
-        return self.epochs[0].stamp_ns - round(self.epochs[0].t_s * 1e9)
-
     def t_s(self, stamp_ns: int) -> float:
         """Return the time of a stamp, s since the first t0, on the clock of the last epoch."""
-        if not self.epochs:
-            return 0.0
         return self.epochs[-1].t_s - (self.epochs[-1].stamp_ns - stamp_ns) * 1e-9
 
     def to_json(self) -> dict[str, Any]:

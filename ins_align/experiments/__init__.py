@@ -22,6 +22,8 @@ from __future__ import annotations
 import importlib
 from pathlib import Path
 
+from ins_align.config import UsageError
+
 # Title, function and by default how many runs of each, in the order in which `all` runs them.
 NAMES = {
     'note': ("The note's experiment", 'bound.run_note', 100),
@@ -37,7 +39,7 @@ NEED_DATA, TAKE_DATA = ('recordings',), ('vehicle', 'recordings')
 MEASUREMENTS = {'bench': ('Speed', 'bench.run', 60)}
 
 
-class ExperimentError(ValueError):
+class ExperimentError(UsageError):
     """An experiment cannot be run as asked."""
 
 

@@ -24,7 +24,7 @@ from numbers import Real
 import reprlib
 from typing import Any
 
-from ins_align.config import checked, Config, ConfigError, ImuNoise, PRESETS
+from ins_align.config import checked, Config, ConfigError, ImuNoise, PRESETS, UsageError
 
 IMU_AXES = {'': (1.0, 1.0, 1.0), 'x': (-1.0, 1.0, 1.0), 'y': (1.0, -1.0, 1.0),
             'z': (1.0, 1.0, -1.0)}
@@ -45,7 +45,7 @@ _OF_CHIP = {
                     0.3 * _CHIP.gyro_scale_std)}
 
 
-class SimulationError(ValueError):
+class SimulationError(UsageError):
     """A simulation cannot be made as asked; the text says why."""
 
 
