@@ -20,7 +20,6 @@ import dataclasses
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-from itertools import pairwise
 import math
 from typing import Any, NamedTuple, TYPE_CHECKING
 
@@ -343,12 +342,13 @@ def _attitude_cells(attitude: Attitude | None) -> list[str]:
 
 def in_order_of_time(epochs: Iterable[Epoch]) -> tuple[Epoch, ...]:
     """Let `Epoch.t_s` go on where it counts anew, since a clock was set back."""
-    given = list(epochs)
-    before_s, moved = 0.0, []
-    for last, epoch in pairwise([*given[:1], *given]):
-        if epoch.t_s < last.t_s:
-            before_s += last.t_s
-        moved.append(dataclasses.replace(epoch, t_s=before_s + epoch.t_s) if before_s else epoch)
+    before_s = last_s = 0.0
+    moved = []
+    for epoch in epochs:
+        if epoch.t_s < last_s:
+            before_s += last_s
+        last_s = epoch.t_s
+        moved.append(dataclasses.replace(epoch, t_s=before_s + last_s))
     return tuple(moved)
 
 

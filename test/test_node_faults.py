@@ -324,7 +324,7 @@ def test_reset_in_the_middle(tmp_path):
     check_attitude(first, simulation)
     check_attitude(second, simulation)
     assert listener.count('resets') == 1
-    assert severities(node, 'ALIGNED: ') == ['INFO', 'INFO']
+    assert severities(node, 'ALIGNED: (?!.*no IMU sample)') == ['INFO', 'INFO']
     assert severities(node, 'alignment starts over: requested by service') == ['WARN']
 
 
@@ -339,7 +339,7 @@ def test_accelerations_in_g_are_an_error(tmp_path):
         listener.wait_for(lambda: listener.statuses)
         play(script_of(messages), tmp_path, RATE)
         listener.wait_for(lambda: listener.status['state'] == 'FAULT')
-    assert severities(node, 'FAULT: ') == ['ERROR']
+    assert set(severities(node, 'FAULT: ')) == {'ERROR'}
 
 
 def severities(node, text):

@@ -133,7 +133,7 @@ def test_what_is_missing_is_said_in_the_log_with_the_names_of_its_namespace():
     assert node.output.count(wrong) == 1
     assert ('reads /robot1/imu/data_raw (sensor_msgs/Imu), /robot1/fix (sensor_msgs/NavSatFix), '
             '/robot1/fix_velocity (geometry_msgs/TwistWithCovarianceStamped); '
-            'lever_arm [1.0, 2.0, 3.0] m, imu_grade tactical' in node.output)
+            'lever_arm (1.0, 2.0, 3.0), imu_grade tactical' in node.output)
 
 
 def test_wrong_units_and_late_messages_are_said_as_replay_says_them(tmp_path):

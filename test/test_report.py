@@ -98,18 +98,6 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
     assert pipe.is_fifo() and list(tmp_path.iterdir()) == [pipe]
 
 
-def test_times_that_were_declared(result):
-    states = 'ALIGNING', 'ALIGNED', 'ALIGNED', 'LEVELLED', 'ALIGNED', 'FAULT'
-    assert aligned_times(with_states(
-        result, *((state, '', '') for state in states))) == [(1.0, 2.0), (4.0, 4.0)]
-    assert aligned_times(with_states(result, ('ALIGNING', '', ''))) == []
-
-
-def aligned_times(result):
-    """Return the first and the last time of each span that was declared."""
-    return [(span.first.t_s, span.last.t_s) for span in result.spans_of(State.ALIGNED)]
-
-
 def with_states(result, *epochs):
     """Return a result with epochs 1 s apart, of states with reasons and why it started over."""
     return dataclasses.replace(result, epochs=tuple(
@@ -339,7 +327,7 @@ def dry(tmp_path_factory):
 
 
 def test_what_is_declared_lasts_into_an_outage(dry):
-    (start, end), = aligned_times(dry)
+    (start, end), = [(first.t_s, last.t_s) for first, last in dry.spans_of(State.ALIGNED)]
     assert start < 20.0 and 42.0 < end < 98.0 and dry.status.state is not State.ALIGNED
     told = changes_in(summary(dry))
     assert f'{start:.1f} s ALIGNED: ' in ' '.join(told)

@@ -158,13 +158,10 @@ def inputs_in_words(node: Node, inputs: Mapping[str, type], config: Config) -> s
     """Say what a node reads, and with which parameters."""
     topics = ', '.join(f'{node.resolve_topic_name(topic)} ({type_in_words(type_name(msg_type))})'
                        for topic, msg_type in inputs.items())
-    default = Config()
-    changed = ''.join(
-        f', {own.name} {getattr(config, own.name)}' for own in dataclasses.fields(Config)
-        if own.name != 'lever_arm'
-        and getattr(config, own.name) != getattr(default, own.name))
-    return (f'reads {topics}; lever_arm {list(config.lever_arm)} m{changed}, '
-            'other parameters at their defaults')
+    told = ', '.join(f'{own.name} {getattr(config, own.name)}'
+                     for own in dataclasses.fields(Config)
+                     if own.name == 'lever_arm' or getattr(config, own.name) != own.default)
+    return f'reads {topics}; {told}, other parameters at their defaults'
 
 
 def topic_faults(node: Node, inputs: Mapping[str, type], expected: Sequence[str],

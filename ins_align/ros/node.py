@@ -60,7 +60,6 @@ from std_msgs.msg import Header, UInt8
 from std_srvs.srv import Trigger
 
 IMU_TOPIC = 'imu/data_raw'
-STATE_NUMBERS = {state: number for number, state in enumerate(State)}
 IMU_DEPTH = 2000  # ten seconds at 200 Hz: the machine may be busy, no sample may be lost
 GNSS_DEPTH = 200
 PERIOD = 0.2  # s, between two rounds of the worker: many messages at one go cost less
@@ -393,7 +392,7 @@ class AlignmentNode(Node):
                 values=[KeyValue(key=key, value=value) for key, value in values.items()])])
         for publisher in self._status_publishers:
             publisher.publish(msg)
-        self._state_publisher.publish(UInt8(data=STATE_NUMBERS[status.state]))
+        self._state_publisher.publish(UInt8(data=list(State).index(status.state)))
         again = status.state is not State.ALIGNED or bool(more)
         if not first and self._reasons.due(text, now, again):
             severity = Severity.WARNING if more else Severity.INFO
