@@ -15,7 +15,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 import dataclasses
 from dataclasses import dataclass
 from enum import Enum
@@ -327,17 +327,22 @@ class Result:
 
     def to_csv(self) -> str:
         """Return the table that ``--csv`` writes, a row per GNSS epoch."""
-        rows = [','.join([f'{epoch.stamp_ns},{epoch.t_s:.9f},{epoch.state.value}',
-                          *_attitude_cells(epoch.initial), *_attitude_cells(epoch.current)])
-                for epoch in self.epochs if not epoch.dry]
-        return '\n'.join([CSV_HEADER, *rows, ''])
+        epochs = [epoch for epoch in self.epochs if not epoch.dry]
+        rows = zip([f'{epoch.stamp_ns},{epoch.t_s:.9f},{epoch.state.value}' for epoch in epochs],
+                   _attitude_cells([epoch.initial for epoch in epochs]),
+                   _attitude_cells([epoch.current for epoch in epochs]))
+        return '\n'.join([CSV_HEADER, *map(','.join, rows), ''])
 
 
-def _attitude_cells(attitude: Attitude | None) -> list[str]:
-    """Return an attitude's columns of `CSV_HEADER`; empty where it, or a number, is not known."""
-    numbers = [math.nan] * 7 if attitude is None else [
-        *attitude.quaternion_xyzw.tolist(), *attitude.sigma_deg.tolist()]
-    return [repr(number) if math.isfinite(number) else '' for number in numbers]
+def _attitude_cells(attitudes: Sequence[Attitude | None]) -> Iterator[str]:
+    """Yield the columns of each attitude, all converted at a time; empty where there is none."""
+    unknown = np.full((2, 3, 3), np.nan)
+    C_nb, covariances = np.array([
+        unknown if each is None else (each.C_nb, each.covariance) for each in attitudes
+    ]).reshape(-1, 2, 3, 3).swapaxes(0, 1)
+    sigmas = np.degrees(np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)))
+    for numbers in np.hstack([quaternion_from_matrix(C_nb), sigmas]).tolist():
+        yield ','.join(repr(number) if math.isfinite(number) else '' for number in numbers)
 
 
 def in_order_of_time(epochs: Iterable[Epoch]) -> tuple[Epoch, ...]:
