@@ -103,8 +103,9 @@ def summary(result: Result) -> str:
             header += ['error roll', 'pitch', 'yaw']
         first_t0_s = result.epochs[0].stamp_ns * 1e-9 - result.epochs[0].t_s
         lines += ['', format_table(rows, header, '  '),
-                  f'  all times since the first t0, stamp {first_t0_s:.3f} s; declared: '
-                  'at its t0, as the node publishes it', '', _nuisance_table(result)]
+                  f'  times are since the first t0, stamp {first_t0_s:.3f} s',
+                  '  declared: at t0, as the node published it; initial: at t0, as known in the '
+                  'end; final: in the end', '', _nuisance_table(result)]
     counts = ', '.join(f'{name} {count}' for name, count in sorted(status.counts.items()) if count)
     return '\n'.join([*lines, '', f'  counts: {counts or "nothing read"}'])
 
