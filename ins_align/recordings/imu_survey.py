@@ -306,8 +306,7 @@ def fit_motion(samples: Series, velocities: Series, gravity: float,
 
     Returns figures, s and m/s, as far as motion and data tell them: ``gnss_delay`` (stamps less
     the times of measurement on the clock of the IMU), ``gnss_delay_std``, ``velocity_noise``
-    (horizontal, per axis),
-    ``velocity_noise_vertical``.
+    (horizontal, per axis), ``velocity_noise_vertical``.
     """
     delays = np.concatenate([offset + DELAYS for offset in offsets])
     moving = np.flatnonzero(np.hypot(*velocities.vectors[:, :2].T) > MOVING)
