@@ -83,7 +83,7 @@ class _Seen:
 
     def __init__(self, point: Array, interval: Intervals) -> None:
         """Lead back from the epochs to the moments that were measured."""
-        self.shape = interval.R.shape[:2] + (3, FIRST + point.shape[1])
+        self.shape = interval.duration.size, len(point), 3, FIRST + point.shape[1]
         gyro, accel = (point[:, triad] for triad in triads(point.shape[1]))
         self.delay = delay = float(point[0, DELAY])
         force, self.gained, self.gained_p = exact(interval.gained, delay)

@@ -98,18 +98,14 @@ class Intervals:
         """
         Return what the intervals would be with the signs of sensors changed, leading axes (K, M).
 
-        `signs`, shape (M, 4), are those of the gyros x, y, z and of the accelerometers. To second
-        order in the rotation over an interval, with rate and force steady in it: good for telling
-        the signs apart.
+        `signs`, shape (M, 4), are those of the gyros x, y, z and of the accelerometers; where none
+        is changed, the leading axes are (K, 1) and serve all. To second order in the rotation over
+        an interval, with rate and force steady in it: good for telling the signs apart.
         """
         gyro, accel = signs[:, :3], signs[:, 3:]
         wider = {name: array[:, None] for name, array in vars(self).items()}
         if (signs == 1).all():
-            shape = self.duration.size, len(signs)
-            return Intervals(**wider | {
-                name: np.broadcast_to(array, shape + array.shape[2:])
-                for name, array in wider.items() if name != 'duration'} | {
-                    'duration': self.duration})
+            return Intervals(**wider | {'duration': self.duration})
         turn = log_so3(self.R)[:, None]
         # Forces act on average half and, for the way, a third of the rotation after the start.
         half, third = (exp_so3(part * gyro * turn) @ exp_so3(-part * turn) for part in (1/2, 1/3))

@@ -19,6 +19,7 @@ What the specific force has added to the velocity since, and the rates to the ro
 the epoch back to that moment. They are kept at a ladder of ages that follows a walker's steps.
 """
 
+from functools import lru_cache
 import math
 from typing import NamedTuple
 
@@ -131,6 +132,7 @@ def smooth(integrals: Array, age: float) -> tuple[Array, Array]:
     return value[1:] @ integrals, change[1:] @ integrals
 
 
+@lru_cache(maxsize=8)          # the delay stays the same for many epochs
 def _cubic(age: float, apart: int) -> tuple[Array, Array, Array]:
     """
     Weights of the rungs, the one at age 0 first, in a cubic and its two derivatives at an age.
