@@ -83,7 +83,7 @@ def test_bound_is_reached_on_a_navigation_grade_flight(monkeypatch):
     monkeypatch.setattr(bound, 'TIMES', (10.0, 14.0, 20.0))
     case = bound.CASES[0]
     case = case._replace(simulate={'duration': 20.5})
-    limits = bound.bound_of(case)
+    limits = common.bound_of(case)
     runs = [bound.run_exact((case, seed)) for seed in range(4)]
     results = bound.results_of(case, limits, runs)
     assert results[0]['heading_bound_deg'] == pytest.approx(0.245, abs=0.01)

@@ -182,3 +182,25 @@ def test_constants_are_those_of_their_page():
     for name, value in written.items():
         assert found[name] == pytest.approx(value if isinstance(value, dict)
                                             else np.array(value, float)), name
+
+
+def test_files_functions_and_chains_of_imports_stay_short():
+    """What docs/design.md promises to whoever reads the package."""
+    trees = {path.relative_to(ROOT).with_suffix('').as_posix().removesuffix('/__init__'):
+             ast.parse(path.read_text('utf-8')) for path in (ROOT / 'ins_align').rglob('*.py')}
+    imported = {name: set(trees) & {
+        f'{node.module.replace(".", "/")}{end}' for node in tree.body
+        if isinstance(node, ast.ImportFrom) and node.module
+        for end in ('', *(f'/{alias.name}' for alias in node.names))}
+        for name, tree in trees.items()}
+
+    def floor(name):
+        return 1 + max((floor(below) for below in imported[name]), default=0)
+
+    for name, tree in trees.items():
+        assert floor(name) <= 8, name
+        assert max((node.end_lineno for node in tree.body), default=0) <= 500, name
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef):
+                first = node.body[1 if ast.get_docstring(node) and len(node.body) > 1 else 0]
+                assert node.end_lineno - first.lineno < 60, f'{name}: {node.name}'

@@ -28,8 +28,7 @@ from ins_align.estimation.receiver import LEAST_NOISE, LOUD
 from ins_align.estimation.states import FIRST, PHI, PHI0, RHO, XI
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.rotation import apply, Array, cross, cumulative_rotations, exp_so3, Index
-from ins_align.gnss.antenna import UNKNOWN_ALTITUDE_STD
-from ins_align.gnss.messages import AntennaEpoch, velocities_of
+from ins_align.gnss.messages import AntennaEpoch, UNKNOWN_ALTITUDE_STD, velocities_of
 from ins_align.imu.preintegration import Intervals
 import numpy as np
 

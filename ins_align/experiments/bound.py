@@ -31,7 +31,7 @@ from typing import Any
 from ins_align.config import Config
 from ins_align.experiments import dense
 from ins_align.experiments.common import (
-    Case, error_of, follow, GRADES, JsonDict, parallel, prepare, Report, run_cases, simulated)
+    bound_of, Case, error_of, follow, GRADES, JsonDict, parallel, prepare, Report, run_cases)
 from ins_align.geometry.rotation import Array, roll_pitch_yaw
 from ins_align.report import new_figure
 import numpy as np
@@ -88,13 +88,6 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
          for title in dict.fromkeys(case.name for case in CASES)])
     report.table('Root mean square errors, bounds and their ratios', map(result_row, results))
     return {'runs': runs, 'results': results}
-
-
-def bound_of(case: Case) -> dense.Bound:
-    """Return the bound of a case, with what is unknown in it."""
-    return dense.bound(
-        simulated(case), not case.config.get('use_velocity', True),
-        case.config.get('lever_arm_std', 0.0), case.config.get('gnss_delay_std', 0.0))
 
 
 def _lever_arm(seed: int) -> JsonDict:

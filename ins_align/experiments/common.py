@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 
 from ins_align.aligner import Aligner, Attitude, Epoch, State
 from ins_align.config import Config
+from ins_align.experiments import dense
 from ins_align.experiments.spoilt import Random, SECOND, SENSORS, Stream, stream_of
 from ins_align.geometry.rotation import Array, log_so3
 from ins_align.outputs import write_whole
@@ -124,6 +125,13 @@ def simulated(case: Case, seed: int = 0) -> Simulation:
     scenario, grade = case.motions[seed % len(case.motions)]
     drawn = case.drawn(seed) if case.drawn else {}
     return simulate(scenario, **{'imu_grade': grade, 'seed': seed, **drawn, **case.simulate})
+
+
+def bound_of(case: Case) -> dense.Bound:
+    """Return the bound of a case, with what is unknown in it."""
+    return dense.bound(
+        simulated(case), not case.config.get('use_velocity', True),
+        case.config.get('lever_arm_std', 0.0), case.config.get('gnss_delay_std', 0.0))
 
 
 def prepare(case: Case, seed: int) -> tuple[Simulation, Stream, Aligner]:

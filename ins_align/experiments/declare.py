@@ -30,10 +30,9 @@ from typing import Any
 
 from ins_align.aligner import State
 from ins_align.config import Config, PRESETS
-from ins_align.experiments.bound import bound_of
 from ins_align.experiments.common import (
-    Case, cell, combination, follow, GRADES, groups_of, JsonDict, moment_row, parallel, prepare,
-    Report, run_case, setup)
+    bound_of, Case, cell, combination, follow, GRADES, groups_of, JsonDict, moment_row, parallel,
+    prepare, Report, run_case, setup)
 from ins_align.experiments.spoilt import Random
 from ins_align.simulation.simulate import SCENARIOS
 import numpy as np

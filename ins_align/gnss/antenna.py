@@ -23,7 +23,7 @@ from ins_align.geometry.earth import (
     dead_reckon, enu_offset, GRAVITY_EQUATOR, Place, SEMI_MAJOR_AXIS)
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.buffer import GnssEpoch
-from ins_align.gnss.messages import AntennaEpoch, Fix
+from ins_align.gnss.messages import AntennaEpoch, Fix, UNKNOWN_ALTITUDE_STD
 import numpy as np
 
 # A fix this far (m) from where the last one and the velocity lead, and as much again for every
@@ -32,7 +32,7 @@ MAX_FIX_JUMP = 300.0
 FIX_JUMPS_BELIEVED = 5
 # A place this old (s) is not carried on with the velocity.
 MAX_CARRIED = 60.0
-_UNKNOWN_VERTICAL_STD, UNKNOWN_ALTITUDE_STD = 1e3, 1e4
+_UNKNOWN_VERTICAL_STD = 1e3     # m/s
 # A variance this many times smaller than what the receiver usually states, the median of so many
 # epochs, is not believed: a receiver that is ten times better than it was will say so again. One
 # that was worse than the configuration expects need not. In the first epoch any is believed that a

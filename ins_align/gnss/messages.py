@@ -51,6 +51,8 @@ MIN_EIGENVALUE = 1e-9  # of possible correlations: less is rounding
 # Beyond these no receiver measures; such values would overflow the integrals (m/s, m).
 MAX_SPEED, MAX_ALTITUDE = 2000.0, 1e6
 NO_FIX = -1  # status
+# Sigma of an altitude that a fix does not have (m).
+UNKNOWN_ALTITUDE_STD = 1e4
 
 
 class MessageError(ValueError):
