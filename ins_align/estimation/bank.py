@@ -337,15 +337,15 @@ class Bank:
         if filters is None:
             return Fit(self._offered, delay=self._config.gnss_delay, doubt=self._start.lacks)
         velocity, position, either = self._rejected
+        x, P = self._body()
         best = filters.best
         remarks = receiver.in_words() + self._not_used + level_in_words(
-            self._rivals.table[filters.ids[best]], self._config.imu_noise,
-            filters.x[filters.lead[best]])
+            self._rivals.table[filters.ids[best]], self._config.imu_noise, x, np.sqrt(np.diag(P)))
         if self._vehicle is not None:
             remarks += self._vehicle.in_words(filters)
         return Fit(self._offered, 3 * (self._offered - either), receiver.misfit, self._nis,
                    self._innovation, velocity, position, either,
-                   delay=self._config.gnss_delay + float(filters.x[filters.lead[best], DELAY]),
+                   delay=self._config.gnss_delay + float(x[DELAY]),
                    objection=self._doubt if self._contradicted else '', doubt=self._doubt,
                    remarks=remarks)
 

@@ -42,8 +42,9 @@ UNLIKELY, HOPELESS, LEAST = 14.0, 25.0, NEGLIGIBLE + 1.0
 ALIKE = 2.0
 # A wrong rival that is likely has to give the same attitude, to so many sigmas.
 HARMLESS = 1.0
-# A bias that is found to be so many times its sigma asks for a larger one.
-LARGE_BIAS = 2.0
+# A setting is named for a bias that is so many times what is configured, without so many of its
+# own sigmas.
+LARGE_BIAS, SURELY = 2.0, 2.0
 # Velocity of a vehicle sideways and upwards that lasts (m/s: tyres' slip, leeway and current,
 # wind); it changes by its sigma in this time (s), as the wind does where an aeroplane turns.
 DRIFTS = {'car': 0.1, 'boat': 1.0, 'aeroplane': 10.0}
@@ -266,19 +267,22 @@ def in_words(rival: Rival, x: Array, gnss_delay: float) -> str:
     return f'the data fit better with {better}: {rival.advice}'
 
 
-def level_in_words(level: Rival, noise: ImuNoise, x: Array) -> str:
+def level_in_words(level: Rival, noise: ImuNoise, x: Array, std: Array) -> str:
     """
     Return how a level with parameters x is worse than the configured noise, or ''.
 
-    It is the end of a sentence. A setting is named where a bias is found that asks for it: what
-    looks worse for other reasons gets no better with larger biases configured, and takes longer.
+    It is the end of a sentence. A setting is named where a bias is surely far larger than
+    configured: what looks worse for other reasons gets no better with a setting, and takes longer.
     """
     if level.gyro == level.accel == 1:
         return ''
-    gyro, accel = (float(np.abs(x[places]).max()) for places in biases(x.size))
-    settings = [f'{name}={found:.2g}' for name, found, std in (
-        ('gyro_bias_std', math.degrees(gyro), math.degrees(noise.gyro_bias_std)),
-        ('accel_bias_std', accel, noise.accel_bias_std)) if found > LARGE_BIAS * std]
+    settings = []
+    for name, places, configured, unit in zip(
+            ('gyro_bias_std', 'accel_bias_std'), biases(x.size),
+            (noise.gyro_bias_std, noise.accel_bias_std), (math.degrees(1.0), 1.0)):
+        found = np.abs(x[places])
+        if np.any(found - SURELY * std[places] > LARGE_BIAS * configured):
+            settings.append(f'{name}={unit * found.max():.2g}')
     if settings:
         return ('; the biases of the IMU are larger than configured, which sigmas allow for: set '
                 + ' and '.join(settings))
