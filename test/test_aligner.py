@@ -1154,6 +1154,29 @@ def test_sharp_positions_of_a_car_that_pulls_away_at_once(seed, delay):
         assert np.all(np.abs(error_of(attitude, s)) <= 4 * np.sqrt(np.diag(attitude.covariance)))
 
 
+@pytest.mark.parametrize('bad', (0, 2))
+@pytest.mark.parametrize('positions', (False, True))
+def test_an_outlier_among_the_first_epochs_is_left_out_of_the_start(flight, positions, bad):
+    """Believed, it would start all headings wrongly, and cost twenty seconds."""
+    def run(spoilt):
+        def change(k, kind, message):
+            if not spoilt or k != bad or kind != ('fix' if positions else 'velocity'):
+                return message
+            if positions:
+                return message._replace(latitude_deg=message.latitude_deg + 1e-3)
+            return message._replace(velocity=message.velocity + 30.0)
+
+        aligner = Aligner(config_for(flight, use_velocity=False if positions else 'auto'))
+        return aligner, give_all(aligner, flight, change=change)
+
+    (_, plain), (aligner, epochs) = run(False), run(True)
+    sigmas = epochs[-1].current.sigma_deg / plain[-1].current.sigma_deg
+    assert np.all(sigmas < 1.2)
+    name = f'epochs_rejected_{"position" if positions else "velocity"}'
+    assert aligner.counts[name] == 1
+    assert normalised_error(epochs[-1].current, flight) < chi2.ppf(0.9999, 3)
+
+
 @pytest.mark.parametrize('seed', (1, pytest.param(0, marks=pytest.mark.campaign)))
 @pytest.mark.parametrize('scenario', ('hover', 'static'))
 def test_wild_gnss_from_the_start_is_found_out(scenario, seed):

@@ -38,8 +38,8 @@ FIRST_EPOCHS, MAX_WAITING = 4, 64
 START_RATIO = 20.0
 # Epochs whose sigma is so many times that of the best say nothing to a start.
 UNCERTAIN = 10.0
-# One epoch is an outlier if the residuals of the others are so many times smaller without it.
-OUTLYING = 10.0
+# One epoch is an outlier if it is so unlike the others: F statistic of its residuals over theirs.
+OUTLYING = 20.0
 # Headings, every five degrees, and their sigma (rad): wide enough for the sum of their densities
 # to be flat to a tenth, and narrow, for errors of a heading are linearised.
 HEADINGS = 72
@@ -115,11 +115,13 @@ class Start:
             noise = max(noise, 1.0 if stated else LEAST_NOISE)
             if values[-1] < START_RATIO ** 2 * usual * noise:
                 return None
+            if len(places) <= FIRST_EPOCHS + kind and noise > OUTLYING:
+                return None                         # they do not tell which of them is an outlier
             if noise < LOUD or len(places) <= FIRST_EPOCHS + kind:
                 break
             left = [_solved(s, a, time, np.delete(places, i), kind)[1]
                     for i in range(len(places))]
-            if min(left) > residual / OUTLYING:
+            if (residual - min(left)) * (rows - 3) <= 3 * OUTLYING * min(left):
                 break
             places = np.delete(places, int(np.argmin(left)))
         for k in np.setdiff1d(np.flatnonzero(use), places).tolist():
