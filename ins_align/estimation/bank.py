@@ -340,7 +340,7 @@ class Bank:
         x, P = self._body()
         best = filters.best
         remarks = receiver.in_words() + self._not_used + level_in_words(
-            self._rivals.table[filters.ids[best]], self._config.imu_noise, x, np.sqrt(np.diag(P)))
+            self._rivals.table[filters.ids[best]], self._config.imu_noise, x, P)
         if self._vehicle is not None:
             remarks += self._vehicle.in_words(filters)
         return Fit(self._offered, 3 * (self._offered - either), receiver.misfit, self._nis,

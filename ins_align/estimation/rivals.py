@@ -267,15 +267,16 @@ def in_words(rival: Rival, x: Array, gnss_delay: float) -> str:
     return f'the data fit better with {better}: {rival.advice}'
 
 
-def level_in_words(level: Rival, noise: ImuNoise, x: Array, std: Array) -> str:
+def level_in_words(level: Rival, noise: ImuNoise, x: Array, P: Array) -> str:
     """
-    Return how a level with parameters x is worse than the configured noise, or ''.
+    Return how a level with parameters x and their covariance is worse than configured, or ''.
 
     It is the end of a sentence. A setting is named where a bias is surely far larger than
     configured: what looks worse for other reasons gets no better with a setting, and takes longer.
     """
     if level.gyro == level.accel == 1:
         return ''
+    std = np.sqrt(np.diag(P))
     settings = []
     for name, places, configured, unit in zip(
             ('gyro_bias_std', 'accel_bias_std'), biases(x.size),

@@ -115,9 +115,11 @@ class Start:
             noise = max(noise, 1.0 if stated else LEAST_NOISE)
             if values[-1] < START_RATIO ** 2 * usual * noise:
                 return None
-            if len(places) <= FIRST_EPOCHS + kind and noise > OUTLYING:
-                return None                         # they do not tell which of them is an outlier
-            if noise < LOUD or len(places) <= FIRST_EPOCHS + kind:
+            if noise < LOUD:
+                break
+            if len(places) <= FIRST_EPOCHS + kind:
+                if noise > OUTLYING:                # and they do not tell which is the outlier
+                    return None
                 break
             left = [_solved(s, a, time, np.delete(places, i), kind)[1]
                     for i in range(len(places))]

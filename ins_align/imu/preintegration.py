@@ -104,8 +104,9 @@ class Intervals:
         """
         gyro, accel = signs[:, :3], signs[:, 3:]
         wider = {name: array[:, None] for name, array in vars(self).items()}
+        wider['duration'] = self.duration
         if (signs == 1).all():
-            return Intervals(**wider | {'duration': self.duration})
+            return Intervals(**wider)
         turn = log_so3(self.R)[:, None]
         # Forces act on average half and, for the way, a third of the rotation after the start.
         half, third = (exp_so3(part * gyro * turn) @ exp_so3(-part * turn) for part in (1/2, 1/3))
@@ -115,7 +116,7 @@ class Intervals:
         of_accel = np.hstack([ones, np.tile(accel, 9)])[:, None]
         force = accel[:, None]
         return Intervals(**wider | {
-            'duration': self.duration, 'R': exp_so3(gyro * turn),
+            'R': exp_so3(gyro * turn),
             'v': accel * apply(half, wider['v']), 'p': accel * apply(third, wider['p']),
             'J_Rg': of_gyro * (half @ wider['J_Rg']),
             'J_vg': force * of_gyro * (half @ wider['J_vg']),
