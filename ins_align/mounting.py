@@ -75,7 +75,8 @@ class Mounting(NamedTuple):
     config: Config  # with the lever arm to align with
     base: Transform | None  # from the configured base to the IMU
     words: Sequence[Event] = ()  # what was taken from TF, what contradicts it
-    missing: Sequence[str] = ()  # transforms that are wanted and not there, in words
+    missing: Sequence[str] = ()  # transforms that parameters insist on and TF lacks, in words
+    complete: bool = True  # whether all is there that would be used
 
 
 def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Config) -> Mounting:
@@ -87,19 +88,20 @@ def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Co
     """
     words: list[Event] = []
     missing: list[str] = []
-    base = None
+    base, complete = None, True
     if config.lever_arm_from_tf is not False:
         to_antenna = lookup(imu_frame, antenna_frame) if imu_frame and antenna_frame else None
-        if to_antenna is None:
-            missing.append(f'from {antenna_frame!r} (antenna) to {imu_frame!r} (IMU)')
-        else:
+        complete = to_antenna is not None
+        if to_antenna is not None:
             config = _with_lever_arm(config, to_antenna.translation, (imu_frame, antenna_frame),
                                      words)
+        elif config.lever_arm_from_tf is True:
+            missing.append(f'from {antenna_frame!r} (antenna) to {imu_frame!r} (IMU)')
     if config.base_frame:
         base = lookup(imu_frame, config.base_frame) if imu_frame else None
         if base is None:
             missing.append(f'from {config.base_frame!r} (base) to {imu_frame!r} (IMU)')
-    return Mounting(config, base, words, missing)
+    return Mounting(config, base, words, missing, complete)
 
 
 def _with_lever_arm(config: Config, found: Array, frames: tuple[str, str],
@@ -185,8 +187,8 @@ class MountingSearch:
             return None
         self._since = now if self._since is None else self._since
         found = find_mounting(self._lookup, self._imu_frame, self.antenna_frame, self._config)
-        if found.missing and (self._required or now - self._since < WAIT):
-            if self._required:
-                self.waits_for = f'the transform {" and that ".join(found.missing)}'
-            return None
-        return found
+        if found.missing:
+            self.waits_for = f'the transform {" and that ".join(found.missing)}'
+        elif found.complete or now - self._since >= WAIT:
+            return found
+        return None

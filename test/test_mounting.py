@@ -84,10 +84,14 @@ def test_which_lever_arm_is_used(frames, parameters, lever_arm, notes, warnings)
 
 
 def test_what_tf_has_may_be_missing_or_senseless(frames):
-    found = find_mounting(frames.lookup, 'imu_link', 'map', Config(base_frame='base'))
+    found = find_mounting(frames.lookup, 'imu_link', 'map',
+                          Config(lever_arm_from_tf=True, base_frame='base'))
     assert found.missing == ["from 'map' (antenna) to 'imu_link' (IMU)",
                              "from 'base' (base) to 'imu_link' (IMU)"]
     assert found.config.lever_arm == (0.0, 0.0, 0.0) and found.base is None
+    without_antenna = find_mounting(frames.lookup, 'imu_link', 'map',
+                                    Config(base_frame='base_link'))
+    assert without_antenna.base is not None and without_antenna.missing == []
     frames.add(transform('base_link', 'far', (5000.0, 0.0, 0.0)))
     frames.add(transform('base_link', 'bad', (np.nan, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
     for frame in ('far', 'bad'):

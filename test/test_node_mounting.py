@@ -104,6 +104,18 @@ def test_what_is_wanted_is_waited_for_and_named():
     assert np.array_equal(mounting.base.rotation, np.eye(3))
 
 
+@pytest.mark.parametrize('lever_arm_from_tf', ['auto', False])
+def test_a_base_alone_does_not_wait_for_the_antenna(lever_arm_from_tf):
+    found = search({'base_link': np.zeros(3)}, base_frame='base_link', lever_arm=(1.0, 2.0, 3.0),
+                   lever_arm_from_tf=lever_arm_from_tf)
+    items, mounting = found.take([SAMPLE, FIX], 0.0)
+    if lever_arm_from_tf == 'auto':
+        assert (items, mounting) == ([], None)  # its transform may still come
+        items, mounting = found.take([], 3.0)
+    assert items == [SAMPLE, FIX] and mounting.base is not None
+    assert mounting.config.lever_arm == (1.0, 2.0, 3.0)
+
+
 @pytest.mark.parametrize('base_frame, vehicle', [
     ('', 'none'), *(pytest.param('base_link', vehicle, marks=pytest.mark.campaign)
                     for vehicle in ('none', 'car'))])

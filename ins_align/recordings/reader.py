@@ -119,7 +119,7 @@ def _mounting(bag: Bag, topics: Topics, config: Config) -> Mounting:
                         frames.add(transform)
     found = find_mounting(frames.lookup, _frame_id(bag, topics.imu), _frame_id(bag, topics.fix),
                           config)
-    if found.missing and (config.lever_arm_from_tf is True or config.base_frame):
+    if found.missing:
         raise BagError(f'{bag.path} has no transform {" and none ".join(found.missing)}: '
                        'lever_arm_from_tf and base_frame need /tf_static with them')
     for severity, text in found.words:
