@@ -27,7 +27,7 @@ import numpy as np
 
 ROUNDING = 1e-6  # m: numbers of a robot's model that differ less are the same
 # A robot's model is published once, to all who join: it is there as soon as the sensors are.
-WAIT = 2.0  # s, for what may not be there, from when both frame_ids are known
+WAIT = 2.0  # s, for what may not be there, from when both sensors have sent
 MAX_HELD = 4000
 
 # Target and source frame to the transform between them, None where there is none.
@@ -131,7 +131,7 @@ class MountingSearch:
     """
     Looks for the transforms that the parameters want while messages arrive.
 
-    It begins once messages have told their frames. Without a `lookup` there is no TF: a
+    It begins once both sensors have sent messages. Without a `lookup` there is no TF: a
     ConfigError if the parameters cannot do without.
     """
 
@@ -141,7 +141,8 @@ class MountingSearch:
         if self._required and lookup is None:
             raise ConfigError('lever_arm_from_tf is true or base_frame is set, but tf2_ros is not '
                               'installed: sudo apt install ros-$ROS_DISTRO-tf2-ros-py')
-        self.antenna_frame = self._imu_frame = ''
+        self.antenna_frame: str | None = None  # until a position has come
+        self._imu_frame: str | None = None
         self._lever_arm = config.lever_arm  # that is in use
         self._held: deque[tuple[int, Any]] = deque(maxlen=MAX_HELD)
         self.restart()
@@ -183,7 +184,7 @@ class MountingSearch:
         """Return what TF says, or that it says nothing; None while that is not known."""
         if self._lookup is None:
             return Mounting(self._config, None)
-        if not (self._imu_frame and self.antenna_frame):
+        if self._imu_frame is None or self.antenna_frame is None:
             return None
         self._since = now if self._since is None else self._since
         found = find_mounting(self._lookup, self._imu_frame, self.antenna_frame, self._config)

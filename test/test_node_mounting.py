@@ -104,10 +104,12 @@ def test_what_is_wanted_is_waited_for_and_named():
     assert np.array_equal(mounting.base.rotation, np.eye(3))
 
 
-@pytest.mark.parametrize('lever_arm_from_tf', ['auto', False])
-def test_a_base_alone_does_not_wait_for_the_antenna(lever_arm_from_tf):
+@pytest.mark.parametrize('lever_arm_from_tf, antenna_frame', [
+    ('auto', 'gnss'), ('auto', ''), (False, '')])  # NavPVT has no frame
+def test_a_base_alone_does_not_wait_for_the_antenna(lever_arm_from_tf, antenna_frame):
     found = search({'base_link': np.zeros(3)}, base_frame='base_link', lever_arm=(1.0, 2.0, 3.0),
                    lever_arm_from_tf=lever_arm_from_tf)
+    found.antenna_frame = antenna_frame
     items, mounting = found.take([SAMPLE, FIX], 0.0)
     if lever_arm_from_tf == 'auto':
         assert (items, mounting) == ([], None)  # its transform may still come

@@ -199,8 +199,9 @@ class AlignmentNode(Node):
 
     def _on_gnss(self, topic: str, msg: Any, info: dict[str, int]) -> None:
         self._take_imu(queued(self._imu_subscription))  # what came before it is not to be behind
-        if topic == FIX_TOPIC and hasattr(msg, 'header'):
-            self._search.antenna_frame = msg.header.frame_id
+        if topic == FIX_TOPIC:
+            header = getattr(msg, 'header', None)  # NavPVT has none
+            self._search.antenna_frame = header.frame_id if header else ''
         items: Iterable[Any]
         try:
             items = gnss_from_msg(topic, msg, self._config)
