@@ -13,7 +13,11 @@
 # limitations under the License.
 """What the node reads of a serialised IMU message and what it changes in it."""
 
-from ins_align.ros.inputs import read_imu, with_orientation
+import sys
+from types import SimpleNamespace
+
+from ins_align.config import Config
+from ins_align.ros.inputs import open_static_tf, read_imu, with_orientation
 import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
@@ -63,3 +67,13 @@ def test_nothing_but_the_orientation_changes(frame_id, way):
     changed = deserialize_message(with_orientation(data, quaternion, covariance), Imu)
     assert changed == expected
     assert deserialize_message(data, Imu) == message(frame_id)
+
+
+def test_tf_is_asked_for_frames_without_a_slash(monkeypatch):
+    asked = []
+    buffer = SimpleNamespace(can_transform=lambda *frames_and_time: asked.append(frames_and_time))
+    monkeypatch.setitem(sys.modules, 'tf2_ros', SimpleNamespace(
+        Buffer=lambda: buffer, TransformListener=lambda *_: SimpleNamespace(tf_sub=None)))
+    lookup = open_static_tf(SimpleNamespace(destroy_subscription=print), Config())
+    assert lookup('/imu', '/gnss') is None
+    assert asked[0][:2] == ('imu', 'gnss')

@@ -210,6 +210,7 @@ def open_static_tf(node: Node, config: Config) -> Lookup | None:
     node.destroy_subscription(buffer.listener.tf_sub)
 
     def lookup(target: str, source: str) -> Transform | None:
+        target, source = target.strip('/'), source.strip('/')  # tf2 knows no frame with a slash
         if not buffer.can_transform(target, source, Time()):
             return None
         return transform_from_msg(buffer.lookup_transform(target, source, Time()).transform)
