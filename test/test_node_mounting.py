@@ -21,9 +21,10 @@ from ins_align.gnss.messages import Fix
 from ins_align.mounting import MountingSearch
 from ins_align.ros.inputs import ImuSample
 from ins_align.simulation.simulate import simulate, write_bag
-from node_harness import bag_script, Listener, play, RELIABLE, replayed, running_node
+from node_harness import bag_script, Listener, playing, RELIABLE, replayed, running_node
 import numpy as np
 import pytest
+from test_node import double, set_parameter
 
 SAMPLE = (1, ImuSample(10, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), 'imu'))
 FIX = (2, Fix(10, 48.0, 11.0, 300.0, None, 0))
@@ -143,7 +144,10 @@ def test_node_with_tf_gives_the_numbers_of_the_parameter(tmp_path, monkeypatch, 
         given.append(f'base_frame:={base_frame}')
     with Listener() as listener, running_node([*given, *RELIABLE]) as node:
         listener.wait_for(lambda: listener.statuses)
-        play(bag_script(tmp_path / 'drive'), tmp_path, 4.0)
+        with playing(bag_script(tmp_path / 'drive'), tmp_path, 4.0):
+            # Whenever it comes, a change of a threshold keeps the lever arm of TF.
+            while listener.status['lever_arm_m'] == '0 0 0':
+                assert set_parameter(listener, 'hold_time', double(1.0)).successful
         listener.wait_for(lambda: listener.count('imu') == len(drive.imu_stamps_ns))
         listener.wait_for(lambda: listener.attitudes)
         listener.wait_for_next_status()

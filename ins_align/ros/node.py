@@ -479,5 +479,9 @@ class AlignmentNode(Node):
         return SetParametersResult(successful=True)
 
     def _change_parameters(self, changes: list[Parameter]) -> None:
-        config = self._config = self._changed_config(changes)
-        self._inbox.append((time.time_ns(), lambda: self._aligner.reconfigure(config)))
+        self._inbox.append((time.time_ns(), lambda: self._reconfigure(changes)))
+
+    def _reconfigure(self, changes: list[Parameter]) -> None:
+        # In the worker's thread, which may have put the lever arm of TF into the configuration.
+        self._config = self._changed_config(changes)
+        self._aligner.reconfigure(self._config)
