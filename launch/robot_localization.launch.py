@@ -101,6 +101,7 @@ def generate_launch_description() -> LaunchDescription:
     ekf = Node(
         package='robot_localization', executable='ekf_node', name='ekf_filter_node',
         namespace=given['namespace'], output='screen', parameters=[EKF, sim_time])
+    # Where robot_localization is not installed, launch ends here and would leave others running.
     return LaunchDescription([
         *(DeclareLaunchArgument(name, default_value=value) for name, value in arguments.items()),
-        alignment, navsat_transform, ekf])
+        navsat_transform, ekf, alignment])
