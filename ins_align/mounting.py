@@ -150,7 +150,7 @@ class MountingSearch:
     def restart(self) -> None:
         """Look again: the IMU is another one."""
         self.mounting: Mounting | None = None
-        self.waits_for = 'the transforms of IMU and antenna' if self._required else ''
+        self.waits_for = 'a message of the IMU and a position' if self._required else ''
         self._since: float | None = None
         self._held.clear()
 

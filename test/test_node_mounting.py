@@ -96,6 +96,7 @@ def test_what_is_wanted_is_waited_for_and_named():
     translations = {'gnss': LEVER_ARM}
     wanted = search(translations, lever_arm_from_tf=True, base_frame='base_link')
     request = (3, print)
+    assert wanted.waits_for == 'a message of the IMU and a position'
     assert wanted.take([SAMPLE, request, FIX], 0.0) == ([request], None)
     assert wanted.waits_for == "the transform from 'base_link' (base) to 'imu' (IMU)"
     assert wanted.take([], 100.0) == ([], None)
