@@ -423,7 +423,8 @@ class Aligner:
         prediction = Prediction(
             current, sensors.gyro_bias, sensors.gyro_matrix,
             float(np.max(method.nuisance().gyro_bias_std)),
-            self.config.imu_noise.angle_random_walk, rate)
+            self.config.imu_noise.angle_random_walk, rate,
+            1e-9 * float(np.median(np.diff(self._imu.stamps))))
         carried = all(prediction.carry(*sample)
                       for sample in zip(stamps.tolist(), rates.tolist()))
         return prediction if carried else None

@@ -16,6 +16,7 @@
 from copy import copy
 
 from ins_align.geometry.earth import EARTH_RATE
+from ins_align.imu.noise import GAP_ANGULAR_ACCELERATION
 from ins_align.imu.prediction import Follower, MAX_GAP_NS, Prediction
 from ins_align.results import Attitude
 import numpy as np
@@ -35,13 +36,13 @@ COVARIANCE = np.array([[4.0, 0.5, 0.2], [0.5, 3.0, -0.1], [0.2, -0.1, 9.0]]) * 1
 
 def prediction():
     return Prediction(Attitude(0, START.as_matrix(), COVARIANCE), BIAS, MATRIX, 1e-3, 2e-3,
-                      np.array(RATE))
+                      np.array(RATE), 1e-9 * STEP_NS)
 
 
 def still(stamp_ns, rate):
     """Return the attitude with its axes in ENU, for gyros without errors."""
     return Prediction(Attitude(stamp_ns, np.eye(3), COVARIANCE), np.zeros(3), np.zeros((3, 3)),
-                      0.0, 0.0, rate)
+                      0.0, 0.0, rate, 1e-9 * STEP_NS)
 
 
 def truth(count):
@@ -89,6 +90,18 @@ def test_covariance_grows_with_the_noise_of_the_gyros():
     seconds = STAMPS[-1] * 1e-9
     drift = 4e-6 * seconds + (1e-6 + EARTH_RATE ** 2) * seconds ** 2
     assert carried.attitude().covariance == pytest.approx(COVARIANCE + drift * np.eye(3))
+
+
+def test_what_it_may_have_turned_in_a_gap_is_not_known():
+    carried = prediction()
+    stamps = STEP_NS * np.array([1, 2, 3, 63, 64])
+    sigmas = []
+    for stamp_ns in stamps.tolist():
+        assert carried.carry(stamp_ns, (0.0, 0.0, 0.5))
+        sigmas.append(np.sqrt(np.diag(carried.attitude().covariance)))
+    may_have_turned = GAP_ANGULAR_ACCELERATION * 0.3 ** 2       # rad, 10 deg
+    assert np.max(sigmas[2]) < 0.02 * may_have_turned
+    assert np.array(sigmas[3:]) == pytest.approx(may_have_turned, rel=0.01)
 
 
 def test_what_is_old_or_broken_changes_nothing():

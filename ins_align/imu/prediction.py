@@ -25,6 +25,7 @@ import math
 from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import Array, matrix_from_quaternion
 from ins_align.imu.buffer import MAX_GAP_NS, MAX_RATE
+from ins_align.imu.noise import GAP_ANGULAR_ACCELERATION, GAP_STEPS
 from ins_align.results import Attitude
 import numpy as np
 
@@ -39,11 +40,13 @@ class Prediction:
 
     The rate is ``measured - gyro_matrix @ measured - gyro_bias``, rad/s, and may be off steadily
     by `gyro_bias_std`; that the Earth turns, too, is left out of it and counts as an error.
-    `angle_random_walk` is in rad/sqrt(s), `rate` is what was measured at the epoch, shape (3,).
+    `angle_random_walk` is in rad/sqrt(s), `rate` is what was measured at the epoch, shape (3,),
+    `interval` the usual one between samples, s.
     """
 
     def __init__(self, attitude: Attitude, gyro_bias: Array, gyro_matrix: Array,
-                 gyro_bias_std: float, angle_random_walk: float, rate: Array) -> None:
+                 gyro_bias_std: float, angle_random_walk: float, rate: Array,
+                 interval: float) -> None:
         """Stand at the epoch."""
         self.stamp_ns = self._epoch_ns = attitude.stamp_ns
         x, y, z, w = attitude.quaternion_xyzw.tolist()
@@ -54,19 +57,23 @@ class Prediction:
         self._rate = tuple(rate.tolist())   # as measured last
         self._white_variance = angle_random_walk ** 2
         self._rate_variance = gyro_bias_std ** 2 + EARTH_RATE ** 2
+        self._longest, self._gaps_variance = GAP_STEPS * interval, 0.0
 
     def carry(self, stamp_ns: int, gyro: Sequence[float]) -> bool:
         """
         Carry on to one sample (rad/s), with the mean of its rate and that of the last one.
 
         Return whether the attitude is now that at the sample: not when it is old or broken, and
-        never again after a gap, in which nobody knows how it has turned.
+        never again after a long gap, in which nobody knows how it has turned. What it may have
+        turned in a short one is added to its covariance, as in the filters.
         """
         x, y, z = gyro
         if not (0 < stamp_ns - self.stamp_ns <= MAX_GAP_NS
                 and abs(x) < MAX_RATE and abs(y) < MAX_RATE and abs(z) < MAX_RATE):
             return False
         dt = (stamp_ns - self.stamp_ns) * 1e-9
+        if dt > self._longest:
+            self._gaps_variance += (GAP_ANGULAR_ACCELERATION * dt * dt) ** 2
         last_x, last_y, last_z = self._rate
         self._rate = x, y, z
         x, y, z = 0.5 * (last_x + x), 0.5 * (last_y + y), 0.5 * (last_z + z)
@@ -96,7 +103,7 @@ class Prediction:
     def covariance(self) -> tuple[float, ...]:
         """Of the small rotation about the axes of ENU, rad^2, nine numbers."""
         age = (self.stamp_ns - self._epoch_ns) * 1e-9
-        drift = (self._white_variance + self._rate_variance * age) * age
+        drift = (self._white_variance + self._rate_variance * age) * age + self._gaps_variance
         ee, en, eu, ne, nn, nu, ue, un, uu = self._covariance
         return ee + drift, en, eu, ne, nn + drift, nu, ue, un, uu + drift
 

@@ -102,7 +102,8 @@ class _Results:
                 yield from self._of_epoch(epoch, time_ns)
                 part = ((epoch.stamp_ns - before_ns) / (stamp_ns - before_ns)
                         if before_ns < stamp_ns else 1.0)
-                prediction = self._prediction(epoch, before + max(part, 0.0) * (gyro - before))
+                prediction = self._prediction(epoch, before + max(part, 0.0) * (gyro - before),
+                                              1e-9 * (stamp_ns - before_ns))
                 epoch_ns = epoch.stamp_ns
             before_ns, before = stamp_ns, gyro
             if prediction is None:
@@ -126,13 +127,13 @@ class _Results:
                         samples.gyro, samples.accel):
                     yield int(block.times_ns[place]), block.messages[0][place], *numbers
 
-    def _prediction(self, epoch: Epoch, rate: Any) -> Prediction | None:
+    def _prediction(self, epoch: Epoch, rate: Any, interval: float) -> Prediction | None:
         """Return the attitude to be carried on from an epoch while it is declared."""
         if epoch.state is not State.ALIGNED or epoch.current is None:
             return None
         noise = self._result.config.imu_noise
         return Prediction(epoch.current, epoch.gyro_bias, np.zeros((3, 3)),
-                          noise.gyro_bias_std, noise.angle_random_walk, rate)
+                          noise.gyro_bias_std, noise.angle_random_walk, rate, interval)
 
     def _of_epoch(self, epoch: Epoch, time_ns: int) -> Iterator[Record]:
         first, now = epoch.initial, epoch.current
