@@ -88,7 +88,7 @@ def summary(result: Result) -> str:
             ('declared', declared), ('initial', status.initial), ('final', status.current)):
         if attitude is None:
             continue
-        row = [name, f'{result.t_s(attitude.stamp_ns):.1f}']
+        row = [name, f'{result.t_s(attitude):.1f}']
         row += [f'{angle:.3f}' for angle in (
             *attitude.roll_pitch_yaw_deg, attitude.heading_deg)]
         row += [f'{sigma:.3f}' for sigma in attitude.sigma_deg]
@@ -260,7 +260,7 @@ def _angles(axes: Axes, label: str, series: _Series, result: Result,
                       label='reference')
     if (declared := result.declared) is not None:
         for column in columns.values():
-            axes.errorbar(result.t_s(declared.stamp_ns), declared.roll_pitch_yaw_deg[column],
+            axes.errorbar(result.t_s(declared), declared.roll_pitch_yaw_deg[column],
                           _sigma(declared)[column], fmt='kD', markersize=4.0, capsize=3.0,
                           label='declared, at its t0')
     limits = axes.get_ylim()  # the first sigmas would make flat lines of the angles

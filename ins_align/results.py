@@ -294,9 +294,11 @@ class Result:
             f'(tilt +- {now.sigma_deg[:2].max():.2f} deg) at stamp {now.stamp_ns}')
         return f'Result({self.state_in_words}, {attitude}, {len(self.epochs)} epochs)'
 
-    def t_s(self, stamp_ns: int) -> float:
-        """Return the time of a stamp, s since the first t0, on the clock of the last epoch."""
-        return self.epochs[-1].t_s - (self.epochs[-1].stamp_ns - stamp_ns) * 1e-9
+    def t_s(self, attitude: Attitude) -> float:
+        """Return the time of an attitude, s since the first t0, on the clock of its stamp."""
+        epoch = (self.spans_of(State.ALIGNED)[-1].first if attitude is self.declared
+                 else self.epochs[-1])
+        return epoch.t_s - (epoch.stamp_ns - attitude.stamp_ns) * 1e-9
 
     def to_json(self) -> dict[str, Any]:
         """Return the object that ``--json`` writes; numbers that are not finite are None."""

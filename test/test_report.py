@@ -183,6 +183,14 @@ def test_times_go_on_where_the_clock_is_set_back(tmp_path):
     row = next(line.split() for line in summary(result).splitlines()
                if line.split()[:1] == ['final'])
     assert float(row[1]) == pytest.approx(times[-1], abs=0.1)
+    # Declared before the clock was set back, and not again: at t0 on that clock.
+    once = dataclasses.replace(result, epochs=tuple(
+        epoch if epoch.t_s < again.first.t_s else dataclasses.replace(epoch, state=State.ALIGNING)
+        for epoch in result.epochs))
+    row = next(line.split() for line in summary(once).splitlines()
+               if line.split()[:1] == ['declared'])
+    seconds = (once.declared.stamp_ns - result.epochs[0].stamp_ns) * 1e-9
+    assert float(row[1]) == pytest.approx(seconds, abs=0.1)
 
 
 def test_summary_says_what_matters(result):
