@@ -346,9 +346,10 @@ def _track(axes: Axes, result: Result) -> None:
     if not len(fixes):
         return
     east, north = track(Series(fixes[:, 0], fixes[:, 1:])).vectors.T
-    stamps = np.array([epoch.stamp_ns for epoch in result.epochs], float)
+    epochs = sorted(result.epochs, key=attrgetter('stamp_ns'))  # a clock may have been set back
+    stamps = np.array([epoch.stamp_ns for epoch in epochs], float)
     index = np.searchsorted(stamps, fixes[:, 0], side='right') - 1
-    states = [result.epochs[i].state if i >= 0 else State.WAITING_FOR_GNSS for i in index]
+    states = [epochs[i].state if i >= 0 else State.WAITING_FOR_GNSS for i in index]
     axes.plot(east, north, color='#cccccc', linewidth=0.8)
     for state, colour in STATE_COLOURS.items():
         if state in states:

@@ -426,6 +426,21 @@ def test_figure_shows_innovations_and_biases(result):
     assert x[np.isfinite(x)] == pytest.approx([epoch.accel_bias[0] for epoch in shown])
 
 
+def test_the_track_has_its_states_where_the_clock_was_set_back_too(result):
+    """The second half of the recording with stamps before those of the first."""
+    def points(of):
+        lines = plot(of).subfigs[1].axes[-1].get_lines()
+        return {line.get_label(): len(line.get_xdata()) for line in lines}
+
+    middle, back = result.epochs[len(result.epochs) // 2].stamp_ns, 100 * 10 ** 9
+    track = result.track.copy()
+    track[track[:, 0] >= middle, 0] -= back
+    assert len(points(result)) > 3 and points(result) == points(dataclasses.replace(
+        result, track=track, epochs=tuple(
+            dataclasses.replace(epoch, stamp_ns=epoch.stamp_ns - back * (epoch.stamp_ns >= middle))
+            for epoch in result.epochs)))
+
+
 def test_outliers_are_drawn_at_the_edge(result):
     epochs = list(result.epochs)
     index = len(epochs) // 2
