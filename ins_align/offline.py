@@ -169,8 +169,8 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     -------
     Result
         ``initial`` and ``current``, the attitudes at t0 and at the last epoch, with covariances;
-        ``aligned``, ``status`` with the reason in words, ``epochs``. Rows with nan are left out
-        and counted in ``status.counts``.
+        ``aligned``, ``status`` with the reason in words, ``epochs``. Rows with nan, or with what
+        is masked, are left out and counted in ``status.counts``.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     settings = config_from_mapping(config)
     unit_ns = 1.0 if np.asarray(stamps).dtype.kind in 'iu' else 1e9
     stamps_ns = _nanoseconds('the IMU', np.asarray(stamps), unit_ns)
-    rates, forces = np.asarray(gyro, float), np.asarray(accel, float)
+    rates, forces = _numbers(gyro), _numbers(accel)
     for name, array in (('gyro', rates), ('accel', forces)):
         if stamps_ns.ndim != 1 or array.shape != (stamps_ns.size, 3):
             raise ValueError(f'{name} has the shape {array.shape} and stamps {stamps_ns.shape}: '
@@ -203,6 +203,11 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     run = _Run(settings)
     run.add(stamps_ns, rates, forces, list(zip(before.tolist(), gnss)))
     return run.result()
+
+
+def _numbers(given: Any) -> Array:
+    """Return an array of numbers, nan where one is masked."""
+    return np.asarray(np.ma.filled(np.ma.asarray(given, float), np.nan))
 
 
 def _nanoseconds(name: str, stamps: np.ndarray, unit_ns: float) -> Index:
@@ -240,7 +245,7 @@ def _messages(name: str, given: Any, kind: type, unit_ns: float, config: Config)
     """Return fixes or velocities, of a table if that is given."""
     if len(given) == 0 or all(isinstance(message, kind) for message in given):
         return list(given)
-    table = np.asarray(given, float)
+    table = _numbers(given)
     if table.ndim != 2 or table.shape[1] not in (4, 7, 13):
         columns = 'latitude, longitude, altitude' if kind is Fix else 'east, north, up'
         raise ValueError(f'{name} have the shape {table.shape}: it must be (K, 4), (K, 7) or '

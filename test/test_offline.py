@@ -141,6 +141,18 @@ def test_rows_with_nan_are_left_out_and_counted(flight):
     assert normalised_error(spoilt.current, flight) < chi2.ppf(0.9999, 3)
 
 
+def test_what_is_masked_is_left_out_as_nan_is(flight):
+    stamps, gyro, accel = imu(flight)
+    arrays = [gyro, accel, *tables(flight, 'std')]
+    with_nan, masked = ([array.copy() for array in arrays] for _ in range(2))
+    for k, (nan, mask) in enumerate(zip(with_nan, masked)):
+        nan[20 + k::50, 1], mask[20 + k::50, 1] = np.nan, 40.0
+        masked[k] = np.ma.masked_array(mask, mask == 40.0)
+    results = [ins_align.align(stamps, *each, **LEVER) for each in (with_nan, masked)]
+    assert results[0].to_json() == results[1].to_json()
+    assert results[1].status.counts['velocity_nan'] == 3
+
+
 def test_an_outage_is_in_the_epochs():
     s = simulated('car', duration=40.0, seed=2, outages=((20.0, 30.0),))
     epochs = ins_align.align(*imu(s), *tables(s, 'std'), **LEVER).epochs
