@@ -25,6 +25,7 @@ from ins_align.config import Config, config_from_mapping
 from ins_align.geometry.rotation import Array, Index, Transform
 from ins_align.gnss import messages
 from ins_align.gnss.messages import Fix, usable, Velocity
+from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.results import Epoch, in_order_of_time, Reference, Result
 import numpy as np
 
@@ -36,7 +37,7 @@ MESSAGES = 2500
 # Stamps that were seconds are below this (ns); those that were nanoseconds by mistake are not.
 MAX_STAMP_NS = 9e18
 # Stamps of a receiver that are closer were not nanoseconds.
-MIN_INTERVAL_NS = 1000
+MIN_INTERVAL_NS = 1_000_000
 
 
 class _Run:
@@ -220,7 +221,12 @@ def _nanoseconds(name: str, stamps: np.ndarray, unit_ns: float) -> Index:
 
 
 def _check_order(stamps_ns: Index, lateness: float) -> None:
-    """Raise ValueError where a stamp of the IMU is further behind an earlier one than allowed."""
+    """Raise ValueError where stamps of the IMU are too far apart, or further back than allowed."""
+    intervals_ns = np.diff(np.unique(stamps_ns))
+    if intervals_ns.size and np.median(intervals_ns) > MAX_GAP_NS:
+        raise ValueError(f'the samples of the IMU are {np.median(intervals_ns) * 1e-9:.6g} s '
+                         f'apart, where {MAX_GAP_NS * 1e-9:g} s are allowed: its stamps must be '
+                         'seconds, or nanoseconds if they are integers')
     behind = np.maximum.accumulate(stamps_ns) - stamps_ns
     if np.any(behind > lateness * 1e9):
         row = int(np.argmax(behind > lateness * 1e9))
@@ -254,7 +260,7 @@ def _messages(name: str, given: Any, kind: type, unit_ns: float, config: Config)
     stamps_ns = _nanoseconds(name, table[:, 0], unit_ns)
     if unit_ns == 1.0 and 0 < np.ptp(stamps_ns) < len(table) * MIN_INTERVAL_NS:
         raise ValueError(f'the stamps of {name} must be nanoseconds, as those of the IMU, which '
-                         'are integers: they look like seconds')
+                         'are integers: they look like another unit')
     known = table.shape[1] > 4
     covariances = np.zeros((len(table), 6, 6))
     if table.shape[1] == 7:
