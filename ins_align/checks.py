@@ -40,7 +40,7 @@ TOO_FAST_SHARE = 1e-3  # of the samples may be beyond that: spikes
 LENGTH_CELLS, MIN_LENGTHS = 20, 20  # of GRID s over which forces are summed up; sums to judge by
 SHORTER, AS_LONG = 0.85, 0.15  # a quarter of the sums is so short; within this they are right
 MIN_MISFIT = 0.1  # of the logarithm of a length: by so much exchanged positions fit better
-MAX_LATENESS = 60.0  # s, the limit of the parameter gnss_lateness
+MAX_LATENESS, MAX_DELAY = 60.0, 10.0  # s, the limits of the parameters gnss_lateness, gnss_delay
 LATE_SHARE, MIN_LATE = 0.1, 10  # of GNSS messages that are worth a word
 BEYOND_THE_POLES = 'latitudes are beyond the poles: they are exchanged with the longitudes'
 CELLS, GNSS_MESSAGES = 600, 3000  # kept of the latest data: 5 minutes, at up to 10 Hz
@@ -115,10 +115,12 @@ def beyond_the_poles(latitude_deg: float, longitude_deg: float) -> bool:
 
 def lateness_advice(lateness: float) -> tuple[str, str]:
     """Say that GNSS messages come so late, s, behind newer IMU samples; with the gnss_lateness."""
-    value = f'{math.ceil(2.0 * lateness) / 2.0 + 0.5:g}'
+    value = f'{min(math.ceil(2.0 * lateness) / 2.0 + 0.5, MAX_LATENESS):g}'
+    clock = (f'set gnss_delay={-lateness:.1f} instead' if lateness <= MAX_DELAY
+             else 'set that right')
     return (f'GNSS messages come up to {lateness:.1f} s later than newer IMU samples: set '
             f'gnss_lateness to {value}; if it is their clock that is behind, and not the '
-            f'messages, set gnss_delay={-lateness:.1f} instead'), value
+            f'messages, {clock}'), value
 
 
 class InputChecks:

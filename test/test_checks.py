@@ -14,9 +14,10 @@
 """Units, coordinates and clocks that are wrong: node, replay and info say the same."""
 
 import dataclasses
+import re
 
-from ins_align.checks import BEYOND_THE_POLES, exchange_fault, InputChecks
-from ins_align.config import Config
+from ins_align.checks import BEYOND_THE_POLES, exchange_fault, InputChecks, lateness_advice
+from ins_align.config import Config, config_from_mapping
 from ins_align.gnss.messages import Fix, Velocity
 from ins_align.gnss.motion import Series
 from ins_align.offline import replay
@@ -70,6 +71,14 @@ def test_info_and_replay_say_the_same(drive, tmp_path, change, sentence):
     for _, other in WRONG:
         assert (other in info) == (other in result.status.reason) == (other == sentence)
     assert 'too little motion' not in info or change is far_in_the_east
+
+
+@pytest.mark.parametrize('lateness', [1.7, 10.0, 10.1, 59.9])
+def test_what_late_messages_ask_for_can_be_set(lateness):
+    text, value = lateness_advice(lateness)
+    config_from_mapping({'gnss_lateness': float(value)})
+    for setting in re.findall(r'gnss_delay=(\S+)', text):
+        config_from_mapping({'gnss_delay': float(setting)})
 
 
 def test_nothing_is_said_of_what_is_right(drive):

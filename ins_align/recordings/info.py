@@ -24,7 +24,7 @@ import shlex
 from typing import Any
 
 from ins_align.checks import (
-    BEYOND_THE_POLES, beyond_the_poles, exchange_fault, lateness_advice, MAX_LATENESS)
+    BEYOND_THE_POLES, beyond_the_poles, exchange_fault, lateness_advice, MAX_DELAY, MAX_LATENESS)
 from ins_align.config import Config, config_from_mapping
 from ins_align.geometry.earth import normal_gravity
 from ins_align.gnss.buffer import MAX_AHEAD_NS
@@ -45,7 +45,7 @@ import numpy as np
 WEAK_CHANGE = 1.0  # m/s: a smaller change shows no heading with a usual receiver
 MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
 MIN_AHEAD = 0.3  # s: clocks that differ by less may be jitter
-MAX_AHEAD, MAX_BEHIND = MAX_AHEAD_NS * 1e-9, 10.0  # s: stamps further apart are of two clocks
+MAX_AHEAD = MAX_AHEAD_NS * 1e-9  # s: stamps further ahead are of another clock
 MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s and so many sigmas beyond it: a delay to be set
 FRAMES_THAT_FIT = ('enu', 'ned')
 FRAME_FAULTS = {
@@ -220,7 +220,7 @@ def _add_clocks(info: Info, imu: Recorded, gnss: list[Recorded]) -> None:
     """Say which stamps are of another clock than those of the IMU."""
     for data in gnss:
         age = data.age_s - imu.age_s
-        if data.stamps_ns.size and not -MAX_AHEAD < age < MAX_BEHIND:
+        if data.stamps_ns.size and not -MAX_AHEAD < age < MAX_DELAY:
             info.add(f'the stamps of {data.name} are {abs(age):.1f} s '
                      f'{"behind" if age > 0.0 else "ahead of"} those of {imu.name}: they are of '
                      'different clocks', fault=True)
