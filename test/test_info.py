@@ -412,6 +412,8 @@ def test_topics_that_are_missing(tmp_path, topics):
     assert 'has no ' in info.faults[-1]
     assert 'it cannot be aligned' in describe(info)
     assert ('positions alone' in describe(info)) == (topics == {'/fix': FIX})
+    nothing = write_messages(tmp_path / 'nothing', 'mcap', [], TOPICS)
+    assert 'positions alone' not in describe(inspect(nothing))
     json.dumps(info.to_json(), allow_nan=False)
 
 
@@ -439,6 +441,10 @@ def test_positions_without_an_altitude(changed):
     assert by_name(info, '/fix').figures['usable_share'] == 1.0
     assert info.command is not None and not info.faults
     assert by_name(info, '/fix_velocity').figures['frame'] == 'enu'
+    alone = changed(lambda name, time, message: (
+        [] if name == '/fix_velocity' else change(name, time, message)), name='alone')
+    fault, = inspect(alone).faults
+    assert fault == replay(alone).status.reason and inspect(alone).command is None
 
 
 def test_half_of_a_recording(tmp_path):

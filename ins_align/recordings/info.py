@@ -114,10 +114,12 @@ def inspect(path: str | os.PathLike[str]) -> Info:
         for data in filter(None, chosen.values()):
             if data.faults:
                 info.add(f'{data.name} cannot be used: {data.faults[0]}', fault=True)
-        if velocity is None:
+        if velocity is None and fix is not None and not fix.faults:
+            alone = fix.figures['vertical_share'] > 0.0
             info.add('there is no velocity that can be used: it is aligned from positions alone, '
-                     'which takes longer unless they are RTK' * (fix is not None),
-                     {'use_velocity': False} if velocities else {})
+                     'which takes longer unless they are RTK' if alone else
+                     'positions have no altitude, and there is no velocity: one of the two is '
+                     'needed', {'use_velocity': False} if velocities else {}, fault=not alone)
         gnss = [data for data in (fix, velocity) if data is not None]
         if imu is not None and gnss:
             _add_clocks(info, imu, gnss)
@@ -171,7 +173,8 @@ def _survey_velocity(data: Recorded, positions: Series) -> None:
         data.add('frame: not known, too little motion: it is taken as east-north-up')
     moved = (data.values[data.usable] != 0.0).any(axis=0)
     if moved[:2].any() and not moved[2]:
-        data.add('vertical velocity: always 0', {'velocity_vertical': 'absent'})
+        always = 'always 0' if data.figures['vertical_share'] else 'none'
+        data.add(f'vertical velocity: {always}', {'velocity_vertical': 'absent'})
 
 
 def _survey_imu(data: Recorded, motion: Series, gravity: float, alone: bool) -> None:

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 from ins_align.config import Config
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.drivers import type_in_words
-from ins_align.gnss.messages import numbers_of
+from ins_align.gnss.messages import numbers_of, usable
 from ins_align.gnss.motion import Series, series_of
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.recordings import Topic
@@ -80,19 +80,20 @@ class Columns(NamedTuple):
     usable: np.ndarray  # (N,) bool: finite, and with a fix
     no_fix: np.ndarray  # (N,) bool
     sigmas: Array  # (N, 2), horizontal and vertical; nan where no covariance is stated
+    vertical: np.ndarray  # (N,) bool: with an altitude or a vertical velocity that is not nan
 
 
 NOTHING = Columns(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)),
-                  np.zeros(0, bool), np.zeros(0, bool), np.zeros((0, 2)))
+                  np.zeros(0, bool), np.zeros(0, bool), np.zeros((0, 2)), np.zeros(0, bool))
 
 
 def columns_of(times_ns: np.ndarray, decoded: ImuSamples | Sequence[Gnss]) -> Columns:
     """Return what messages say, recorded at some times; what cannot be decoded is left out."""
     if isinstance(decoded, ImuSamples):
         values = np.hstack([decoded.gyro, decoded.accel])
-        usable = (np.abs(values) < np.repeat([MAX_RATE, MAX_ACCELERATION], 3)).all(axis=1)
-        return Columns(times_ns[decoded.decoded], decoded.stamps_ns, values, usable,
-                       np.zeros_like(usable), np.full((usable.size, 2), np.nan))
+        good = (np.abs(values) < np.repeat([MAX_RATE, MAX_ACCELERATION], 3)).all(axis=1)
+        return Columns(times_ns[decoded.decoded], decoded.stamps_ns, values, good,
+                       np.zeros_like(good), np.full((good.size, 2), np.nan), good)
     rows = []
     for time_ns, message in zip(times_ns.tolist(), decoded):
         if not isinstance(message, Refused):
@@ -100,7 +101,8 @@ def columns_of(times_ns: np.ndarray, decoded: ImuSamples | Sequence[Gnss]) -> Co
             known = message.covariance is not None
             east, north, up = message.covariance.diagonal() if known else (math.nan,) * 3
             rows.append((time_ns, message.stamp_ns, values, not fault, fault == 'no_fix',
-                         (math.sqrt((east + north) / 2.0), math.sqrt(up))))
+                         (math.sqrt((east + north) / 2.0), math.sqrt(up)),
+                         usable(message)[0].vertical))
     return Columns(*map(np.array, zip(*rows))) if rows else NOTHING
 
 
@@ -147,6 +149,7 @@ class Recorded(Surveyed):
             share = float(np.mean(data.no_fix))
             self.add(f'without a fix: {share:.1%}', no_fix_share=share)
         if kind != 'imu':
+            self.add('', vertical_share=float(np.mean(data.vertical)))
             self._add_sigmas(data.sigmas)
 
     def _add_sigmas(self, sigmas: Array) -> None:
