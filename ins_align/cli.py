@@ -329,9 +329,10 @@ def _check_outputs(arguments: argparse.Namespace, files: dict[str, list[str]]) -
     if arguments.json != STANDARD_OUTPUT:
         outputs += filter(None, [arguments.json])
     inputs = [*arguments.bags, *filter(None, [getattr(arguments, 'params', None)])]
-    for path in outputs:
+    targets = list(map(os.path.realpath, outputs))
+    for path, target in zip(outputs, targets):
         check_writable(path, inputs)
-        if outputs.count(path) > 1:
+        if targets.count(target) > 1:
             raise UsageError(f'{path} is given for two outputs')
 
 

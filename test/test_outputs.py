@@ -101,6 +101,7 @@ def test_killed_simulation_leaves_no_recording(tmp_path):
     (['replay', '--json', 'link', 'b.db3'], 'link: it is a recording and would be lost'),
     (['replay', '--csv', 'x.json', 'a.db3', 'b.db3', '--json', 'x_a.json'],
      'x_a.json is given for two outputs'),
+    (['replay', '--csv', 'y', 'a.db3', '--json', './y'], 'y is given for two outputs'),
     (['replay', '--csv', 'x.json', 'x/a.db3', 'b.db3'],
      'x_a.json: it is a recording and would be lost'),
     (['replay', '--json', 'empty', 'empty'], 'empty: it is to be read'),
