@@ -285,7 +285,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
     keep_to_one()
     gc.set_threshold(100_000)  # rows and results by the thousand, none of which is garbage
     files = {option: names_for(path, arguments.bags) for option in ('csv', 'plot', 'results')
-             if (path := getattr(arguments, option))}
+             if (path := getattr(arguments, option)) is not None}
     _check_outputs(arguments, files)
     settings = {'config': _config(arguments), **{
         name: getattr(arguments, name) for name in (
@@ -326,8 +326,8 @@ def _check_outputs(arguments: argparse.Namespace, files: dict[str, list[str]]) -
         if os.path.exists(path):
             raise UsageError(f'cannot write {path}: it exists already, choose another name')
     outputs = list(chain(*files.values()))
-    if arguments.json != STANDARD_OUTPUT:
-        outputs += filter(None, [arguments.json])
+    if arguments.json not in (None, STANDARD_OUTPUT):
+        outputs.append(arguments.json)
     inputs = [*arguments.bags, *filter(None, [getattr(arguments, 'params', None)])]
     targets = list(map(os.path.realpath, outputs))
     for path, target in zip(outputs, targets):
@@ -366,7 +366,7 @@ def _tell(arguments: argparse.Namespace, outcomes: Iterable[Outcome]) -> int:
 
 
 def _config(arguments: argparse.Namespace) -> Config:
-    given = load_params(arguments.params) if arguments.params else {}
+    given = {} if arguments.params is None else load_params(arguments.params)
     values, warnings = without_unknown(given)
     for warning in warnings:
         print(f'ins_align {arguments.command}: warning: {arguments.params}: {warning}',

@@ -226,6 +226,7 @@ def test_one_spelling_of_the_lever_arm(standing, capsys):
     (['--set', 'lever_am=[1,2,3]'], 'did you mean lever_arm'),
     (['--set', 'method'], 'NAME=VALUE'),
     (['--params', 'no/such/file.yaml'], 'No such file'),
+    *(([option, ''], 'cannot') for option in ('--params', '--json', '--csv', '--plot', '--bag')),
     (['--imu-topic', '/no/such'], 'has no topic /no/such; it has /fix'),
     (['--imu-topic', '/fix'], 'IMU needs sensor_msgs/Imu'),
     (['--velocity-topic', '/fix'], 'velocity needs'),
