@@ -319,7 +319,7 @@ def test_no_imu(tmp_path, capsys, kind):
 
 
 @pytest.mark.parametrize('kind, reason', [
-    ('mcap', 'cut off'), ('sqlite3', '.recover'), ('ros1', 'rosbag reindex a.bag')])
+    ('mcap', 'cut off'), ('sqlite3', '.dump'), ('ros1', 'rosbag reindex a.bag')])
 def test_cut_off_to_nothing(tmp_path, capsys, kind, reason):
     path = write_recording(tmp_path / 'a.bag', kind, 5.0)
     file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix != '.yaml')

@@ -17,6 +17,7 @@ from contextlib import closing
 import shutil
 import sqlite3
 import struct
+import subprocess
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -201,9 +202,9 @@ def not_indexed(content):
 
 
 @pytest.mark.parametrize('kind, edit, message', [
-    ('sqlite3', lambda content: content[:len(content) // 2], r'sqlite3 \S+ .recover'),
-    ('sqlite3', spoilt(200_000, b'\xff' * 20_000), r'sqlite3 \S+ .recover'),
-    ('sqlite3', lambda content: content[:50], r'sqlite3 \S+ .recover'),
+    ('sqlite3', lambda content: content[:len(content) // 2], r'sqlite3 \S+ .dump'),
+    ('sqlite3', spoilt(200_000, b'\xff' * 20_000), r'sqlite3 \S+ .dump'),
+    ('sqlite3', lambda content: content[:50], r'sqlite3 \S+ .dump'),
     ('mcap', spoilt(500_000, b'\xff' * 20_000), r'mcap recover \S+'),
     ('mcap', lambda content: MCAP, 'no IMU topic .*it has no topics'),
     ('mcap', lambda content: mcap_of(mcap_chunk(b'x', compression='rar')), "with 'rar', which is"),
@@ -227,6 +228,20 @@ def test_what_cannot_be_read_gets_a_sentence(copy, kind, edit, message):
             [*bag.blocks(bag.topics)]
             choose_topics(bag, Config())
     assert str(info.value).isprintable() and str(path.name) in str(info.value)
+
+
+@pytest.mark.parametrize('kind', ['sqlite3', 'sqlite3 file'])
+def test_the_command_that_is_named_mends_a_database(copy, kind):
+    if not all(map(shutil.which, ('sqlite3', 'zstd'))):
+        pytest.skip('no sqlite3 or no zstd is installed')
+    path, expected = copy(kind, lambda content: content[:len(content) * 4 // 5])
+    with pytest.raises(BagError) as info, Bag(path) as bag:
+        [*bag.blocks(bag.topics)]
+    command = str(info.value).partition('this may mend it: ')[2]
+    subprocess.run(command, shell=True, cwd=path.parent, capture_output=True)
+    records, _ = by_bag(path.parent / 'mended.db3')
+    # One may straddle the end.
+    assert len(records) > 3000 and len({*records} - {*expected}) <= 1
 
 
 def test_a_folder_of_recordings_asks_for_a_choice(tmp_path):

@@ -46,7 +46,8 @@ LISTED_NAME = re.compile(  # of such a file, in a line of metadata.yaml
 DATABASE_PATH = re.compile(r'[\w/. ~+=@,-]*\.db3', re.ASCII)
 # What may mend a file that rosbags cannot open.
 COMMANDS = {'.bag': 'rosbag reindex {0}', '.mcap': 'mcap recover {0} -o mended.mcap',
-            '.db3': 'sqlite3 {0} .recover | sqlite3 mended.db3'}
+            # Not .recover: the sqlite3 of Debian and Ubuntu has no tables of pages.
+            '.db3': "sqlite3 {0} .dump | sed 's/^ROLLBACK.*/COMMIT;/' | sqlite3 mended.db3"}
 BLOCK = 4096  # messages yielded at a time
 PIECE_BYTES = 1 << 20  # of a file, unpacked at a time
 INDEX_ENTRY_BYTES = 12  # of a message in the index of a ROS 1 file
@@ -364,6 +365,10 @@ def _bag_errors(path: Path) -> Iterator[None]:
         if isinstance(error, OSError) and error.strerror:
             raise BagError(f'{path} cannot be read: {error.strerror}') from None
         text = str(error).rstrip('.') or type(error).__name__
-        command = COMMANDS.get(path.suffix, '').format(path.name)
+        packed = path.suffix == '.zstd'
+        name = f'unpacked{Path(path.stem).suffix}' if packed else path.name
+        command = COMMANDS.get(Path(name).suffix, '').format(name)
+        if command and packed:
+            command = f'zstd -dc {path.name} > {name}; {command}'
         raise BagError(f'{path.name or path} cannot be read ({text})'
                        + (f'; this may mend it: {command}' if command else '')) from None
