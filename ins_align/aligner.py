@@ -102,7 +102,7 @@ class Aligner:
         self._lined_up: list[AntennaEpoch] = []     # epochs that wait for steps 4 to 8
         self._last_ns: int | None = None            # the last epoch since t0; None before it
         self._start_ns = self._measured_ns = 0      # t0 before it moves; the last measurement
-        self._without_velocity = ''                 # why velocities that came are of no use
+        self._without_velocity = False              # though velocities came
         self._verdict = Verdict(State.WAITING_FOR_IMU, 'no IMU sample yet')
         self._time_to_align_s: float | None = None
         self._initial: Attitude | None = None
@@ -265,13 +265,13 @@ class Aligner:
         # 7. The declaration decides the state and the words.
         verdict = self._decide(epoch, method, fit)
         if epoch.v_n is not None:
-            self._without_velocity = ''
+            self._without_velocity = False
         if fault := self._force_check.fault or epoch.fault:
             self._declaration.withdraw()
             verdict = Verdict(State.FAULT, fault)
-        if self._without_velocity:
-            verdict = Verdict(verdict.state, f'{verdict.reason}; no GNSS velocity is used: '
-                                             f'{self._without_velocity}')
+        if self._without_velocity and (why := self._refusal or self._left_out('velocity')):
+            verdict = Verdict(verdict.state,
+                              f'{verdict.reason}; no GNSS velocity is used: {why}')
         if verdict.state is State.ALIGNED and self.declared is None:
             self.declared = self._initial
             self._time_to_align_s = (epoch.stamp_ns - self._start_ns) * 1e-9
@@ -342,7 +342,7 @@ class Aligner:
         self._last_ns = self._start_ns = epoch.stamp_ns
         if self._first_t0_ns is None:
             self._first_t0_ns = epoch.stamp_ns
-        self._without_velocity = no_velocity if wanted and epoch.v_n is None else ''
+        self._without_velocity = bool(no_velocity) and wanted and epoch.v_n is None
         imu = preintegrate(*self._imu.start(epoch.stamp_ns))
         if config.method == 'bank':
             self._method = Bank(config, epoch, imu, bool(use_position), self._learnt,
