@@ -432,6 +432,18 @@ def test_values_that_are_no_numbers(changed):
     json.dumps(info.to_json(), allow_nan=False)
 
 
+def test_an_imu_that_hangs(changed):
+    def change(name, time, message):
+        if name == '/imu/data_raw':
+            message.angular_velocity.x = message.angular_velocity.y = 0.01
+            message.angular_velocity.z = message.linear_acceleration.x = 0.02
+            message.linear_acceleration.y, message.linear_acceleration.z = 0.03, 9.81
+
+    path = changed(change)
+    fault, = inspect(path).faults
+    assert fault.endswith(replay(path).status.reason)
+
+
 def test_positions_without_an_altitude(changed):
     def change(name, time, message):
         if name == '/fix':

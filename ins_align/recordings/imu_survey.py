@@ -94,7 +94,8 @@ def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: floa
     up = values[:, 3:].mean(axis=0)
     up /= np.linalg.norm(up) or 1.0
     grid, cells = _cells(times, values)
-    rates = ('all angular rates are 0' if max_rate == 0.0 else
+    rates = ('the IMU sends the same values again and again' if not np.ptp(values, axis=0).any()
+             else 'all angular rates are 0' if max_rate == 0.0 else
              degrees_fault(max_rate > ANY_GYRO_RATE, grid, *np.split(cells, 2, axis=1),
                            velocities))
     for fault in filter(None, (force_fault(force), rates)):
