@@ -21,6 +21,7 @@ from concurrent.futures.process import BrokenProcessPool
 import multiprocessing
 import os
 import signal
+import tempfile
 import threading
 from typing import Any, TypeVar
 
@@ -49,8 +50,9 @@ def keep_to_one() -> None:
         os.environ.setdefault(variable, '1')
 
 
-def _serve_parent() -> None:
-    """Leave Ctrl-C to the parent process, and end when it is killed."""
+def _serve_parent(folder: str) -> None:
+    """Leave Ctrl-C and a folder for what is unpacked to the parent; end when it is killed."""
+    tempfile.tempdir = folder
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -74,15 +76,16 @@ def run_all(function: Callable[[Any], T], tasks: Sequence[Any], jobs: int | None
     if jobs <= 1:
         yield from map(function, tasks)
         return
-    executor = ProcessPoolExecutor(jobs, initializer=_serve_parent)
-    try:
-        yield from _in_order(executor, function, tasks, BrokenProcessPool)
-    except BaseException:
-        for child in multiprocessing.active_children():
-            child.terminate()
-        raise
-    finally:
-        executor.shutdown()
+    with tempfile.TemporaryDirectory(prefix='ins_align_') as folder:
+        executor = ProcessPoolExecutor(jobs, initializer=_serve_parent, initargs=(folder,))
+        try:
+            yield from _in_order(executor, function, tasks, BrokenProcessPool)
+        except BaseException:
+            for child in multiprocessing.active_children():
+                child.terminate()
+            raise
+        finally:
+            executor.shutdown()
 
 
 def run_on_cluster(function: Callable[[Any], T], tasks: Sequence[Any], address: str,

@@ -15,6 +15,7 @@
 
 import contextlib
 import fcntl
+import importlib
 import json
 import os
 from pathlib import Path
@@ -29,6 +30,7 @@ import termios
 
 from ins_align.cli import main, SCENARIOS
 from ins_align.outputs import names_for
+from ins_align.recordings import ZSTD_MODULE
 from ins_align.simulation.scenarios import trajectory_of
 import pytest
 from recordings import FIX, messages_of, real_recording, TWIST, write_recording
@@ -395,11 +397,16 @@ def test_help_imports_nothing_heavy(command):
 
 
 @pytest.mark.parametrize('jobs', ['1', '2'])
-def test_interrupt(flight, jobs):
-    """Ctrl-C leaves without a traceback, and with all its processes."""
+def test_interrupt(flight, tmp_path, jobs):
+    """Ctrl-C leaves without a traceback, with all its processes and what they have unpacked."""
+    file, = flight.glob('*.mcap')
+    packed = tmp_path / 'flight.mcap.zstd'
+    packed.write_bytes(importlib.import_module(ZSTD_MODULE).compress(file.read_bytes()))
+    (tmp_path / 'unpacked').mkdir()
     process = subprocess.Popen(
-        [*COMMAND, 'replay', *[str(flight)] * 200, '--jobs', jobs], text=True,
+        [*COMMAND, 'replay', *[str(packed)] * 200, '--jobs', jobs], text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=Path(__file__).parents[1],
+        env={**os.environ, 'TMPDIR': str(tmp_path / 'unpacked')},
         # A shell makes what it starts in the background deaf to Ctrl-C, tests too.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     process.stdout.readline()
@@ -407,6 +414,7 @@ def test_interrupt(flight, jobs):
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 130
     assert errors == ''
+    assert not list((tmp_path / 'unpacked').glob('ins_align_*'))
 
 
 def test_workers_end_with_a_killed_parent(flight):
