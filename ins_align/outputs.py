@@ -65,7 +65,7 @@ def process(task: Task, progress: Callable[[float], None] | None = None) -> Outc
     from ins_align.report import plot, summary
 
     def named(error: object) -> str:
-        return str(error).replace(str(task.arguments['path']), task.name)
+        return str(error).replace(str(task.arguments['path']), task.name or '.')
 
     try:
         result = replay(**task.arguments, progress=progress)

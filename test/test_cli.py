@@ -287,7 +287,7 @@ def test_unusable_file(tmp_path, capsys):
 
 
 @pytest.mark.parametrize('command', ['replay', 'info'])
-def test_files_of_recordings_are_told_apart(tmp_path, capsys, command):
+def test_files_of_recordings_are_told_apart(tmp_path, capsys, monkeypatch, command):
     """Those of one recorder have the same names."""
     bags = []
     for name in ('monday', 'tuesday'):
@@ -300,6 +300,9 @@ def test_files_of_recordings_are_told_apart(tmp_path, capsys, command):
     error = capsys.readouterr().err
     assert f'ins_align {command}: {bags[0]}: bag.mcap is empty\n' in error
     assert f'ins_align {command}: warning: {bags[1]}: bag.mcap was cut off' in error
+    monkeypatch.chdir(tmp_path)
+    assert main([command, '']) == 2
+    assert f'{command}: . holds no recording' in one_sentence(capsys)
     assert main([command, str(tmp_path / 'missing')]) == 2
     assert f'{command}: {tmp_path}/missing does not exist' in one_sentence(capsys)
 
