@@ -247,13 +247,17 @@ def _longest_rest(grid: Array, cells: Array, velocities: Series) -> tuple[float,
     speed = np.interp(grid, velocities.times, np.hypot(*velocities.vectors[:, :2].T))
     after = np.clip(np.searchsorted(velocities.times, grid), 1, velocities.times.size - 1)
     near = np.abs(grid - velocities.times[after - 1]) < 2.0 * GRID
-    still = np.concatenate([[False], near & (speed < REST_SPEED), [False]])
+    # A vehicle that is carried stands for GNSS; of a long rest that is disturbed the rest counts.
+    limits = np.repeat([REST_RATE, REST_FORCE], 3)
+    calm = np.all(np.abs(np.diff(cells, axis=0)) < 2.0 * limits, axis=1)
+    calm = np.append(calm, True) & np.insert(calm, 0, True)
+    still = np.concatenate([[False], near & calm & (speed < REST_SPEED), [False]])
     runs = np.flatnonzero(np.diff(still.astype(np.int8))).reshape(-1, 2).tolist()
     for start, end in sorted(runs, key=lambda run: run[0] - run[1]):
         # The first and the last second may belong to stopping and setting off.
         rest = slice(start + 2, end - 2)
         if (end - start) * GRID >= MIN_REST and np.all(
-                cells[rest].std(axis=0) < np.repeat([REST_RATE, REST_FORCE], 3)):
+                cells[rest].std(axis=0) < limits):
             first, last = grid[rest][[0, -1]].tolist()
             return first - 0.5 * GRID, last + 0.5 * GRID
     return None
