@@ -27,7 +27,7 @@ from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimation.declaration import Fit
 from ins_align.estimation.filter import Filters
 from ins_align.estimation.linearised import linearised, MAX_DELAY, MIN_DELAY
-from ins_align.estimation.receiver import ReceiverNoise
+from ins_align.estimation.receiver import MOVING, ReceiverNoise
 from ins_align.estimation.rivals import level_in_words, Parameters, Rivals, SHARE
 from ins_align.estimation.start import (
     all_headings, HEADINGS, OPEN_POSITION, RoughAttitude, Start, STEP_STD)
@@ -239,10 +239,12 @@ class Bank:
         kinds = [kind for kind, present in enumerate(measured.present[k]) if present]
         if not kinds:
             return
-        news = []
+        news, receiver = [], self._receiver
+        moving = bool(np.linalg.norm(measured.s[k, 0] - measured.still[k]) > MOVING)
         for kind in kinds:
-            new = filters.update(model, k, kind, measured, self._receiver.factors(kind))
-            self._receiver.hear(kind, new.square, new.normalised, measured.stated[k][kind])
+            stated = measured.stated[k][kind]
+            new = filters.update(model, k, kind, measured, receiver.factors(kind, stated))
+            receiver.hear(kind, stated, moving, new.square, new.normalised)
             self._rejected[kind] += not new.taken
             news.append(new)
         self._offered += 1
@@ -291,7 +293,7 @@ class Bank:
             self._last = start.epochs[0]
             self.t0_ns = self._last.stamp_ns
         if rough is not None:
-            self._receiver.start(rough.kind, rough.noise)
+            self._receiver.start(rough.kind, rough.stated, rough.noise)
             self._begin_with(rough)
 
     def _begin_with(self, rough: RoughAttitude) -> None:

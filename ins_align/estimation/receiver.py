@@ -19,9 +19,11 @@ from ins_align.geometry.rotation import Array
 import numpy as np
 
 # The noise is taken to be larger than stated when innovations are LOUD times as large in the mean
-# square; that of a receiver that states none is estimated, from LEAST_NOISE of the configured
-# variance on. It follows at this rate, a single epoch counting up to the last.
-LOUD, LEAST_NOISE, FOLLOW, CLIP = 2.0, 1e-2, 0.02, 5.0
+# square; that of a receiver that states none, or whose velocities are QUIET, is estimated, from
+# LEAST_NOISE of the variance on. It follows at this rate, a single epoch counting up to the last.
+LOUD, QUIET, LEAST_NOISE, FOLLOW, CLIP = 2.0, 0.25, 1e-2, 0.02, 5.0
+# Velocities below this (m/s) do not count as quiet: receivers smooth what stands.
+MOVING = 1.0
 # A mean of innovations over some epochs, which forgets this share with each, shows errors that
 # last; so much more than white noise makes of it is chance.
 LASTING, CHANCE = 0.2, 0.5
@@ -44,31 +46,42 @@ class ReceiverNoise:
 
     def __init__(self) -> None:
         """Believe what is stated."""
-        # Log of factors on variances: of velocity and position, horizontal and vertical.
-        self._noise = np.zeros((2, 2))
+        # Log of factors on variances, those configured and those stated: of velocity and position,
+        # horizontal and vertical.
+        self._noise = np.zeros((2, 2, 2))
+        self._quiet = np.ones(2)    # mean square of velocities in motion, horizontal and vertical
         self.misfit = self._lasting = 1.0
         self._heard, self._mean = BELIEVED, np.zeros((2, 3))
 
-    def start(self, kind: int, factor: float) -> None:
+    def start(self, kind: int, stated: bool, factor: float) -> None:
         """Begin with a factor on the variances of velocities (kind 0) or positions (1)."""
-        self._noise[kind] = math.log(factor)
+        self._noise[int(stated), kind] = math.log(factor)
 
-    def factors(self, kind: int) -> Array:
+    def factors(self, kind: int, stated: bool) -> Array:
         """Return factors on the sigmas of velocities or positions, east, north, up."""
-        return np.exp(0.5 * self._noise[kind, [0, 0, 1]])
+        return np.exp(0.5 * self._noise[int(stated), kind, [0, 0, 1]])
 
-    def hear(self, kind: int, square: float, normalised: Array, stated: bool) -> None:
+    def hear(self, kind: int, stated: bool, moving: bool, square: float,
+             normalised: Array) -> None:
         """
         Follow an innovation.
 
-        It is of a velocity (kind 0) or a position (1), normalised and squared, per row, and over
-        its sigmas, east, north, up, (3,); `stated`: whether the receiver states its noise.
+        It is of a velocity (kind 0) or a position (1), whose noise is stated or configured, while
+        the antenna moves or not; normalised and squared, per row, and over its sigmas, east,
+        north, up, (3,).
         """
         east, north, up = np.square(normalised).tolist()
-        noise = self._noise[kind]
-        noise += FOLLOW * (np.minimum([0.5 * (east + north), up], CLIP)
-                           - (LOUD if stated else 1.0))
-        np.maximum(noise, 0.0 if stated else math.log(LEAST_NOISE), out=noise)
+        noise = self._noise[int(stated), kind]
+        heard = np.minimum([0.5 * (east + north), up], CLIP)
+        estimated = np.full(2, not stated)
+        if stated and kind == 0:
+            if moving:
+                self._quiet += FOLLOW * (heard - self._quiet)
+            estimated = (noise < 0.0) | (self._quiet < QUIET)
+        least = np.where(estimated & (moving | (not stated)), math.log(LEAST_NOISE),
+                         np.minimum(noise, 0.0))
+        noise += FOLLOW * (heard - np.where(estimated, 1.0, LOUD))
+        np.maximum(noise, least, out=noise)
         self._heard += 1
         share = 1 / min(self._heard, MEMORY)
         self.misfit += share * (min(square, CLIP) - self.misfit)
@@ -85,9 +98,10 @@ class ReceiverNoise:
 
     def in_words(self) -> str:
         """Return how the noise is another one than is stated, as the end of a sentence."""
-        words = ''.join(f'; the GNSS {name} are {math.exp(noise / 2):.1f} times as noisy as stated'
-                        for name, noise in zip(('velocities', 'positions'),
-                                               self._noise.max(axis=1))
+        words = ''.join(f'; the GNSS {name} are {math.exp(noise / 2):.2g} times as noisy as '
+                        + whose for whose, noises in zip(('configured', 'stated'),
+                                                         self._noise.max(axis=2))
+                        for name, noise in zip(('velocities', 'positions'), noises)
                         if math.exp(noise) > MENTIONED)
         if self._lasting - CHANCE > max(MENTIONED, self.misfit):
             words += ('; errors of the GNSS last from epoch to epoch: sigmas are '

@@ -43,8 +43,8 @@ ALIKE = 2.0
 # A wrong rival that is likely has to give the same attitude, to so many sigmas.
 HARMLESS = 1.0
 # A setting is named for a bias that is so many times what is configured, without so many of its
-# own sigmas.
-LARGE_BIAS, SURELY = 2.0, 2.0
+# own sigmas. One beyond 4 sigmas of the worst level is none: something else is wrong.
+LARGE_BIAS, SURELY, NO_BIAS = 2.0, 2.0, 40.0
 # Velocity of a vehicle sideways and upwards that lasts (m/s: tyres' slip, leeway and current,
 # wind); it changes by its sigma in this time (s), as the wind does where an aeroplane turns.
 DRIFTS = {'car': 0.1, 'boat': 1.0, 'aeroplane': 10.0}
@@ -282,7 +282,8 @@ def level_in_words(level: Rival, noise: ImuNoise, x: Array, P: Array) -> str:
             ('gyro_bias_std', 'accel_bias_std'), biases(x.size),
             (noise.gyro_bias_std, noise.accel_bias_std), (math.degrees(1.0), 1.0)):
         found = np.abs(x[places])
-        if np.any(found - SURELY * std[places] > LARGE_BIAS * configured):
+        if (np.any(found - SURELY * std[places] > LARGE_BIAS * configured)
+                and found.max() < NO_BIAS * configured):
             settings.append(f'{name}={unit * found.max():.2g}')
     if settings:
         return ('; the biases of the IMU are larger than configured, which sigmas allow for: set '

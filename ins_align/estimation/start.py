@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 from ins_align.config import Config
 from ins_align.estimation.moments import AttitudeMoments
-from ins_align.estimation.receiver import LEAST_NOISE, LOUD
+from ins_align.estimation.receiver import LEAST_NOISE, LOUD, MOVING, QUIET
 from ins_align.estimation.states import FIRST, PHI, PHI0, RHO, XI
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.rotation import apply, Array, cross, cumulative_rotations, exp_so3, Index
@@ -38,6 +38,9 @@ FIRST_EPOCHS, MAX_WAITING = 4, 64
 START_RATIO = 20.0
 # Epochs whose sigma is so many times that of the best say nothing to a start.
 UNCERTAIN = 10.0
+# Epochs over so many seconds may tell less noise than is stated or configured: errors that last
+# are not in the residuals of fewer.
+LONG_ENOUGH = 1.0
 # One epoch is an outlier if it is so unlike the others: F statistic of its residuals over theirs.
 OUTLYING = 20.0
 # Headings, every five degrees, and their sigma (rad): wide enough for the sum of their densities
@@ -56,6 +59,7 @@ class RoughAttitude(NamedTuple):
     C: Array  #: (3, 3), at t0, but for a rotation about the axis
     axis: Array  #: (3,), in the body at t0
     kind: int  #: 0 from velocities, 1 from positions
+    stated: bool  #: whether the receiver states variances
     noise: float  #: factor on the receiver's variances
 
 
@@ -110,9 +114,14 @@ class Start:
             noise = residual / (rows * usual)
             values, vectors = np.linalg.eigh(moments)
             stated = any(epochs[k].stated[kind] for k in places)
-            if not stated:                          # by chance it may be so much more
-                noise *= 1 + math.sqrt(2 / rows)
-            noise = max(noise, 1.0 if stated else LEAST_NOISE)
+            chance = math.sqrt(2 / rows)            # it may be so much more
+            quiet = (kind == 0 and noise * (1 + 3 * chance) < QUIET
+                     and np.any(np.linalg.norm(velocities_of(epochs)[places], axis=1) > MOVING))
+            noise = (max(noise * (1 + chance), LEAST_NOISE) if quiet or not stated
+                     else max(noise, 1.0))
+            seconds = time[places[-1]] - time[places[0]]
+            if noise < 1 and seconds < LONG_ENOUGH and len(epochs) < MAX_WAITING:
+                return None
             if values[-1] < START_RATIO ** 2 * usual * noise:
                 return None
             if noise < LOUD:
@@ -133,7 +142,8 @@ class Start:
         if places[0] > 0:
             self._drop_first()
             return self.solve(use_position)
-        return RoughAttitude(C, vectors[:, -1], kind, noise if noise > LOUD or not stated else 1.0)
+        return RoughAttitude(C, vectors[:, -1], kind, stated,
+                             noise if noise > LOUD or noise < 1 or not stated else 1.0)
 
     @property
     def lacks(self) -> str:
