@@ -20,8 +20,9 @@ import numpy as np
 
 # The noise is taken to be larger than stated when innovations are LOUD times as large in the mean
 # square; that of a receiver that states none, or whose velocities are QUIET, is estimated, from
-# LEAST_NOISE of the variance on. It follows at this rate, a single epoch counting up to the last.
-LOUD, QUIET, LEAST_NOISE, FOLLOW, CLIP = 2.0, 0.25, 1e-2, 0.02, 5.0
+# LEAST_NOISE of the variance on. It follows at a rate, the mean square of velocities at another, a
+# single epoch counting up to the last.
+LOUD, QUIET, LEAST_NOISE, FOLLOW, LATELY, CLIP = 2.0, 0.25, 1e-2, 0.02, 0.05, 5.0
 # Velocities below this (m/s) do not count as quiet: receivers smooth what stands.
 MOVING = 1.0
 # A mean of innovations over some epochs, which forgets this share with each, shows errors that
@@ -76,7 +77,7 @@ class ReceiverNoise:
         estimated = np.full(2, not stated)
         if stated and kind == 0:
             if moving:
-                self._quiet += FOLLOW * (heard - self._quiet)
+                self._quiet += LATELY * (heard - self._quiet)
             estimated = (noise < 0.0) | (self._quiet < QUIET)
         least = np.where(estimated & (moving | (not stated)), math.log(LEAST_NOISE),
                          np.minimum(noise, 0.0))
