@@ -22,9 +22,11 @@ from alignment import (
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config, ConfigError, ImuNoise, PRESETS
 from ins_align.geometry.rotation import exp_so3, log_so3, matrix_from_quaternion, roll_pitch_yaw
+from ins_align.gnss.messages import Fix, Velocity
+from ins_align.offline import align
 from ins_align.results import Severity
 from ins_align.simulation.scenarios import Motion, Scenario, SCENARIOS
-from ins_align.simulation.simulate import give
+from ins_align.simulation.simulate import gauss_markov, give
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -1222,27 +1224,60 @@ def test_delay_is_followed_as_far_as_its_sigma_allows(delay):
     assert abs(named - delay) < 0.05
 
 
+def with_stated(s, covariance_of):
+    """Return the epochs of a recording whose velocities state another covariance."""
+    aligner, done = Aligner(config_for(s, imu_grade='mems')), []
+    for k, (kind, payload) in enumerate(s.messages()):
+        if kind == 'velocity':
+            payload = payload._replace(covariance=covariance_of(payload))
+        give(aligner, kind, payload)
+        if k % 1000 == 0:
+            done += aligner.update()
+    return done + aligner.flush()
+
+
+def first_aligned(epochs):
+    return next(epoch.t_s for epoch in epochs if epoch.state is State.ALIGNED)
+
+
 @pytest.mark.parametrize('true_std, duration', [(0.05, 45.0), (0.6, 90.0)])
 def test_noise_that_the_receiver_does_not_state_is_found(true_std, duration):
     s = simulated('car', imu_grade='mems', duration=duration, seed=7, velocity_std=true_std,
                   velocity_std_vertical=true_std)
-
-    def run(**changes):
-        aligner, done = Aligner(config_for(s, imu_grade='mems')), []
-        for k, (kind, payload) in enumerate(s.messages()):
-            give(aligner, kind,
-                 payload._replace(**changes) if kind == 'velocity' else payload)
-            if k % 1000 == 0:
-                done += aligner.update()
-        return done + aligner.flush()
-
-    stated, unstated = run(), run(covariance=None)
-    first = [next(e.t_s for e in epochs if e.state is State.ALIGNED)
-             for epochs in (stated, unstated)]
-    assert first[1] < 1.3 * first[0]
+    stated = with_stated(s, lambda velocity: velocity.covariance)
+    unstated = with_stated(s, lambda velocity: None)
+    assert first_aligned(unstated) < 1.3 * first_aligned(stated)
     sigmas = [epochs[-1].current.sigma_deg for epochs in (stated, unstated)]
     assert np.all(np.abs(np.log(sigmas[1] / sigmas[0])) < 0.3)
     assert normalised_error(unstated[-1].current, s) < 16
+    assert ('times as noisy as configured' in unstated[-1].reason) == (true_std == 0.6)
+
+
+@pytest.mark.parametrize('scenario, longer', [('flight', 1.2), ('hover', 2.0), ('car', 4.0)])
+def test_noise_that_the_receiver_overstates_is_found(scenario, longer):
+    """Ten times, as common receivers do; a car at rest shows it once it moves."""
+    s = simulated(scenario, imu_grade='mems', duration=60.0, seed=7, velocity_std=0.03,
+                  velocity_std_vertical=0.05)
+    right = with_stated(s, lambda velocity: velocity.covariance)
+    overstated = with_stated(s, lambda velocity: 100 * velocity.covariance)
+    assert first_aligned(overstated) < longer * first_aligned(right)
+    sigmas = [epochs[-1].current.sigma_deg for epochs in (right, overstated)]
+    assert np.all(sigmas[1] < 1.4 * sigmas[0])
+    assert normalised_error(overstated[-1].current, s) < 16
+
+
+def test_errors_that_last_are_not_taken_for_a_quiet_receiver():
+    """Of a receiver that filters, at 10 Hz: in the first 0.3 s they do not show."""
+    s = simulated('car', imu_grade='mems', gnss_rate=10.0, velocity_std=0.01, duration=30.0,
+                  seed=0, gyro_bias_std=0.1)
+    lasting = gauss_markov(s.gnss_stamps_ns * 1e-9, 0.1, 0.5, np.random.default_rng(100))
+    result = align(s.imu_stamps_ns, s.gyro, s.accel,
+                   [Fix(stamp_ns, *lla, None, 0) for stamp_ns, lla
+                    in zip(s.gnss_stamps_ns.tolist(), s.lla_deg.tolist())],
+                   [Velocity(stamp_ns, v, None) for stamp_ns, v
+                    in zip(s.gnss_stamps_ns.tolist(), s.velocity + lasting)], velocity_std=0.1)
+    errors = [normalised_error(epoch.current, s) for epoch in result.epochs if epoch.t_s > 8.0]
+    assert len(errors) > 200 and max(errors) < 25.0
 
 
 @pytest.mark.parametrize('scenario', ['car', 'flight', 'static'])

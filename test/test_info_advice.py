@@ -108,6 +108,15 @@ def test_accelerometers_that_are_off_gravity_at_rest(tmp_path, error):
     assert settings == {}
 
 
+def test_what_is_carried_at_rest_for_the_receiver_is_not_at_rest(tmp_path):
+    truth = drive(duration=40.0)
+    time = (truth.imu_stamps_ns - truth.imu_stamps_ns[0]) * 1e-9
+    turned = truth.gyro + 0.5 * ((12.0 < time) & (time < 14.0))[:, None]
+    info = inspected(truth, tmp_path / 'a', gyro=turned)
+    assert imu_of(info)['rest_s'] == pytest.approx(10.0, abs=1.0)
+    assert settings_of(info) == {}
+
+
 @pytest.mark.parametrize('seed', (0, *(
     pytest.param(seed, marks=pytest.mark.campaign) for seed in (1, 2))))
 def test_an_imu_as_good_as_its_grade_needs_no_setting(tmp_path, seed):
@@ -199,6 +208,7 @@ def test_a_level_names_the_setting_that_a_bias_asks_for(gyro_bias, accel_bias):
     assert ('accel_bias_std=0.3' in said) == (accel_bias == 0.3)
     assert ('gyros look worse' in said) != ('_std=' in said)
     assert level_in_words(Rival(), PRESETS['mems'], x, P) == ''
+    assert '_std=' not in level_in_words(Rival(gyro=3.0), PRESETS['mems'], 100.0 * x, P)
     hardly_known = np.diag(0.25 * x ** 2)
     assert '_std=' not in level_in_words(Rival(gyro=3.0), PRESETS['mems'], x, hardly_known)
 
