@@ -188,6 +188,15 @@ def test_a_chip_aligns_with_thresholds_that_it_reaches(tmp_path, seed):
     assert main([*shlex.split(info.command)[1:], '--set', 'lever_arm=[1,1,1]']) == 0
 
 
+@pytest.mark.parametrize('factor', [1.0, 8.0])
+def test_a_receiver_that_overstates_its_noise(tmp_path, factor):
+    truth = drive(velocity_std=0.05, velocity_std_vertical=0.05)
+    info = inspected(truth, tmp_path / 'a',
+                     velocity_covariance=factor ** 2 * truth.velocity_covariance)
+    assert ('much less than stated' in describe(info)) == (factor > 1.0)
+    assert settings_of(info) == {}
+
+
 def test_of_rates_in_degrees_nothing_is_told_in_degrees(tmp_path):
     truth = drive(duration=60.0)
     info = inspected(truth, tmp_path / 'a', gyro=np.degrees(truth.gyro))

@@ -47,6 +47,7 @@ MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
 MIN_AHEAD = 0.3  # s: clocks that differ by less may be jitter
 MAX_AHEAD = MAX_AHEAD_NS * 1e-9  # s: stamps further ahead are of another clock
 MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s and so many sigmas beyond it: a delay to be set
+MUCH_LESS = 0.5  # of the stated sigma: so much less noise an alignment believes
 FRAMES_THAT_FIT = ('enu', 'ned')
 FRAME_FAULTS = {
     'body': 'its speed fits the change of position and its direction does not: it is given in the '
@@ -265,8 +266,11 @@ def _add_velocity_noise(info: Info, velocity: Recorded) -> None:
     if 'velocity_vertical' in velocity.settings:
         names.pop()
     settings = {name: rounded(max(std, 1e-3)) for name, std in zip(names, noise)}
+    stated = velocity.figures['covariance_share'] >= 0.5
+    quiet = stated and noise[0] < MUCH_LESS * velocity.figures['sigma'][0]
     info.add(f'noise of the GNSS velocity: {noise[0]:.2g} m/s horizontally, {noise[1]:.2g} m/s '
-             'vertically', settings if velocity.figures['covariance_share'] < 0.5 else {})
+             'vertically' + ', much less than stated: this counts in motion' * quiet,
+             {} if stated else settings)
 
 
 def _lateness(imu: Recorded, gnss: list[Recorded]) -> float:
