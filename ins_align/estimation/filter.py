@@ -117,8 +117,9 @@ class Filters:
         The rivals that are left.
     owed : ndarray, shape (M,)
         Information on the heading, 1/rad^2, that epochs to come may give by chance besides.
-    at_start : ndarray, shape (M, 3)
-        The variances of the accelerometers' biases, (m/s^2)^2, as they were at the start.
+    expected, variance : ndarray, shapes (3,) and (M, 3)
+        Biases of the accelerometers, m/s^2, as they are expected before the data, and their
+        variances, (m/s^2)^2.
     place : ndarray of int, shape (B,), or slice
         The place in `ids` of each mean's rival; all of them where each rival has one mean.
     lead : ndarray of int, shape (M,)
@@ -127,7 +128,7 @@ class Filters:
     """
 
     _OF_MEANS = 'C', 'u', 'w', 'x', 'C0', 'rival', 'weight'
-    _OF_RIVALS = 'P', 'walk', 'owed', 'at_start', 'evidence', 'counts', 'ids'
+    _OF_RIVALS = 'P', 'walk', 'owed', 'variance', 'evidence', 'counts', 'ids'
 
     def __init__(self, C: Array, u: Array, x: Array, rival: Index, P: Array, walk: Array,
                  prior: Array, counts: np.ndarray) -> None:
@@ -139,7 +140,9 @@ class Filters:
         self.weight = -np.log(np.bincount(rival))[rival]
         self.evidence, self.counts = prior, counts
         self.P, self.walk, self.owed = P, walk, np.zeros(M)
-        self.at_start = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, biases(x.size)[1]].copy()
+        accel = biases(x.size)[1]
+        self.expected = x[accel]
+        self.variance = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, accel].copy()
         self._find_places()
 
     # Which mean is whose, and how likely
@@ -222,10 +225,12 @@ class Filters:
         P[:, :9, :9] = 0.5 * (block + block.swapaxes(1, 2))     # or rounding grows
         M, n = self.walk.shape
         variance = P.reshape(M, -1)[:, ::n + 1]
-        gyro, accel = (variance[:, FIRST:][:, places] for places in biases(n - FIRST))
-        turning = TURNING * gyro.sum(axis=1)[:, None] * np.maximum(self.at_start - accel, 0.0)
+        triads = biases(n - FIRST)
+        gyro, accel = (variance[:, FIRST:][:, triad] for triad in triads)
+        turning = TURNING * gyro.sum(axis=1)[:, None] * np.maximum(self.variance - accel, 0.0)
         variance += duration * self.walk
         accel += duration * turning
+        self.variance += duration * self.walk[:, FIRST:][:, triads[1]]
 
     def update(self, model: Linearised, k: int, kind: int, measured: Measured,
                noise: Array) -> Innovation:
@@ -491,9 +496,3 @@ def _tested(HP: Array, S: Array, innovation: Array, second_order: bool) -> _Test
     weighted = apply(inverse, innovation)
     return _Test(HP, S, inverse, weighted, np.einsum('ij,ij->i', innovation, weighted),
                  second_order)
-
-
-def log_sum(values: Array) -> float:
-    """Return the log of the sum of exponentials."""
-    largest = float(np.max(values))
-    return largest + math.log(float(np.sum(np.exp(values - largest))))

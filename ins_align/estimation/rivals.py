@@ -23,9 +23,9 @@ from dataclasses import dataclass, replace
 import math
 
 from ins_align.config import Config, ImuNoise, PRESETS
-from ins_align.estimation.filter import Filters, log_sum, NEGLIGIBLE
+from ins_align.estimation.filter import Filters, NEGLIGIBLE
 from ins_align.estimation.states import (
-    biases, DELAY, DRIFT, FIRST, GYRO, LEVER_ARM, MARGIN, MOUNT, OF_VEHICLE, triads)
+    biases, DELAY, DRIFT, FIRST, GYRO, LEVER_ARM, log_sum, MARGIN, MOUNT, OF_VEHICLE, triads)
 from ins_align.geometry.rotation import Array, log_so3
 import numpy as np
 
@@ -36,8 +36,10 @@ GYRO_MISALIGNMENT, ACCEL_ERRORS = 0.3, 0.3
 # temperatures do, and the delay by the second: clocks of IMU and GNSS that nothing keeps together.
 WANDER_TIME, ACCEL_WANDER, DELAY_WANDER = 100.0, 0.1, 0.1
 # Means whose log weight is so much below the likeliest's are dropped, and so are rivals that are
-# wrong; levels stay, for what they assume may become true, but have no part in a mixture.
-UNLIKELY, HOPELESS, LEAST = 14.0, 25.0, NEGLIGIBLE + 1.0
+# wrong; levels stay, for what they assume may become true, but have no part in a mixture. A level
+# stays lower where its accelerometers' biases are less likely than STRAINED (log): it has gone
+# astray, which its evidence, held so long, has forgotten.
+UNLIKELY, HOPELESS, LEAST, STRAINED = 14.0, 25.0, NEGLIGIBLE + 1.0, 8.0
 # Means of a rival that agree to so many sigmas are merged.
 ALIKE = 2.0
 # A wrong rival that is likely has to give the same attitude, to so many sigmas.
@@ -148,7 +150,11 @@ class Rivals:
         ids, level = filters.ids, filters.evidence
         wrong, along = self._wrong[ids], self.along[ids]
         best = level[filters.best]
-        filters.evidence = np.where(wrong, level, np.maximum(level, best - LEAST)) - best
+        x = filters.x[filters.lead]
+        off = x[:, biases(x.shape[1])[1]] - filters.expected
+        strain = 0.5 * np.sum(off ** 2 / filters.variance, axis=1)
+        least = best - LEAST - np.maximum(strain - STRAINED, 0.0)
+        filters.evidence = np.where(wrong, level, np.maximum(level, least)) - best
         if filters.single and not (wrong.any() or along.any()):
             return
         keep = filters.weight > filters.weight[filters.lead][filters.place] - UNLIKELY

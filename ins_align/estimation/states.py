@@ -18,8 +18,10 @@ A leaf of the imports: places, shapes and names that the modules of the estimati
 """
 
 from dataclasses import dataclass
+import math
 
 from ins_align.geometry.rotation import Array
+import numpy as np
 
 # Places in the error state; the parameters follow from FIRST on: lever arm, delay, errors of the
 # gyros (bias, then matrix), errors of the accelerometers.
@@ -42,6 +44,12 @@ def biases(m: int) -> tuple[slice, slice]:
     """Return the places of the biases of gyros and accelerometers among m parameters."""
     gyro, accel = (slice(triad.start, triad.start + 3) for triad in triads(m))
     return gyro, accel
+
+
+def log_sum(values: Array) -> float:
+    """Return the log of the sum of exponentials."""
+    largest = float(np.max(values))
+    return largest + math.log(float(np.sum(np.exp(values - largest))))
 
 
 @dataclass

@@ -27,9 +27,9 @@ there to contradict the others, nothing.
 import math
 
 from ins_align.config import Config
-from ins_align.estimation.filter import Filters, log_sum
+from ins_align.estimation.filter import Filters
 from ins_align.estimation.states import (
-    DRIFT, FIRST, Linearised, MARGIN, Measured, MOUNT, OF_VEHICLE, PHI)
+    DRIFT, FIRST, Linearised, log_sum, MARGIN, Measured, MOUNT, OF_VEHICLE, PHI)
 from ins_align.geometry.rotation import apply, Array, Index, skew, Transform
 import numpy as np
 
