@@ -24,8 +24,8 @@ from ins_align.config import Config, PRESETS, STANDARD_GRAVITY
 from ins_align.estimation.bank import Bank, RESOLVED_STD
 from ins_align.estimation.filter import Filters
 from ins_align.estimation.linearised import linearised
-from ins_align.estimation.rivals import Parameters, Rival, SIGNS
-from ins_align.estimation.states import DELAY, FIRST, GYRO, PHI, PHI0, triads
+from ins_align.estimation.rivals import Parameters, Rival, SIGNS, STRAINED
+from ins_align.estimation.states import biases, DELAY, FIRST, GYRO, PHI, PHI0, triads
 from ins_align.experiments.common import error_of
 from ins_align.experiments.dense import bound
 from ins_align.geometry.rotation import exp_so3, log_so3, skew
@@ -312,6 +312,27 @@ def test_no_sigma_steps_up(scenario, grade):
         before, rejected = now, bank.fit().rejected
     assert compared > 200
     assert np.all(before < np.radians(2.0))
+
+
+def test_a_refuted_level_can_come_back_unless_its_biases_have_gone_astray():
+    """What its evidence forgets they remember: three accelerometers, ten of their sigmas off."""
+    s = simulated('flight', imu_grade='mems', duration=30.0, seed=2)
+    bank, epochs, imu = prepared(s)
+    for _ in went(bank, epochs, imu, 10):
+        pass
+    filters = bank._filters
+    likeliest, *others = np.flatnonzero(filters.counts)
+    _, accel = biases(filters.x.shape[1])
+    held = []
+    expected_std = np.sqrt(filters.variance[others[0]])
+    for off in (1.0, 10.0):
+        filters.x[filters.lead[others[0]], accel] = off * expected_std
+        filters.evidence = np.where(np.arange(filters.ids.size) == likeliest, 0.0, -1000.0)
+        bank._rivals.select(filters)
+        held.append(filters.evidence[others])
+    assert np.all(held[0] > -14.0) and np.all(held[0] < -12.0)
+    assert held[1][0] == pytest.approx(held[0][0] - (0.5 * 3 * 10.0 ** 2 - STRAINED))
+    assert np.array_equal(held[1][1:], held[0][1:])
 
 
 def test_weights_and_covariances_stay_what_they_are():
