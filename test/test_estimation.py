@@ -324,7 +324,7 @@ def test_a_refuted_level_can_come_back_unless_its_biases_have_gone_astray():
     likeliest, *others = np.flatnonzero(filters.counts)
     _, accel = biases(filters.x.shape[1])
     held = []
-    expected_std = np.sqrt(filters.variance[others[0]])
+    expected_std = np.sqrt(filters.accel_variance[others[0]])
     for off in (1.0, 10.0):
         filters.x[filters.lead[others[0]], accel] = off * expected_std
         filters.evidence = np.where(np.arange(filters.ids.size) == likeliest, 0.0, -1000.0)

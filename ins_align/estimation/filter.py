@@ -117,7 +117,7 @@ class Filters:
         The rivals that are left.
     owed : ndarray, shape (M,)
         Information on the heading, 1/rad^2, that epochs to come may give by chance besides.
-    expected, variance : ndarray, shapes (3,) and (M, 3)
+    accel_expected, accel_variance : ndarray, shapes (3,) and (M, 3)
         Biases of the accelerometers, m/s^2, as they are expected before the data, and their
         variances, (m/s^2)^2.
     place : ndarray of int, shape (B,), or slice
@@ -128,7 +128,7 @@ class Filters:
     """
 
     _OF_MEANS = 'C', 'u', 'w', 'x', 'C0', 'rival', 'weight'
-    _OF_RIVALS = 'P', 'walk', 'owed', 'variance', 'evidence', 'counts', 'ids'
+    _OF_RIVALS = 'P', 'walk', 'owed', 'accel_variance', 'evidence', 'counts', 'ids'
 
     def __init__(self, C: Array, u: Array, x: Array, rival: Index, P: Array, walk: Array,
                  prior: Array, counts: np.ndarray) -> None:
@@ -141,8 +141,8 @@ class Filters:
         self.evidence, self.counts = prior, counts
         self.P, self.walk, self.owed = P, walk, np.zeros(M)
         accel = biases(x.size)[1]
-        self.expected = x[accel]
-        self.variance = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, accel].copy()
+        self.accel_expected = x[accel]
+        self.accel_variance = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, accel].copy()
         self._find_places()
 
     # Which mean is whose, and how likely
@@ -225,12 +225,13 @@ class Filters:
         P[:, :9, :9] = 0.5 * (block + block.swapaxes(1, 2))     # or rounding grows
         M, n = self.walk.shape
         variance = P.reshape(M, -1)[:, ::n + 1]
-        triads = biases(n - FIRST)
-        gyro, accel = (variance[:, FIRST:][:, triad] for triad in triads)
-        turning = TURNING * gyro.sum(axis=1)[:, None] * np.maximum(self.variance - accel, 0.0)
+        places = biases(n - FIRST)
+        gyro, accel = (variance[:, FIRST:][:, triad] for triad in places)
+        known = np.maximum(self.accel_variance - accel, 0.0)
+        turning = TURNING * gyro.sum(axis=1)[:, None] * known
         variance += duration * self.walk
         accel += duration * turning
-        self.variance += duration * self.walk[:, FIRST:][:, triads[1]]
+        self.accel_variance += duration * self.walk[:, FIRST:][:, places[1]]
 
     def update(self, model: Linearised, k: int, kind: int, measured: Measured,
                noise: Array) -> Innovation:

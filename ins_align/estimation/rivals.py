@@ -151,8 +151,8 @@ class Rivals:
         wrong, along = self._wrong[ids], self.along[ids]
         best = level[filters.best]
         x = filters.x[filters.lead]
-        off = x[:, biases(x.shape[1])[1]] - filters.expected
-        strain = 0.5 * np.sum(off ** 2 / filters.variance, axis=1)
+        off = x[:, biases(x.shape[1])[1]] - filters.accel_expected
+        strain = 0.5 * np.sum(off ** 2 / filters.accel_variance, axis=1)
         least = best - LEAST - np.maximum(strain - STRAINED, 0.0)
         filters.evidence = np.where(wrong, level, np.maximum(level, least)) - best
         if filters.single and not (wrong.any() or along.any()):
