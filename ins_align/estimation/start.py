@@ -113,9 +113,10 @@ class Start:
             rows = 3 * (len(places) - 2 - kind)
             noise = residual / (rows * usual)
             values, vectors = np.linalg.eigh(moments)
-            stated = any(epochs[k].stated[kind] for k in places)
+            states = [epochs[k].stated[kind] for k in places]
+            stated = any(states)
             chance = math.sqrt(2 / rows)            # it may be so much more
-            quiet = (kind == 0 and noise * (1 + 3 * chance) < QUIET
+            quiet = (kind == 0 and all(states) and noise * (1 + 3 * chance) < QUIET
                      and np.any(np.linalg.norm(velocities_of(epochs)[places], axis=1) > MOVING))
             noise = (max(noise * (1 + chance), LEAST_NOISE) if quiet or not stated
                      else max(noise, 1.0))
