@@ -269,7 +269,7 @@ class Aligner:
         if fault := self._force_check.fault or epoch.fault:
             self._declaration.withdraw()
             verdict = Verdict(State.FAULT, fault)
-        if self._without_velocity and (why := self._refusal or self._left_out('velocity')):
+        if self._without_velocity and (why := self._unused_velocities()):
             verdict = Verdict(verdict.state,
                               f'{verdict.reason}; no GNSS velocity is used: {why}')
         if verdict.state is State.ALIGNED and self.declared is None:
@@ -322,7 +322,7 @@ class Aligner:
         wanted = config.use_velocity is not False
         alone = not wanted or (config.use_velocity == 'auto' and config.method != 'vif'
                                and epoch.stamp_ns - self._first_fix_ns >= NO_VELOCITY_NS)
-        no_velocity = self._refusal or self._left_out('velocity')
+        no_velocity = self._unused_velocities()
         if epoch.v_n is None and not alone:
             self._wait(State.WAITING_FOR_GNSS, 'no GNSS velocity yet', no_velocity)
             return
@@ -365,6 +365,10 @@ class Aligner:
             self._say_start_over(why)
             learnt = self._method.learnt()
         self._forget(learnt)
+
+    def _unused_velocities(self) -> str:
+        """Return in words why velocities that came are of no use, or ''."""
+        return self._refusal or self._left_out('velocity')
 
     def _left_out(self, kind: str) -> str:
         """List in words which messages of a kind were left out since the last start."""

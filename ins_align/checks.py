@@ -21,13 +21,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 import math
 from typing import Union
 
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, Index
-from ins_align.gnss.messages import Fix, numbers_of, Velocity
+from ins_align.gnss.messages import Fix, numbers_of, usable, Velocity
 from ins_align.gnss.motion import (
     EMPTY, GRID, on_grid, Series, series_of, track, velocity_frame, velocity_from_positions,
     VelocityFrame, without_wild_positions)
@@ -40,7 +40,8 @@ TOO_FAST_SHARE = 1e-3  # of the samples may be beyond that: spikes
 LENGTH_CELLS, MIN_LENGTHS = 20, 20  # of GRID s over which forces are summed up; sums to judge by
 SHORTER, AS_LONG = 0.85, 0.15  # a quarter of the sums is so short; within this they are right
 MIN_MISFIT = 0.1  # of the logarithm of a length: by so much exchanged positions fit better
-MAX_LATENESS, MAX_DELAY = 60.0, 10.0  # s, the limits of the parameters gnss_lateness, gnss_delay
+_LIMITS = {own.name: own.metadata['maximum'] for own in fields(Config)}
+MAX_LATENESS, MAX_DELAY = _LIMITS['gnss_lateness'], _LIMITS['gnss_delay']  # s
 LATE_SHARE, MIN_LATE = 0.1, 10  # of GNSS messages that are worth a word
 BEYOND_THE_POLES = 'latitudes are beyond the poles: they are exchanged with the longitudes'
 CELLS, GNSS_MESSAGES = 600, 3000  # kept of the latest data: 5 minutes, at up to 10 Hz
@@ -154,7 +155,8 @@ class InputChecks:
             self._add_imu(stamps_ns, gyro, accel)
 
     def _add_gnss(self, message: Fix | Velocity) -> None:
-        numbers, fault = numbers_of(message)
+        message, fault = usable(message)
+        numbers = numbers_of(message)
         if not fault:
             rows = self._velocities if isinstance(message, Velocity) else self._fixes
             rows.append((message.stamp_ns * 1e-9, *numbers))

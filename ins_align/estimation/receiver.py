@@ -98,7 +98,7 @@ class ReceiverNoise:
         return max(1.0, self.misfit, self._lasting - CHANCE)
 
     def in_words(self) -> str:
-        """Return how the noise is another one than is stated, as the end of a sentence."""
+        """Return how the noise is larger than stated or configured, as the end of a sentence."""
         words = ''.join(f'; the GNSS {name} are {math.exp(noise / 2):.2g} times as noisy as '
                         + whose for whose, noises in zip(('configured', 'stated'),
                                                          self._noise.max(axis=2))

@@ -28,7 +28,8 @@ from ins_align.estimation.receiver import LEAST_NOISE, LOUD, MOVING, QUIET
 from ins_align.estimation.states import FIRST, PHI, PHI0, RHO, XI
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.rotation import apply, Array, cross, cumulative_rotations, exp_so3, Index
-from ins_align.gnss.messages import AntennaEpoch, UNKNOWN_ALTITUDE_STD, velocities_of
+from ins_align.gnss.messages import (
+    AntennaEpoch, NO_VERTICAL, UNKNOWN_ALTITUDE_STD, velocities_of)
 from ins_align.imu.preintegration import Intervals
 import numpy as np
 
@@ -154,7 +155,7 @@ class Start:
                 or epoch.position_covariance[2, 2] < UNKNOWN_ALTITUDE_STD ** 2
                 for epoch in self.epochs):
             return ''
-        return 'positions have no altitude, and there is no velocity: one of the two is needed'
+        return NO_VERTICAL
 
     def _pairs(self, kind: int) -> tuple[Array, Array, Array]:
         """Return the times and the vectors of the formula, free start, for all epochs."""

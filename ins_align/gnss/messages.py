@@ -51,8 +51,9 @@ MIN_EIGENVALUE = 1e-9  # of possible correlations: less is rounding
 # Beyond these no receiver measures; such values would overflow the integrals (m/s, m).
 MAX_SPEED, MAX_ALTITUDE = 2000.0, 1e6
 NO_FIX = -1  # status
-# Sigma of an altitude that a fix does not have (m).
+# Sigma of an altitude that a fix does not have (m), and what that means without a velocity.
 UNKNOWN_ALTITUDE_STD = 1e4
+NO_VERTICAL = 'positions have no altitude, and there is no velocity: one of the two is needed'
 
 
 class MessageError(ValueError):
@@ -154,10 +155,9 @@ def sound_covariance(sent: Array | None, default_std: Sequence[float] = ()) -> A
     return np.diag(used)
 
 
-def numbers_of(message: Fix | Velocity) -> tuple[list[float], str]:
-    """Return position or velocity as `usable` has it, and as what it is counted if it is not."""
-    found, fault = usable(message)
-    return (found.velocity.tolist() if isinstance(found, Velocity) else list(found[1:4])), fault
+def numbers_of(message: Fix | Velocity) -> list[float]:
+    """Return position or velocity of a message."""
+    return message.velocity.tolist() if isinstance(message, Velocity) else list(message[1:4])
 
 
 def stamp_from_msg(msg: Any) -> int:

@@ -39,6 +39,7 @@ _LIMITS = np.repeat([MAX_RATE, MAX_ACCELERATION], 3)[:, None]
 # The IMU may be silent for this long; then the attitude is lost and alignment starts over (ns).
 MAX_GAP_NS = 500_000_000
 NO_SAMPLE = f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s'
+SAME_VALUES = 'the IMU sends the same values again and again'
 # IMU samples that are kept before those wanted: interpolation needs two, the checks the rest.
 KEPT_BEFORE = 2 + IMU_BEFORE
 # So many IMU samples in a row that go in order, behind the newest one, through a time that others
@@ -257,7 +258,7 @@ class ImuBuffer:
                           zip(stamps[gaps].tolist(), stamps[gaps + 1].tolist())]
         # An epoch is taken when the IMU is ahead by the lateness: what is known by then counts.
         self._silences += [Silence(max(start, known - self._lateness_ns), end, 'imu_stuck',
-                                   'the IMU sends the same values again and again')
+                                   SAME_VALUES)
                            for start, end, known in stuck(stamps, self.samples)]
         self._silences += [Silence(stamp - 1, stamp, 'imu_blind', 'the gyros are at the end of '
                                    'their range: let the driver set a larger one')

@@ -28,10 +28,11 @@ from typing import NamedTuple
 
 from ins_align.checks import ANY_GYRO_RATE, degrees_fault
 from ins_align.config import Config, ImuNoise, PRESETS
+from ins_align.estimation.receiver import MOVING
 from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, skew
 from ins_align.gnss.motion import GRID, Series
-from ins_align.imu.buffer import MAX_GAP_NS
+from ins_align.imu.buffer import MAX_GAP_NS, SAME_VALUES
 from ins_align.imu.noise import force_fault, white_noise
 from ins_align.recordings.topic_survey import rounded, Surveyed
 import numpy as np
@@ -59,7 +60,6 @@ MAX_DELAY_STD = 0.05  # s: what is known less well is not told
 # velocity noise of VELOCITY_STD, m/s. Rotation and v_0 are free.
 VELOCITY_STD = 0.2
 PRIOR_STD = np.repeat([1e4, 1e4, math.radians(0.5), 3.0, 0.5], 3)
-MOVING = 1.0  # m/s
 MAX_TURN_STD = 0.2  # rad: a rotation that is known less well is open
 OUTLIER = 6.0  # times the median size of residuals
 LONGEST = 3600.0  # s from the first motion on that are looked at: memory is bounded
@@ -94,8 +94,8 @@ def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: floa
     up = values[:, 3:].mean(axis=0)
     up /= np.linalg.norm(up) or 1.0
     grid, cells = _cells(times, values)
-    rates = ('the IMU sends the same values again and again' if not np.ptp(values, axis=0).any()
-             else 'all angular rates are 0' if max_rate == 0.0 else
+    rates = (SAME_VALUES if not np.ptp(values, axis=0).any() else
+             'all angular rates are 0' if max_rate == 0.0 else
              degrees_fault(max_rate > ANY_GYRO_RATE, grid, *np.split(cells, 2, axis=1),
                            velocities))
     for fault in filter(None, (force_fault(force), rates)):

@@ -26,9 +26,10 @@ from typing import Any
 from ins_align.checks import (
     BEYOND_THE_POLES, beyond_the_poles, exchange_fault, lateness_advice, MAX_DELAY, MAX_LATENESS)
 from ins_align.config import Config, config_from_mapping
+from ins_align.estimation.receiver import QUIET
 from ins_align.geometry.earth import normal_gravity
 from ins_align.gnss.buffer import MAX_AHEAD_NS
-from ins_align.gnss.messages import enu_from_ned
+from ins_align.gnss.messages import enu_from_ned, NO_VERTICAL
 from ins_align.gnss.motion import (
     differences, EMPTY, find_manoeuvres, MANOEUVRE_SPEED, MANOEUVRE_TIME, on_grid, Series, track,
     velocity_frame, velocity_from_positions, without_wild_positions)
@@ -47,7 +48,6 @@ MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
 MIN_AHEAD = 0.3  # s: clocks that differ by less may be jitter
 MAX_AHEAD = MAX_AHEAD_NS * 1e-9  # s: stamps further ahead are of another clock
 MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s and so many sigmas beyond it: a delay to be set
-MUCH_LESS = 0.5  # of the stated sigma: so much less noise an alignment believes
 FRAMES_THAT_FIT = ('enu', 'ned')
 FRAME_FAULTS = {
     'body': 'its speed fits the change of position and its direction does not: it is given in the '
@@ -118,9 +118,8 @@ def inspect(path: str | os.PathLike[str]) -> Info:
         if velocity is None and fix is not None and not fix.faults:
             alone = fix.figures['vertical_share'] > 0.0
             info.add('there is no velocity that can be used: it is aligned from positions alone, '
-                     'which takes longer unless they are RTK' if alone else
-                     'positions have no altitude, and there is no velocity: one of the two is '
-                     'needed', {'use_velocity': False} if velocities else {}, fault=not alone)
+                     'which takes longer unless they are RTK' if alone else NO_VERTICAL,
+                     {'use_velocity': False} if velocities else {}, fault=not alone)
         gnss = [data for data in (fix, velocity) if data is not None]
         if imu is not None and gnss:
             _add_clocks(info, imu, gnss)
@@ -267,7 +266,7 @@ def _add_velocity_noise(info: Info, velocity: Recorded) -> None:
         names.pop()
     settings = {name: rounded(max(std, 1e-3)) for name, std in zip(names, noise)}
     stated = velocity.figures['covariance_share'] >= 0.5
-    quiet = stated and noise[0] < MUCH_LESS * velocity.figures['sigma'][0]
+    quiet = stated and noise[0] < math.sqrt(QUIET) * velocity.figures['sigma'][0]
     info.add(f'noise of the GNSS velocity: {noise[0]:.2g} m/s horizontally, {noise[1]:.2g} m/s '
              'vertically' + ', much less than stated: this counts in motion' * quiet,
              {} if stated else settings)

@@ -97,12 +97,12 @@ def columns_of(times_ns: np.ndarray, decoded: ImuSamples | Sequence[Gnss]) -> Co
     rows = []
     for time_ns, message in zip(times_ns.tolist(), decoded):
         if not isinstance(message, Refused):
-            values, fault = numbers_of(message)
+            found, fault = usable(message)
+            values = numbers_of(found)
             known = message.covariance is not None
             east, north, up = message.covariance.diagonal() if known else (math.nan,) * 3
             rows.append((time_ns, message.stamp_ns, values, not fault, fault == 'no_fix',
-                         (math.sqrt((east + north) / 2.0), math.sqrt(up)),
-                         usable(message)[0].vertical))
+                         (math.sqrt((east + north) / 2.0), math.sqrt(up)), found.vertical))
     return Columns(*map(np.array, zip(*rows))) if rows else NOTHING
 
 
