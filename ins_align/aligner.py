@@ -422,13 +422,12 @@ class Aligner:
         current, method = self._current, self._method
         if current is None or method is None:
             return None
-        stamps, rates, rate = self._imu.rates_since(current.stamp_ns)
+        stamps, rates, rate, usual = self._imu.rates_since(current.stamp_ns)
         sensors = method.sensor_errors()
         prediction = Prediction(
             current, sensors.gyro_bias, sensors.gyro_matrix,
             float(np.max(method.nuisance().gyro_bias_std)),
-            self.config.imu_noise.angle_random_walk, rate,
-            1e-9 * float(np.median(np.diff(self._imu.stamps))))
+            self.config.imu_noise.angle_random_walk, rate, usual)
         carried = all(prediction.carry(*sample)
                       for sample in zip(stamps.tolist(), rates.tolist()))
         return prediction if carried else None

@@ -258,7 +258,7 @@ def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
     Read the values for this node from a ROS 2 parameter file, by name, not checked.
 
     The YAML has ``ros__parameters`` below the node's name or a wildcard (``/**``). A ConfigError
-    says that the file cannot be read or holds no parameters for this node.
+    says that the file cannot be read, or holds no parameters for this node or those of two.
     """
     try:
         with open(path, 'rb') as file:
@@ -269,14 +269,16 @@ def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise ConfigError(f'{path} is larger than {MAX_PARAMS_BYTES >> 20} MiB: '
                           'that is no parameter file')
     values: dict[str, Any] = {}
-    found = False
-    for node, content in _node_sections(_parse_yaml(text, str(path)), ''):
-        if node.rsplit('/', 1)[-1] not in (NODE_NAME, '*', '**'):
-            continue
+    found = [section for section in _node_sections(_parse_yaml(text, str(path)), '')
+             if section[0].rsplit('/', 1)[-1] in (NODE_NAME, '*', '**')]
+    nodes = [node for node, _ in found if node.endswith(f'/{NODE_NAME}')]
+    if len(nodes) > 1:
+        raise ConfigError(f'{path} holds parameters for {" and ".join(nodes)}: leave only those '
+                          'of one of them')
+    for node, content in found:
         if not isinstance(content, dict):
             raise ConfigError(f'{path}: ros__parameters of {node} must be a mapping of names '
                               'to values')
-        found = True
         values.update(content)
     if not found:
         raise ConfigError(f'{path} holds no parameters for this node: expected '

@@ -21,7 +21,7 @@ from typing import Any, TYPE_CHECKING, Union
 
 from ins_align.aligner import Aligner
 from ins_align.checks import InputChecks
-from ins_align.config import Config, config_from_mapping
+from ins_align.config import Config, config_from_mapping, ConfigError
 from ins_align.geometry.rotation import Array, Index, Transform
 from ins_align.gnss import messages
 from ins_align.gnss.messages import Fix, usable, Velocity
@@ -176,13 +176,16 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     Raises
     ------
     ConfigError
-        If a parameter is not known or its value is wrong.
+        If a parameter is not known, its value is wrong, or it needs a recording.
     ValueError
         If an array has the wrong shape, or its stamps are no times, in another unit, out of order
         by more than `gnss_lateness` or of another clock than those of the IMU.
 
     """
     settings = config_from_mapping(config)
+    if settings.base_frame or settings.lever_arm_from_tf is True:
+        raise ConfigError('base_frame and lever_arm_from_tf need the transforms of a recording, '
+                          'which arrays do not have: leave them out, and set lever_arm')
     unit_ns = 1.0 if np.asarray(stamps).dtype.kind in 'iu' else 1e9
     stamps_ns = _nanoseconds('the IMU', np.asarray(stamps), unit_ns)
     rates, forces = _numbers(gyro), _numbers(accel)

@@ -262,9 +262,13 @@ class Result:
 
     @cached_property
     def spans(self) -> list[Span]:
-        """Return how the state changed, from the first epoch on."""
+        """Return how the state changed, from the first epoch on, with what is said at the end."""
+        status = self.status
+        end = [dataclasses.replace(epoch, state=status.state, reason=status.reason,
+                                   started_over='')
+               for epoch in self.epochs[-1:] if epoch.state is not status.state]
         spans: list[Span] = []
-        for epoch in self.epochs:
+        for epoch in (*self.epochs, *end):
             if spans and spans[-1].first.state is epoch.state and not epoch.started_over:
                 spans[-1] = Span(spans[-1].first, epoch)
             else:

@@ -182,7 +182,9 @@ def test_parameter_file_of_several_nodes(tmp_path):
 @pytest.mark.parametrize('text, message', [
     ('', 'no parameters'), ('hold_time: 1', 'no parameters'),
     ('other:\n  ros__parameters:\n    x: 1', 'no parameters'),
-    ('ins_align:\n  ros__parameters: [1]', 'mapping'), ('a: [', 'YAML, line 1'),
+    ('ins_align:\n  ros__parameters: [1]', 'mapping'),
+    ('a:\n ins_align:\n  ros__parameters: {}\nb:\n ins_align:\n  ros__parameters: {}',
+     'for /a/ins_align and /b/ins_align: leave only those of one'), ('a: [', 'YAML, line 1'),
     ('a: !!python/object/apply:os.system [ls]', 'YAML'), ('\x00', 'YAML'),
     ('[' * 100000, 'YAML'), ('x' * (1 << 21), 'MiB')])
 def test_parameter_file_refused(tmp_path, text, message):

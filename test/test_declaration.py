@@ -65,6 +65,19 @@ def test_level_comes_before_heading_and_the_reason_has_numbers():
     assert verdict.state is State.ALIGNING and 'tilt sigma 5' in verdict.reason
 
 
+def test_after_a_minute_near_the_threshold_the_reason_names_the_parameter():
+    near, far = covariance(0.1, 2.4), covariance(0.1, 30.0)
+    declaration = Declaration(Config())
+    early = judge(declaration, 0.0, 10.0, near)
+    assert 'heading_std_threshold' not in early.reason
+    late = judge(declaration, 100.0, 10.0, near)
+    assert late.reason == ('heading sigma 2.4 deg, needs 1: turn or change speed, or raise '
+                           'heading_std_threshold if 2.4 deg is good enough')
+    assert 'threshold' not in judge(declaration, 200.0, 10.0, far).reason
+    tilted = judge(Declaration(Config()), 100.0, 10.0, covariance(1.2, 30.0))
+    assert 'raise tilt_std_threshold if 1.2 deg' in tilted.reason
+
+
 def test_what_is_missing_shows_in_the_numbers():
     verdict = judge(Declaration(Config()), 0.0, 3.0, covariance(0.1, 1.004))
     assert verdict.reason.startswith('heading sigma 1.004 deg, needs 1:')

@@ -188,6 +188,8 @@ def test_units_that_are_wrong_are_named():
     stamps, gyro, accel = imu(car)
     wrong = ins_align.align(stamps, np.degrees(gyro), accel, *tables(car, 'std'), **LEVER)
     assert not wrong.aligned and 'deg/s' in wrong.status.reason
+    change = wrong.to_json()['changes'][-1]
+    assert change['state'] == 'FAULT' and 'deg/s' in change['reason']
 
 
 def test_no_data():
@@ -228,6 +230,9 @@ def test_wrong_arrays_end_in_a_sentence(flight, change, message):
 def test_wrong_parameters_end_in_a_sentence(flight):
     with pytest.raises(ConfigError, match='did you mean lever_arm'):
         ins_align.align(*imu(flight), *tables(flight), lever_arms=(1.0, 1.0, 1.0))
+    for needs_tf in ({'base_frame': 'base_link'}, {'lever_arm_from_tf': True}):
+        with pytest.raises(ConfigError, match='which arrays do not have'):
+            ins_align.align(*imu(flight), *tables(flight), **needs_tf)
 
 
 def test_every_public_name_is_there():

@@ -100,10 +100,13 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
 
 def with_states(result, *epochs):
     """Return a result with epochs 1 s apart, of states with reasons and why it started over."""
-    return dataclasses.replace(result, epochs=tuple(
-        dataclasses.replace(result.epochs[0], t_s=float(k), state=State(state), reason=reason,
-                            started_over=why)
-        for k, (state, reason, why) in enumerate(epochs)))
+    state, reason, _ = epochs[-1]
+    return dataclasses.replace(
+        result, status=dataclasses.replace(result.status, state=State(state), reason=reason),
+        epochs=tuple(
+            dataclasses.replace(result.epochs[0], t_s=float(k), state=State(state), reason=reason,
+                                started_over=why)
+            for k, (state, reason, why) in enumerate(epochs)))
 
 
 def changes_in(text):
@@ -140,9 +143,7 @@ def test_many_changes_are_cut_in_the_table_and_whole_in_json(result, count, left
     ('DADADL', 'LEVELLED (first ALIGNED after 0.0 s, declarations: 3)')])
 def test_headline_gives_the_first_declaration(result, states, words):
     names = {'A': 'ALIGNING', 'D': 'ALIGNED', 'L': 'LEVELLED'}
-    told = with_states(result, *((names[state], '', '') for state in states))
-    told = dataclasses.replace(told, status=dataclasses.replace(
-        result.status, state=State(names[states[-1]])))
+    told = with_states(result, *((names[state], 'why', '') for state in states))
     assert told.state_in_words == words
     assert f'  {words}: ' in summary(told)
 
@@ -184,7 +185,8 @@ def test_times_go_on_where_the_clock_is_set_back(tmp_path):
                if line.split()[:1] == ['final'])
     assert float(row[1]) == pytest.approx(times[-1], abs=0.1)
     # Declared before the clock was set back, and not again: at t0 on that clock.
-    once = dataclasses.replace(result, epochs=tuple(
+    lost = dataclasses.replace(result.status, state=State.ALIGNING)
+    once = dataclasses.replace(result, status=lost, epochs=tuple(
         epoch if epoch.t_s < again.first.t_s else dataclasses.replace(epoch, state=State.ALIGNING)
         for epoch in result.epochs))
     row = next(line.split() for line in summary(once).splitlines()

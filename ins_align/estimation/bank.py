@@ -26,7 +26,7 @@ from typing import NamedTuple
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimation.declaration import Fit
 from ins_align.estimation.filter import Filters
-from ins_align.estimation.linearised import linearised, MAX_DELAY, MIN_DELAY
+from ins_align.estimation.linearised import EARLIEST, LATEST, linearised
 from ins_align.estimation.receiver import MOVING, ReceiverNoise
 from ins_align.estimation.rivals import level_in_words, Parameters, Rivals, SHARE
 from ins_align.estimation.start import (
@@ -216,7 +216,7 @@ class Bank:
     def _point_of(self, filters: Filters) -> Array:
         """Return the parameters of the likeliest mean of each rival, with one delay for all."""
         point = filters.x[filters.lead]
-        point[:, DELAY] = np.clip(point[filters.best, DELAY], MIN_DELAY, MAX_DELAY)
+        point[:, DELAY] = np.clip(point[filters.best, DELAY], EARLIEST, LATEST)
         return point
 
     def _model(self, filters: Filters, point: Array, imu: Intervals) -> Linearised:

@@ -38,6 +38,8 @@ MIN_ROWS = 12
 DELAY_SIGMAS = 3.0
 # Conditions that have to hold are seen to hold at epochs that are no further apart than this (s).
 MAX_SILENCE = 30.0
+# A sigma that after so many seconds is within so many times its threshold may be good enough.
+PATIENCE, ACCEPTABLE = 60.0, 4.0
 # Epochs over which the latest innovations are averaged.
 RECENT = 25
 
@@ -78,6 +80,7 @@ class Declaration:
         self._offered = 0                   # epochs until then
         self._recent_nis = 1.0
         self._rejected = 0
+        self._time_s = 0.0
 
     def update(self, time_s: float, initial: Array, current: Array, fit: Fit) -> Verdict:
         """
@@ -87,6 +90,7 @@ class Declaration:
         in ENU. Both must be good enough; where only the present one is, `move_t0` says that t0 had
         better move.
         """
+        self._time_s = time_s
         if math.isfinite(fit.nis):
             self._recent_nis += (min(fit.nis, 10.0) - self._recent_nis) / RECENT
         contradiction = self._contradicted_by(fit)
@@ -161,13 +165,22 @@ class Declaration:
         if tilt > config.tilt_std_threshold and not self.levelled:
             return Verdict(State.ALIGNING,
                            f'tilt sigma {_above(tilt, config.tilt_std_threshold)}: wait, or turn '
-                           f'or change speed{fit.remarks}')
+                           f'or change speed{self._or_raise("tilt", tilt)}{fit.remarks}')
         state = State.LEVELLED if self.levelled else State.ALIGNING
         if heading > config.heading_std_threshold:
             return Verdict(state, f'heading sigma {_above(heading, config.heading_std_threshold)}'
-                                  f': turn or change speed{fit.remarks}')
+                                  f': turn or change speed{self._or_raise("heading", heading)}'
+                                  f'{fit.remarks}')
         return Verdict(state, f'heading sigma {_deg(heading)} is good enough: it has to hold '
                               f'for {config.hold_time:g} s')
+
+    def _or_raise(self, name: str, sigma_deg: float) -> str:
+        """Return what else leads on where a sigma does not get much better than it is."""
+        threshold = f'{name}_std_threshold'
+        if (self._time_s < PATIENCE
+                or sigma_deg > ACCEPTABLE * getattr(self.config, threshold)):
+            return ''
+        return f', or raise {threshold} if {_deg(sigma_deg)} is good enough'
 
     def _too_few(self, fit: Fit) -> str:
         """Return what is missing where there is no redundancy, at a start or a later one."""

@@ -28,7 +28,7 @@ from ins_align.imu.recent import AGES, exact, smooth
 import numpy as np
 
 # A delay within these (s) is followed along the recent motion; from there it goes straight on.
-MIN_DELAY, MAX_DELAY = -0.1, AGES[-1]
+EARLIEST, LATEST = -0.1, AGES[-1]
 _EYE = np.eye(3)
 
 
@@ -37,8 +37,8 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool,
     """
     Linearise K epochs.
 
-    It is done at parameters `point`, (M, m), whose delays are alike, and within `MIN_DELAY` and
-    `MAX_DELAY`. Intervals before each epoch are as each of the rivals has them, with leading axes
+    It is done at parameters `point`, (M, m), whose delays are alike, and within `EARLIEST` and
+    `LATEST`. Intervals before each epoch are as each of the rivals has them, with leading axes
     (K, M), and Q, (K, 1, 9, 9), is their covariance of (rotation, velocity, position) in the frame
     at the start. `base` is the position of the vehicle's base in the frame of the IMU, (3,), m.
     """

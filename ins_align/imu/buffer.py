@@ -224,17 +224,19 @@ class ImuBuffer:
         return (self.newest_ns is not None and self.stamps.size > 0
                 and self.newest_ns - self._lateness_ns - int(self.stamps[-1]) > MAX_GAP_NS)
 
-    def rates_since(self, stamp_ns: int) -> tuple[Index, Array, Array]:
+    def rates_since(self, stamp_ns: int) -> tuple[Index, Array, Array, float]:
         """
         Return the angular rates after a stamp, rad/s, without spikes.
 
-        Stamps, shape (N,), rates, (N, 3), and the rate at the stamp itself, (3,).
+        Stamps, shape (N,), rates, (N, 3), the rate at the stamp itself, (3,), and the usual
+        interval between samples, s.
         """
         self.consolidate()
         first = int(np.searchsorted(self.stamps, stamp_ns, side='right'))
         rates = without_spikes(self.stamps, self.samples)[0][:, :3]
         rate = np.array([np.interp(0.0, self.stamps - stamp_ns, axis) for axis in rates.T])
-        return self.stamps[first:], rates[first:], rate
+        usual = 1e-9 * float(np.median(np.diff(self.stamps)))
+        return self.stamps[first:], rates[first:], rate, usual
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop samples that no epoch at or after a stamp looks back at."""
