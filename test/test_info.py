@@ -566,8 +566,8 @@ def test_loops_of_a_walker_are_no_wrong_unit(noise, unit, expected):
     ('uav_thor75', 50.0, 'enu', True, 45.0, {
         'gnss_delay': (0.03, 0.1), 'velocity_std': (0.1, 0.25),
         'velocity_std_vertical': (0.1, 0.35)}),
-    ('car_drive0708', 100.0, 'enu', True, 53.0, {
-        'accel_bias_std': (0.13, 0.15), 'gnss_delay': (0.03, 0.1)}),
+    # Its clocks drift apart, from 0.13 s to 0: no delay is right for all of it.
+    ('car_drive0708', 100.0, 'enu', True, 53.0, {'accel_bias_std': (0.13, 0.15)}),
     ('quad_dot08.bag', 120.5, None, False, 2.7, {})])
 def test_real_recordings(name, rate, frame, rest, first, settings):
     info = inspect(real_recording(name))

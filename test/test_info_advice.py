@@ -142,6 +142,16 @@ def test_delay_of_the_receiver(tmp_path, scenario, arguments, delay):
     assert settings == {}
 
 
+@pytest.mark.parametrize('scenario', ['car', 'launch'])
+def test_clocks_that_drift_apart_have_no_delay_of_their_own(tmp_path, scenario):
+    truth = simulate(scenario, seed=4, duration=150.0)
+    drift = np.linspace(120e6, 0.0, truth.gnss_stamps_ns.size).astype(np.int64)
+    info = inspected(truth, tmp_path / 'a', gnss_stamps_ns=truth.gnss_stamps_ns + drift)
+    assert info.figures['gnss_delay'] == pytest.approx(0.06, abs=0.02)
+    assert 0.03 < info.figures['gnss_delay_std'] < 0.06     # 0.12 / sqrt(12) = 0.035
+    assert 'gnss_delay' not in settings_of(info)
+
+
 @pytest.mark.parametrize('scenario', ['straight', 'static', 'swing', 'car'])
 def test_no_delay_is_told_where_there_is_none_or_no_motion(tmp_path, scenario):
     """The antenna of a boat that yaws on its course moves, and its heading is open."""

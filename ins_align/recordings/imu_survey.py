@@ -343,11 +343,13 @@ def fit_motion(samples: Series, velocities: Series, gravity: float,
     free = np.maximum(3.0 * good.sum(axis=1) - PRIOR_STD.size, 1.0)
     likelihood = (-0.5 * free * np.log(costs))[:, telling]
     delay, std = _maximum(near, likelihood.sum(axis=1))
-    odd, even = (_maximum(near, likelihood[:, half::2].sum(axis=1))[0] for half in (1, 0))
-    std = max(std, 0.5 * abs(odd - even))
     known = (std < MAX_DELAY_STD and np.count_nonzero(telling) >= MIN_WINDOWS
              and 0 < place % DELAYS.size < DELAYS.size - 1)
-    figures = {'gnss_delay': delay, 'gnss_delay_std': std} if known else {}
+    # Of clocks that drift apart the halves of the recording show another delay.
+    halves = [_maximum(near, half.sum(axis=1))[0]
+              for half in np.array_split(likelihood, 2, axis=1)]
+    figures = {'gnss_delay': delay,
+               'gnss_delay_std': max(std, 0.5 * abs(halves[1] - halves[0]))} if known else {}
     # Of windows in motion, if there are: standing, receivers are better than they are.
     chosen = np.hypot(v_n[..., 0], v_n[..., 1]).mean(axis=1) > MOVING
     chosen |= np.count_nonzero(chosen) < MIN_WINDOWS
