@@ -173,7 +173,7 @@ def plot(result: Result) -> Figure:
     _angles(tilt, 'roll, pitch (deg)', series, result, {'roll': 0, 'pitch': 1})
     _angles(yaw, 'yaw (deg, counter-\nclockwise from east)', series, result, {'yaw': 2})
     _sigmas(sigmas, series, result)
-    _innovations(innovations, series, result)
+    _innovations(innovations, series)
     _biases(gyro, 'gyro bias (deg/s)', series.time, np.degrees(series.gyro_bias),
             np.degrees(result.status.gyro_bias_std))
     _biases(accel, 'accelerometer\nbias (m/s\u00b2)', series.time, series.accel_bias,
@@ -283,9 +283,8 @@ def _sigmas(axes: Axes, series: _Series, result: Result) -> None:
         axes.axhline(threshold, color=colour, linestyle='--', linewidth=0.8, label='threshold')
 
 
-def _innovations(axes: Axes, series: _Series, result: Result) -> None:
-    kind = 'velocity' if result.topics and result.topics.velocity else 'position'
-    axes.set_ylabel(f'innovation of the\n{kind} (sigma)')
+def _innovations(axes: Axes, series: _Series) -> None:
+    axes.set_ylabel('innovation of\nthe GNSS (sigma)')
     if not np.isfinite(series.innovations).any():
         return
     # Outliers may be anything: they are drawn at the edge.

@@ -22,7 +22,7 @@ import sys
 
 from alignment import error_of, normalised_error, simulated
 import ins_align
-from ins_align.config import ConfigError
+from ins_align.config import ConfigError, PRESETS
 from ins_align.offline import replay
 from ins_align.results import State
 from ins_align.simulation.simulate import write_bag
@@ -151,6 +151,35 @@ def test_what_is_masked_is_left_out_as_nan_is(flight):
     results = [ins_align.align(stamps, *each, **LEVER) for each in (with_nan, masked)]
     assert results[0].to_json() == results[1].to_json()
     assert results[1].status.counts['velocity_nan'] == 3
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_a_robot_on_a_flat_floor(seed):
+    """Roll and pitch never change, so nothing shows the signs of two gyros: that does no harm."""
+    rate, random = 100, np.random.default_rng(seed)
+    t = np.arange(40 * rate) / rate
+    turn = np.radians(30.0) * np.sin(2 * np.pi * t / 17) * (t > 5)
+    speed = 4.0 * (0.6 + 0.4 * np.sin(2 * np.pi * t / 23)) * np.clip((t - 3) / 2, 0, 1)
+    yaw = np.cumsum(turn) / rate + random.uniform(-3.0, 3.0)
+    zero = np.zeros(t.size)
+    gyro = np.stack([zero, zero, turn], axis=1)
+    accel = np.stack([np.gradient(speed, 1 / rate), speed * turn, zero + 9.81], axis=1)
+    mems = PRESETS['mems']
+    for sensor, bias, walk in ((gyro, mems.gyro_bias_std, mems.angle_random_walk),
+                               (accel, mems.accel_bias_std, mems.velocity_random_walk)):
+        sensor += bias * random.standard_normal(3)
+        sensor += walk * np.sqrt(rate) * random.standard_normal(sensor.shape)
+    v_n = np.stack([speed * np.cos(yaw), speed * np.sin(yaw), zero], axis=1)
+    degrees = np.degrees(np.cumsum(v_n[:, :2], axis=0) / rate / 6.38e6)
+    epochs = slice(None, None, 20)
+    fixes = np.column_stack([t, 48 + degrees[:, 1], 11 + degrees[:, 0] / 0.669, zero])[epochs]
+    velocities = np.column_stack([t, v_n + 0.05 * random.standard_normal(v_n.shape),
+                                  np.full((t.size, 3), 0.05)])[epochs]
+    result = ins_align.align(t, gyro, accel, fixes, velocities, lever_arm_std=0.05)
+    assert result.aligned, result
+    heading = np.degrees(yaw[round(result.current.stamp_ns * 1e-9 * rate)])
+    error = (result.current.yaw_deg - heading + 180.0) % 360.0 - 180.0
+    assert abs(error) < 4.0 * result.current.sigma_deg[2]
 
 
 def test_an_outage_is_in_the_epochs():

@@ -417,7 +417,7 @@ def lines_of(axes):
 def test_figure_shows_innovations_and_biases(result):
     axes = {one.get_ylabel().replace('\n', ' '): one for one in plot(result).axes}
     shown = [epoch for epoch in result.epochs if epoch.current is not None]
-    up = lines_of(axes['innovation of the velocity (sigma)'])['up'].get_ydata()
+    up = lines_of(axes['innovation of the GNSS (sigma)'])['up'].get_ydata()
     tested = [epoch.innovation[2] for epoch in shown if np.isfinite(epoch.innovation).any()]
     assert len(tested) > 100
     assert np.clip(tested, -5.0, 5.0) == pytest.approx(up[np.isfinite(up)].clip(-5.0, 5.0))

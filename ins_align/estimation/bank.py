@@ -119,7 +119,7 @@ class Bank:
         self._start = Start(self._config)
         self._last = epoch                          # the last epoch that was processed
         self._C_nn0 = np.eye(3)
-        self._nis, self._innovation = math.nan, NOTHING_NEW
+        self._innovation = NOTHING_NEW
         self._receiver = ReceiverNoise()
         self._in_a_row = 0                          # epochs that were rejected
         # n0 and the point of linearisation hold for so many epochs, of which so many are left.
@@ -235,7 +235,7 @@ class Bank:
         vehicle = self._vehicle
         filters.propagate(model, k)
         due = vehicle is not None and vehicle.is_due(model.duration[k])
-        self._nis, self._innovation = math.nan, NOTHING_NEW
+        self._innovation = NOTHING_NEW
         kinds = [kind for kind, present in enumerate(measured.present[k]) if present]
         if not kinds:
             return
@@ -250,7 +250,6 @@ class Bank:
         self._offered += 1
         self._rejected[2] += not all(new.taken for new in news)
         self._in_a_row = self._in_a_row + 1 if any(new.fits_none for new in news) else 0
-        self._nis = sum(new.square for new in news) / len(news)
         self._innovation = news[0].normalised
         if vehicle is not None and due:
             vehicle.look(filters, model, k, measured)
@@ -274,8 +273,7 @@ class Bank:
         self._doubt, self._contradicted = (
             '' if self._vehicle is None else self._vehicle.doubt(filters)), False
         if not self._doubt:
-            self._doubt, self._contradicted = self._rivals.doubt(
-                filters, *self._mixture, self._receiver.misfit)
+            self._doubt, self._contradicted = self._rivals.doubt(filters, *self._mixture)
 
     # Start
 
@@ -345,7 +343,7 @@ class Bank:
             self._rivals.table[filters.ids[best]], self._config.imu_noise, x, P)
         if self._vehicle is not None:
             remarks += self._vehicle.in_words(filters)
-        return Fit(self._offered, 3 * (self._offered - either), receiver.misfit, self._nis,
+        return Fit(self._offered, 3 * (self._offered - either), receiver.misfit,
                    self._innovation, velocity, position, either,
                    delay=self._config.gnss_delay + float(x[DELAY]),
                    objection=self._doubt if self._contradicted else '', doubt=self._doubt,

@@ -40,8 +40,6 @@ DELAY_SIGMAS = 3.0
 MAX_SILENCE = 30.0
 # A sigma that after so many seconds is within so many times its threshold may be good enough.
 PATIENCE, ACCEPTABLE = 60.0, 4.0
-# Epochs over which the latest innovations are averaged.
-RECENT = 25
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,6 @@ class Fit:
     offered: int  #: epochs with a measurement, rejected ones included
     rows: int = 0  #: redundant rows; 0 before there is a solution
     misfit: float = math.nan  #: mean square of normalised residuals
-    #: Normalised innovation squared of the last epoch, per row; nan where nothing was tested.
-    nis: float = math.nan
     #: (3,), of the velocity (of the position where only that is used) over its sigma.
     innovation: Array = field(default_factory=lambda: np.full(3, math.nan))
     rejected_velocity: int = 0  #: measurements that were refused as outliers
@@ -78,7 +74,6 @@ class Declaration:
         self._against = ''                  # what spoke against it when it was judged last
         self._contradiction = ''            # when there was redundancy last
         self._offered = 0                   # epochs until then
-        self._recent_nis = 1.0
         self._rejected = 0
         self._time_s = 0.0
 
@@ -91,8 +86,6 @@ class Declaration:
         better move.
         """
         self._time_s = time_s
-        if math.isfinite(fit.nis):
-            self._recent_nis += (min(fit.nis, 10.0) - self._recent_nis) / RECENT
         contradiction = self._contradicted_by(fit)
         if fit.rows >= MIN_ROWS:
             self._contradiction, self._offered = contradiction, fit.offered
@@ -206,9 +199,8 @@ class Declaration:
         if fit.rejected > REJECTED_SHARE * fit.offered:
             return (f'{fit.rejected} of {fit.offered} GNSS epochs do not fit the rest: check the '
                     'velocity frame, the IMU axes and signs, the lever arm, the GNSS delay')
-        misfit = max(fit.misfit, self._recent_nis)
-        if misfit > MAX_MISFIT:
-            return (f'the residuals are {math.sqrt(misfit):.1f} times what the stated noise '
+        if fit.misfit > MAX_MISFIT:
+            return (f'the residuals are {math.sqrt(fit.misfit):.1f} times what the stated noise '
                     'allows: check the lever arm, the GNSS delay, the velocity frame, the IMU '
                     'axes and signs, the covariances that the receiver states')
         return ''

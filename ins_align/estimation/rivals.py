@@ -34,7 +34,7 @@ import numpy as np
 GYRO_MISALIGNMENT, ACCEL_ERRORS = 0.3, 0.3
 # In this time (s) the biases of the accelerometers change by the first share of their sigma, as
 # temperatures do, and the delay by the second: clocks of IMU and GNSS that nothing keeps together.
-WANDER_TIME, ACCEL_WANDER, DELAY_WANDER = 100.0, 0.1, 0.1
+WANDER_TIME, ACCEL_WANDER, DELAY_WANDER = 100.0, 0.1, 0.2
 # Means whose log weight is so much below the likeliest's are dropped, and so are rivals that are
 # wrong; levels stay, for what they assume may become true, but have no part in a mixture. A level
 # stays lower where its accelerometers' biases are less likely than STRAINED (log): it has gone
@@ -42,7 +42,8 @@ WANDER_TIME, ACCEL_WANDER, DELAY_WANDER = 100.0, 0.1, 0.1
 UNLIKELY, HOPELESS, LEAST, STRAINED = 14.0, 25.0, NEGLIGIBLE + 1.0, 8.0
 # Means of a rival that agree to so many sigmas are merged.
 ALIKE = 2.0
-# A wrong rival that is likely has to give the same attitude, to so many sigmas.
+# A wrong rival that is likely has to give the same attitude, to so many sigmas: on a flat floor
+# nothing ever shows the signs of two gyros.
 HARMLESS = 1.0
 # A setting is named for a bias that is so many times what is configured, without so many of its
 # own sigmas. One beyond 4 sigmas of the worst level is none: something else is wrong.
@@ -168,20 +169,19 @@ class Rivals:
             filters.keep(keep)
         filters.merge(ALIKE)
 
-    def doubt(self, filters: Filters, mean: Array, P: Array, misfit: float) -> tuple[str, bool]:
+    def doubt(self, filters: Filters, mean: Array, P: Array) -> tuple[str, bool]:
         """
         Hear the rivals that are wrong, in filters of the same table with their mixture.
 
-        `misfit` is the mean square of normalised innovations. Returns why a heading is not to be
-        declared, or '', and whether the data fit better with one of them.
+        Returns why a heading is not to be declared, or '', and whether the data fit better with
+        one of them.
         """
         wrong = self._wrong[filters.ids]
         if not wrong.any():
             return '', False
         # How much likelier each of them is than all levels.
         level = filters.evidence
-        ahead = np.where(wrong, level, -np.inf)
-        ahead = (ahead - log_sum(level[filters.counts])) / max(misfit, 1.0)
+        ahead = np.where(wrong, level - log_sum(level[filters.counts]), -np.inf)
         if not np.any(ahead > -MARGIN):
             return '', False
         C = np.stack([filters.C0[filters.lead], filters.C[filters.lead]], axis=1)
@@ -193,7 +193,7 @@ class Rivals:
         # A sensor worse than configured is unlikely before the data, and no error of the user's:
         # who accuses has to fit better than any level does.
         fits = np.max((level - self.prior[filters.ids])[filters.counts])
-        if level[worst] - fits > MARGIN * max(misfit, 1.0):
+        if level[worst] - fits > MARGIN:
             return in_words(self.table[filters.ids[worst]], filters.x[filters.lead[worst]],
                             self._gnss_delay), True
         rival = self.table[filters.ids[worst]]
