@@ -433,6 +433,17 @@ def test_wrong_signs_are_named_and_not_declared(turning, rival):
     assert rival.better in status.reason and rival.advice in status.reason
 
 
+@pytest.mark.parametrize('seed', [5, pytest.param(1, marks=pytest.mark.campaign)])
+def test_a_chip_that_stood_for_a_minute(seed):
+    """Its gyros turn every heading away by more than errors of a heading can be linearised."""
+    s = simulated('car', imu_grade='chip', duration=100.0, seed=seed, stand_still=60.0)
+    _, epochs = aligned(s, imu_grade='chip', tilt_std_threshold=1.0, heading_std_threshold=2.0,
+                        lever_arm_std=0.3, gnss_delay_std=0.03)
+    declared = [epoch for epoch in epochs if epoch.state in (State.ALIGNED, State.LEVELLED)]
+    assert len(declared) > 50
+    assert max(normalised_error(epoch.current, s) for epoch in declared) < chi2.ppf(0.9999, 3)
+
+
 @pytest.mark.parametrize('coarse', [{'quantum': (0.01, 0.0)}, {'dead_band': (0.0087, 0.0)}])
 def test_coarse_gyros_are_no_wrong_axes(coarse):
     _, epochs = aligned(simulated('flight', seed=7, duration=45.0, stand_still=20.0, **coarse))

@@ -30,7 +30,7 @@ from ins_align.estimation.linearised import EARLIEST, LATEST, linearised
 from ins_align.estimation.receiver import MOVING, ReceiverNoise
 from ins_align.estimation.rivals import level_in_words, Parameters, Rivals, SHARE
 from ins_align.estimation.start import (
-    all_headings, HEADINGS, OPEN_POSITION, RoughAttitude, Start, STEP_STD)
+    all_headings, draw_anew, HEADINGS, OPEN_POSITION, RoughAttitude, Start)
 from ins_align.estimation.states import (
     biases, DELAY, FIRST, GYRO, Linearised, Measured, OF_VEHICLE, triads)
 from ins_align.estimation.track import InertialTrack
@@ -254,7 +254,7 @@ class Bank:
         if vehicle is not None and due:
             vehicle.look(filters, model, k, measured)
         self._rivals.select(filters)
-        filters.draw_anew(HEADINGS, STEP_STD)
+        draw_anew(filters)
 
     def _drop_vehicle(self, filters: Filters) -> bool:
         """Assume nothing of the vehicle any more where the motion contradicts it."""

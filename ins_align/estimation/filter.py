@@ -28,7 +28,6 @@ Neither their propagation, which is exact but for noise, nor a measurement's der
 attitude, so all means that differ in their heading share one covariance (docs, "Theory").
 """
 
-import math
 from typing import NamedTuple
 
 from ins_align.estimation.states import (
@@ -52,14 +51,11 @@ NEGLIGIBLE, CLOSE, SETTLED = 12.0, 0.01, 1e-8
 NO_TURN = 1e-3
 # A rate that is not known turns biases of the accelerometers against the tilt that they look like:
 # an error of second order. What is known of them is lost at the rate's variance times this (s).
-TURNING = 30.0
+TURNING = 90.0
 # An epoch speaks of the heading alone where the tilt's sigma is at most this share of the
 # heading's. Information on it (1/rad^2) that is less than the second is none; what epochs say less
 # than chance, the next ones may say more, at most the third.
 TILT_KNOWN, NO_NEWS, MOST_OWED = 0.5, 1e-9, 2.0
-# Headings all round whose log weights differ by less than the first are as likely; they are drawn
-# anew when each has become as uncertain as the second (rad).
-EVEN, BLURRED = 1.0, 0.2
 # What is beyond first order in an innovation counts from so much of the receiver's noise on.
 BENT = 0.05
 _EYE = np.eye(3)
@@ -168,10 +164,12 @@ class Filters:
         if not self.single:
             self.lead = np.lexsort((-self.weight, self.rival))[self.first]
 
-    def keep(self, means: np.ndarray) -> None:
-        """Keep some of the means, and the rivals that have any."""
+    def keep(self, means: np.ndarray, weight: Array | None = None) -> None:
+        """Keep some of the means, a mask or places, and the rivals that have any."""
         for name in self._OF_MEANS:
             setattr(self, name, getattr(self, name)[means])
+        if weight is not None:
+            self.weight = weight
         left = np.isin(self.ids, self.rival)
         if not left.all():
             for name in self._OF_RIVALS:
@@ -325,14 +323,14 @@ class Filters:
         lead, before = self.lead, self.P
         up = self.C[lead][:, 2]
         self._reduce(test, taken, lead)
-        column, variance = _of_heading(self.P, up)
+        column, variance = of_heading(self.P, up)
         tilt = np.trace(self.P[:, PHI, PHI], axis1=1, axis2=2) - variance
         heard = taken & (tilt < TILT_KNOWN ** 2 * variance)
         if not heard.any():
             return np.zeros(len(lead)), None
         W = test.inverse[lead] @ noise[lead]
         chance = self.owed + np.trace(W - W @ W, axis1=1, axis2=2)
-        said = np.maximum(1 / variance - 1 / _of_heading(before, up)[1], NO_NEWS)
+        said = np.maximum(1 / variance - 1 / of_heading(before, up)[1], NO_NEWS)
         gone = heard * np.clip(chance, 0.0, said)
         self.owed = np.where(heard, np.minimum(chance - gone, MOST_OWED), self.owed)
         self.P += (gone / (1 - gone * variance))[:, None, None] * (
@@ -396,36 +394,6 @@ class Filters:
         self.P[:, RHO] = self.P[:, :, RHO] = 0.0
         self.P[:, RHO, RHO] = std ** 2 * _EYE
 
-    def draw_anew(self, headings: int, std: float) -> None:
-        """
-        Draw the headings of rivals anew that have so many all round, none likelier than another.
-
-        Where the vehicle turns to is not known, each mean becomes blurred. As all are as likely,
-        this says nothing of the rest: they are sharp again, and evenly spaced.
-        """
-        if self.single:
-            return
-        lead = self.lead
-        up, up0 = self.C[lead][:, 2], self.C0[lead][:, 2]
-        column, variance = _of_heading(self.P, up)
-        fresh = ((np.bincount(self.rival)[self.ids] == headings) & (variance > BLURRED ** 2)
-                 & (self.weight[lead] - np.minimum.reduceat(self.weight, self.first) < EVEN))
-        if not fresh.any():
-            return
-        turn = np.zeros(column.shape)
-        turn[:, PHI], turn[:, PHI0] = up, up0
-        turn, column, variance = turn[fresh], column[fresh], variance[fresh]
-        shared = turn[:, :, None] * column[:, None]
-        self.P[fresh] += ((variance + std ** 2)[:, None, None] * (turn[:, :, None] * turn[:, None])
-                          - shared - shared.swapaxes(1, 2))
-        for first, i in zip(self.first[fresh], lead[fresh]):
-            means = slice(first, first + headings)
-            away = log_so3(self.C[means] @ self.C[i].T)[:, 2]
-            even = 2 * math.pi / headings * (np.arange(headings) + first - i)
-            turned = exp_so3((even - away)[:, None] * _EYE[2])
-            self.C[means], self.C0[means] = turned @ self.C[means], turned @ self.C0[means]
-            self.weight[means] = -math.log(headings)
-
     def merge(self, alike: float) -> None:
         """Merge the means of each rival that are all within so many sigmas of the likeliest."""
         if self.single:
@@ -485,7 +453,7 @@ class Filters:
         return mean, (share @ covariance.reshape(2, -1, 9)).reshape(2, 3, 3)
 
 
-def _of_heading(P: Array, up: Array) -> tuple[Array, Array]:
+def of_heading(P: Array, up: Array) -> tuple[Array, Array]:
     """Return its covariance with all errors, shape (M, n), and its variance, (M,)."""
     column = apply(P[:, :, PHI], up)
     return column, np.einsum('ij,ij->i', up, column[:, PHI])

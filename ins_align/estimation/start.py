@@ -23,11 +23,13 @@ import math
 from typing import NamedTuple
 
 from ins_align.config import Config
+from ins_align.estimation.filter import Filters, of_heading
 from ins_align.estimation.moments import AttitudeMoments
 from ins_align.estimation.receiver import LEAST_NOISE, LOUD, MOVING, QUIET
 from ins_align.estimation.states import FIRST, PHI, PHI0, RHO, XI
 from ins_align.estimation.track import InertialTrack
-from ins_align.geometry.rotation import apply, Array, cross, cumulative_rotations, exp_so3, Index
+from ins_align.geometry.rotation import (
+    apply, Array, cross, cumulative_rotations, exp_so3, Index, log_so3)
 from ins_align.gnss.messages import (
     AntennaEpoch, NO_VERTICAL, UNKNOWN_ALTITUDE_STD, velocities_of)
 from ins_align.imu.preintegration import Intervals
@@ -48,6 +50,9 @@ OUTLYING = 20.0
 # to be flat to a tenth, and narrow, for errors of a heading are linearised.
 HEADINGS = 72
 STEP_STD = 0.4 * 2 * math.pi / HEADINGS
+_EVEN = 2 * math.pi / HEADINGS * np.arange(HEADINGS)[:, None]
+# Headings are drawn anew when each has become as uncertain as this (rad).
+BLURRED = 0.2
 TILT_STD = math.radians(10.0)
 # What is not known of velocity and position at first (m/s, m); of a velocity whose horizontal
 # part is measured, the vertical is known better.
@@ -211,7 +216,45 @@ def all_headings(rough: RoughAttitude, accel_sign: float) -> Array:
         # With the accelerations reversed it is half a turn about any axis across.
         across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
         C = C @ exp_so3(math.pi * across / np.linalg.norm(across))
-    return C @ exp_so3(2 * math.pi / HEADINGS * np.arange(HEADINGS)[:, None] * axis)
+    return C @ exp_so3(_EVEN * axis)
+
+
+def draw_anew(filters: Filters) -> None:
+    """
+    Draw headings all round anew for the rivals whose headings have become blurred.
+
+    Where the vehicle turns to is not known, each mean becomes blurred, and errors of a heading are
+    linearised. The new ones are sharp and evenly spaced. What was known of the heading, which the
+    gyros have not kept, is given up, and says nothing of the rest.
+    """
+    if filters.single:
+        return
+    lead, P = filters.lead, filters.P
+    up, up0 = filters.C[lead][:, 2], filters.C0[lead][:, 2]
+    column, variance = of_heading(P, up)
+    blurred = (np.bincount(filters.rival)[filters.ids] > 1) & (variance > BLURRED ** 2)
+    if not blurred.any():
+        return
+    turn = np.zeros(column.shape)
+    turn[:, PHI], turn[:, PHI0] = up, up0
+    shared = turn[:, :, None] * column[:, None]
+    P += blurred[:, None, None] * (
+        (variance + STEP_STD ** 2)[:, None, None] * (turn[:, :, None] * turn[:, None])
+        - shared - shared.swapaxes(1, 2))
+    # Each comes from the old one that is likeliest to be turned to it.
+    source, weight = (np.split(values, filters.first[1:])
+                      for values in (np.arange(len(filters.C)), filters.weight))
+    angle = [np.zeros(old.size) for old in source]
+    for m in np.flatnonzero(blurred):
+        old = source[m]
+        away = _EVEN - log_so3(filters.C[old] @ filters.C[lead[m]].T)[:, 2]
+        away = np.remainder(away + math.pi, 2 * math.pi) - math.pi
+        likeliest = np.argmax(weight[m] - 0.5 * away ** 2 / variance[m], axis=1)
+        source[m], angle[m] = old[likeliest], away[np.arange(HEADINGS), likeliest]
+        weight[m] = np.full(HEADINGS, -math.log(HEADINGS))
+    filters.keep(np.concatenate(source), np.concatenate(weight))
+    turned = exp_so3(np.concatenate(angle)[:, None] * np.array([0.0, 0.0, 1.0]))
+    filters.C, filters.C0 = turned @ filters.C, turned @ filters.C0
 
 
 def _measured(epoch: AntennaEpoch) -> bool:

@@ -33,6 +33,7 @@ from ins_align.experiments.common import (
     aligned_row, Case, Groups, JsonDict, parallel, Report, run_case, run_cases)
 from ins_align.experiments.spoilt import directions, GNSS, Random, SECOND, Stream
 from ins_align.geometry.rotation import Array
+from ins_align.recordings.imu_survey import CHIP_THRESHOLDS
 from ins_align.simulation.simulate import gauss_markov
 import numpy as np
 
@@ -198,6 +199,8 @@ def _late_gyros(stream: Stream, random: Random) -> None:
 CAR, FLIGHT, HOVER, LAUNCH = (((scenario, 'mems'),)
                               for scenario in ('car', 'flight', 'hover', 'launch'))
 MIXED = tuple(product(('flight', 'car', 'hover'), ('mems', 'tactical')))
+CHIPS = tuple((scenario, 'chip') for scenario in ('car', 'flight', 'launch', 'hover'))
+OF_CHIPS = {'imu_grade': 'chip', **CHIP_THRESHOLDS}
 TOLD = {'gnss_delay_std': 0.0, 'lever_arm_std': 0.05}
 LONG, LATER, HOURS = {'duration': 120.0}, {'duration': 150.0}, {'duration': 900.0}
 EXACT = {'velocity_std': 0.0}           # noise is added by what spoils it
@@ -209,6 +212,10 @@ BUMPY = {'duration': 390.0, 'stand_still': 300.0, 'gnss_delay': 0.15}
 SPOTS = tuple(case._replace(simulate={'duration': DURATION, **case.simulate}) for case in (
     Case('nothing wrong', MIXED),
     Case('a throw, nothing wrong', LAUNCH),
+    Case('a chip, nothing wrong', CHIPS, None, {}, OF_CHIPS),
+    *(Case(f'a chip, {rest:g} s at rest before', CHIPS, None,
+           {'duration': rest + 90.0, 'stand_still': rest}, OF_CHIPS, part=part)
+      for rest, part in ((20.0, 1), (120.0, 2))),
     # Told wrongly
     Case('told for certain, and right', MIXED, config=TOLD),
     *(Case(f'told for certain, delay {by:g} s off', MIXED, simulate={'gnss_delay': by},
