@@ -165,7 +165,7 @@ class Filters:
             self.lead = np.lexsort((-self.weight, self.rival))[self.first]
 
     def keep(self, means: np.ndarray, weight: Array | None = None) -> None:
-        """Keep some of the means, a mask or places, and the rivals that have any."""
+        """Keep means, by a mask or by places that may repeat, and the rivals that have any."""
         for name in self._OF_MEANS:
             setattr(self, name, getattr(self, name)[means])
         if weight is not None:
