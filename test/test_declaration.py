@@ -13,7 +13,6 @@
 # limitations under the License.
 """When something is declared, held back and withdrawn, and the words for it."""
 
-
 from ins_align.config import Config
 from ins_align.estimation.declaration import Declaration, Fit
 from ins_align.results import State, Verdict

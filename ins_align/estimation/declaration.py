@@ -156,24 +156,23 @@ class Declaration:
         if fit.rows < MIN_ROWS:
             return Verdict(State.ALIGNING, self._too_few(fit))
         if tilt > config.tilt_std_threshold and not self.levelled:
-            return Verdict(State.ALIGNING,
-                           f'tilt sigma {_above(tilt, config.tilt_std_threshold)}: wait, or turn '
-                           f'or change speed{self._or_raise("tilt", tilt)}{fit.remarks}')
+            return Verdict(State.ALIGNING, self._too_large(
+                'tilt', tilt, 'wait, or turn or change speed') + fit.remarks)
         state = State.LEVELLED if self.levelled else State.ALIGNING
         if heading > config.heading_std_threshold:
-            return Verdict(state, f'heading sigma {_above(heading, config.heading_std_threshold)}'
-                                  f': turn or change speed{self._or_raise("heading", heading)}'
-                                  f'{fit.remarks}')
+            return Verdict(state, self._too_large(
+                'heading', heading, 'turn or change speed') + fit.remarks)
         return Verdict(state, f'heading sigma {_deg(heading)} is good enough: it has to hold '
                               f'for {config.hold_time:g} s')
 
-    def _or_raise(self, name: str, sigma_deg: float) -> str:
-        """Return what else leads on where a sigma does not get much better than it is."""
-        threshold = f'{name}_std_threshold'
-        if (self._time_s < PATIENCE
-                or sigma_deg > ACCEPTABLE * getattr(self.config, threshold)):
-            return ''
-        return f', or raise {threshold} if {_deg(sigma_deg)} is good enough'
+    def _too_large(self, name: str, sigma_deg: float, advice: str) -> str:
+        """Return what leads on; after a while also that the sigma may be good enough as it is."""
+        parameter = f'{name}_std_threshold'
+        threshold_deg = getattr(self.config, parameter)
+        words = f'{name} sigma {_above(sigma_deg, threshold_deg)}: {advice}'
+        if self._time_s >= PATIENCE and sigma_deg <= ACCEPTABLE * threshold_deg:
+            words += f', or raise {parameter} if {_deg(sigma_deg)} is good enough'
+        return words
 
     def _too_few(self, fit: Fit) -> str:
         """Return what is missing where there is no redundancy, at a start or a later one."""

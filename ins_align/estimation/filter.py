@@ -164,12 +164,10 @@ class Filters:
         if not self.single:
             self.lead = np.lexsort((-self.weight, self.rival))[self.first]
 
-    def keep(self, means: np.ndarray, weight: Array | None = None) -> None:
+    def keep(self, means: np.ndarray) -> None:
         """Keep means, by a mask or by places that may repeat, and the rivals that have any."""
         for name in self._OF_MEANS:
             setattr(self, name, getattr(self, name)[means])
-        if weight is not None:
-            self.weight = weight
         left = np.isin(self.ids, self.rival)
         if not left.all():
             for name in self._OF_RIVALS:

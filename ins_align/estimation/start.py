@@ -50,10 +50,10 @@ OUTLYING = 20.0
 # to be flat to a tenth, and narrow, for errors of a heading are linearised.
 HEADINGS = 72
 STEP_STD = 0.4 * 2 * math.pi / HEADINGS
-_EVEN = 2 * math.pi / HEADINGS * np.arange(HEADINGS)[:, None]
+TILT_STD = math.radians(10.0)
 # Headings are drawn anew when each has become as uncertain as this (rad).
 BLURRED = 0.2
-TILT_STD = math.radians(10.0)
+_EVEN = 2 * math.pi / HEADINGS * np.arange(HEADINGS)[:, None]
 # What is not known of velocity and position at first (m/s, m); of a velocity whose horizontal
 # part is measured, the vertical is known better.
 OPEN_VELOCITY, OPEN_POSITION, STEADY_VELOCITY = 1e3, 1e4, 10.0
@@ -242,17 +242,16 @@ def draw_anew(filters: Filters) -> None:
         (variance + STEP_STD ** 2)[:, None, None] * (turn[:, :, None] * turn[:, None])
         - shared - shared.swapaxes(1, 2))
     # Each comes from the old one that is likeliest to be turned to it.
-    source, weight = (np.split(values, filters.first[1:])
-                      for values in (np.arange(len(filters.C)), filters.weight))
+    source = np.split(np.arange(len(filters.C)), filters.first[1:])
     angle = [np.zeros(old.size) for old in source]
     for m in np.flatnonzero(blurred):
         old = source[m]
         away = _EVEN - log_so3(filters.C[old] @ filters.C[lead[m]].T)[:, 2]
         away = np.remainder(away + math.pi, 2 * math.pi) - math.pi
-        likeliest = np.argmax(weight[m] - 0.5 * away ** 2 / variance[m], axis=1)
+        likeliest = np.argmax(filters.weight[old] - 0.5 * away ** 2 / variance[m], axis=1)
         source[m], angle[m] = old[likeliest], away[np.arange(HEADINGS), likeliest]
-        weight[m] = np.full(HEADINGS, -math.log(HEADINGS))
-    filters.keep(np.concatenate(source), np.concatenate(weight))
+    filters.weight = np.where(blurred[filters.place], -math.log(HEADINGS), filters.weight)
+    filters.keep(np.concatenate(source))
     turned = exp_so3(np.concatenate(angle)[:, None] * np.array([0.0, 0.0, 1.0]))
     filters.C, filters.C0 = turned @ filters.C, turned @ filters.C0
 
