@@ -104,7 +104,8 @@ class Listener:
         rclpy.init(context=self._context)
         self.node = rclpy.create_node(name, context=self._context)
         self.attitudes, self.statuses, self.diagnostics, self.imus = [], [], [], []
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        # A queue of one would keep the last of two attitudes when a busy machine holds us up.
+        latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         for msg_type, topic, store, qos in (
                 (QuaternionStamped, f'{namespace}/ins_align/initial_attitude', self.attitudes,
                  latched),

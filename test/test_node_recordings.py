@@ -40,6 +40,7 @@ def test_recording(name, start, duration, parameters, tmp_path):
     script = bag_script(bag, start, duration)
     fixes = sum(topic == '/fix' for _, topic, _, _ in script)
     with Listener() as listener, running_node([*overrides(parameters), *RELIABLE]):
+        listener.wait_for(lambda: listener.statuses)  # we have found each other
         play(script, tmp_path, RATE)
         listener.wait_for(lambda: listener.count('fix') == fixes)
         listener.wait_for_next_status()
