@@ -304,7 +304,8 @@ class Filters:
     def _reduce(self, test: _Test, taken: np.ndarray, lead: Index) -> None:
         """Take off the covariances what was measured of the means that lead."""
         HP, inverse = test.HP[lead], test.inverse[lead]
-        self.P = self.P - HP.swapaxes(1, 2) @ (inverse * taken[:, None, None]) @ HP
+        P = self.P - HP.swapaxes(1, 2) @ (inverse * taken[:, None, None]) @ HP
+        self.P = 0.5 * (P + P.swapaxes(1, 2))       # or rounding grows
 
     def _learn(self, test: _Test, noise: Array,
                taken: np.ndarray) -> 'tuple[Array, Array | None]':
@@ -376,7 +377,6 @@ class Filters:
 
     def turned(self, C_nn0: Array, s_v: Array, s_p: Array) -> None:
         """Go on in another n0; its axes, and what an antenna that rests has there of s."""
-        self.P = 0.5 * (self.P + self.P.swapaxes(1, 2))     # or rounding grows
         self.C = C_nn0 @ self.C
         self.u, self.w = (self.u - s_v) @ C_nn0.T, (self.w - s_p) @ C_nn0.T
 

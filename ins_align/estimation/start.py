@@ -35,8 +35,9 @@ from ins_align.gnss.messages import (
 from ins_align.imu.preintegration import Intervals
 import numpy as np
 
-# A start takes so many epochs, fewer leave the formula no redundancy, and waits for no more.
-FIRST_EPOCHS, MAX_WAITING = 4, 64
+# A start takes so many epochs, fewer leave the formula no redundancy, and waits for no more. What
+# positions with a noise of some metres say grows with the square of the time that they span.
+FIRST_EPOCHS, MAX_WAITING = 4, 256
 # The vector from which a bank starts is so many times its noise.
 START_RATIO = 20.0
 # Epochs whose sigma is so many times that of the best say nothing to a start.
@@ -46,6 +47,8 @@ UNCERTAIN = 10.0
 LONG_ENOUGH = 1.0
 # One epoch is an outlier if it is so unlike the others: F statistic of its residuals over theirs.
 OUTLYING = 20.0
+TOO_NOISY = ('{epochs} GNSS epochs in {seconds:.0f} s are too noisy to start with: fewer epochs a '
+             'second, which are waited for longer, would do')
 # Headings, every five degrees, and their sigma (rad): wide enough for the sum of their densities
 # to be flat to a tenth, and narrow, for errors of a heading are linearised.
 HEADINGS = 72
@@ -155,12 +158,16 @@ class Start:
     @property
     def lacks(self) -> str:
         """Return in words what these epochs do not have and a start needs, or ''."""
-        if not self.epochs or any(
+        epochs = self.epochs
+        if epochs and not any(
                 epoch.v_n is not None
                 or epoch.position_covariance[2, 2] < UNKNOWN_ALTITUDE_STD ** 2
-                for epoch in self.epochs):
+                for epoch in epochs):
+            return NO_VERTICAL
+        if len(epochs) < MAX_WAITING:
             return ''
-        return NO_VERTICAL
+        seconds = (epochs[-1].stamp_ns - epochs[0].stamp_ns) * 1e-9
+        return TOO_NOISY.format(seconds=seconds, epochs=len(epochs))
 
     def _pairs(self, kind: int) -> tuple[Array, Array, Array]:
         """Return the times and the vectors of the formula, free start, for all epochs."""
