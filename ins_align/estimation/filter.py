@@ -24,15 +24,22 @@ whose measurements are late by its delay sees. Errors are
     C_true = C exp(phi)    u_true = u + C J xi    w_true = w + C J rho    C0_true = C0 exp(phi0)
 
 with J the left Jacobian of SO(3) at phi: (phi, xi, rho) is the logarithm of an error in SE2(3).
-Neither their propagation, which is exact but for noise, nor a measurement's derivative holds an
-attitude, so all means that differ in their heading share one covariance (docs, "Theory").
+Biases of gyros and accelerometers turn with it,
+
+    b_true = b + exp(-phi) db    a_true = a + g - exp(-phi) (g - da + phi x g)
+
+with g the force at rest: what the mean makes of it, C (g - da + phi x g), holds whatever phi is. So
+it should where da is open and that is known; where da is known, g counts for nothing. Neither the propagation of errors, which is exact but for noise, nor a
+measurement's derivative holds an attitude, so all means that differ in their heading share one
+covariance (docs, "Theory").
 """
 
 from typing import NamedTuple
 
+from ins_align.config import STANDARD_GRAVITY
 from ins_align.estimation.states import (
     biases, FIRST, GYRO, Linearised, Measured, PHI, PHI0, RHO, XI)
-from ins_align.geometry.rotation import apply, Array, exp_so3, Index, log_so3, skew
+from ins_align.geometry.rotation import apply, Array, cross, exp_so3, Index, log_so3, skew
 import numpy as np
 
 # Normalised innovation squared of three rows above which a measurement is an outlier: one good
@@ -52,9 +59,9 @@ NO_TURN = 1e-3
 # A rate that is not known turns biases of the accelerometers against the tilt that they look like:
 # an error of second order. What is known of them is lost at the rate's variance times this (s).
 TURNING = 90.0
-# An epoch speaks of the heading alone where the tilt's sigma is at most this share of the
-# heading's. Information on it (1/rad^2) that is less than the second is none; what epochs say less
-# than chance, the next ones may say more, at most the third.
+# An epoch speaks of the heading alone where the sigma of the tilt that the accelerometers show is
+# at most this share of the heading's. Information on it (1/rad^2) that is less than the second is
+# none; what epochs say less than chance, the next ones may say more, at most the third.
 TILT_KNOWN, NO_NEWS, MOST_OWED = 0.5, 1e-9, 2.0
 # What is beyond first order in an innovation counts from so much of the receiver's noise on.
 BENT = 0.05
@@ -139,6 +146,8 @@ class Filters:
         accel = biases(x.size)[1]
         self.accel_expected = x[accel]
         self.accel_variance = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, accel].copy()
+        self._turned = np.r_[:FIRST, FIRST + np.r_[biases(x.size)]]
+        self._felt = np.r_[PHI, self._turned[-3:]]
         self._find_places()
 
     # Which mean is whose, and how likely
@@ -323,8 +332,7 @@ class Filters:
         up = self.C[lead][:, 2]
         self._reduce(test, taken, lead)
         column, variance = of_heading(self.P, up)
-        tilt = np.trace(self.P[:, PHI, PHI], axis1=1, axis2=2) - variance
-        heard = taken & (tilt < TILT_KNOWN ** 2 * variance)
+        heard = taken & (self._apparent_tilt() < TILT_KNOWN ** 2 * variance)
         if not heard.any():
             return np.zeros(len(lead)), None
         W = test.inverse[lead] @ noise[lead]
@@ -337,6 +345,21 @@ class Filters:
         feigned = gone / said
         return feigned, (feigned / variance)[:, None] * column
 
+    def _apparent_tilt(self) -> Array:
+        """Return the variance, (M,), of the tilt that the accelerometers show."""
+        across = skew(self.C[self.lead, 2])
+        felt = np.concatenate([across, np.broadcast_to(_EYE / STANDARD_GRAVITY, across.shape)], 2)
+        tilt = across @ felt
+        P = self.P[:, self._felt[:, None], self._felt]
+        return np.einsum('mij,mij->m', tilt @ P, tilt)
+
+    def _turning_force(self) -> Array:
+        """Return the force at rest, (B, 3), as far as a bias that turns with a tilt is in it."""
+        accel = self._felt[3:]
+        open_bias = self.P[:, accel, accel].sum(axis=1)
+        share = open_bias / (open_bias + STANDARD_GRAVITY ** 2 * self._apparent_tilt())
+        return STANDARD_GRAVITY * share[self.place, None] * self.C[:, 2]
+
     def _move(self, test: _Test, use: np.ndarray, lead: Index,
               back: Array | None = None) -> None:
         """
@@ -348,28 +371,42 @@ class Filters:
         if back is not None:
             heading = np.einsum('bi,bi->b', d[:, PHI], self.C[:, 2])
             d = d - heading[:, None] * back[self.place]
-        half = self._shift(d)[:, lead]
-        d = d[lead]
-        if not test.second_order and max(np.abs(d[:, PHI]).max(),
-                                         np.abs(d[:, PHI0]).max()) < NO_TURN:
+        if not test.second_order and max(np.abs(d[lead, PHI]).max(),
+                                         np.abs(d[lead, PHI0]).max()) < NO_TURN:
+            self._shift(d)
             return
-        # exp(d)^-1 exp(d + e) ~ exp(G e)
-        G = np.zeros((len(d), FIRST, FIRST))
-        G[:, PHI, PHI], G[:, PHI0, PHI0] = half.swapaxes(2, 3)
-        G[:, XI, XI] = G[:, RHO, RHO] = G[:, PHI, PHI]
+        rest = self._turning_force()
+        half = self._shift(d, rest)[:, lead]
+        d = d[lead]
+        # exp(d)^-1 exp(d + e) ~ exp(G e), of the errors that turn
+        G = np.zeros((len(d), FIRST + 6, FIRST + 6))
+        back, back0 = half.swapaxes(2, 3)
+        G[:, PHI, PHI], G[:, PHI0, PHI0] = back, back0
+        G[:, XI, XI] = G[:, RHO, RHO] = back
         G[:, XI, PHI], G[:, RHO, PHI] = -0.5 * skew(d[:, XI]), -0.5 * skew(d[:, RHO])
-        rows = G @ self.P[:, :FIRST]
-        self.P[:, :FIRST] = rows
-        self.P[:, FIRST:, :FIRST] = rows[:, :, FIRST:].swapaxes(1, 2)
-        self.P[:, :FIRST, :FIRST] = rows[:, :, :FIRST] @ G.swapaxes(1, 2)
+        G[:, FIRST:-3, FIRST:-3] = G[:, -3:, -3:] = back @ back
+        G[:, -3:, PHI] = back @ back @ skew(rest[lead]) @ (_EYE - half[0])
+        turned = self._turned
+        self.P[:, turned] = G @ self.P[:, turned]
+        self.P[:, :, turned] = self.P[:, :, turned] @ G.swapaxes(1, 2)
 
-    def _shift(self, d: Array) -> Array:
-        """Correct the means by errors, shape (B, n); return half of their turns, now and at t0."""
+    def _shift(self, d: Array, rest: 'Array | None' = None) -> Array:
+        """
+        Correct the means by errors, shape (B, n); return half of their turns, now and at t0.
+
+        Biases turn with them where `rest` is given, as `_turning_force` returns it.
+        """
         half = exp_so3(0.5 * np.stack([d[:, PHI], d[:, PHI0]]))
         turn, turn0 = half @ half
         moved = d[:, 3:9].reshape(-1, 2, 3) @ (self.C @ half[0]).swapaxes(1, 2)     # half[0] ~ J
         self.u, self.w = self.u + moved[:, 0], self.w + moved[:, 1]
-        self.x = self.x + d[:, FIRST:]
+        x = d[:, FIRST:]
+        if rest is not None:
+            x, back = x.copy(), turn.swapaxes(1, 2)
+            gyro, accel = biases(x.shape[1])
+            x[:, gyro] = apply(back, x[:, gyro])
+            x[:, accel] = rest - apply(back, rest - x[:, accel] + cross(d[:, PHI], rest))
+        self.x = self.x + x
         self.C, self.C0 = self.C @ turn, self.C0 @ turn0
         return half
 
@@ -415,7 +452,7 @@ class Filters:
         merged = leads[near]
         d = np.zeros_like(away)
         d[merged] = mean[near]
-        self._shift(d)
+        self._shift(d, self._turning_force())
         self.weight[merged] = 0.0
         kept = ~near[place]
         kept[merged] = True
