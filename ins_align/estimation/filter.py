@@ -28,10 +28,10 @@ Biases of gyros and accelerometers turn with it,
 
     b_true = b + exp(-phi) db    a_true = a + g - exp(-phi) (g - da + phi x g)
 
-with g the force at rest: what the mean makes of it, C (g - da + phi x g), holds whatever phi is. So
-it should where da is open and that is known; where da is known, g counts for nothing. Neither the propagation of errors, which is exact but for noise, nor a
-measurement's derivative holds an attitude, so all means that differ in their heading share one
-covariance (docs, "Theory").
+with g the force at rest: what the mean makes of it, C (g - da + phi x g), holds whatever phi is. That
+is so where da is open; the better it is known, the less g counts. Neither the propagation of errors,
+which is exact but for noise, nor a measurement's derivative holds an attitude, so all means that
+differ in their heading share one covariance (docs, "Theory").
 """
 
 from typing import NamedTuple
@@ -146,7 +146,7 @@ class Filters:
         accel = biases(x.size)[1]
         self.accel_expected = x[accel]
         self.accel_variance = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, accel].copy()
-        self._turned = np.r_[:FIRST, FIRST + np.r_[biases(x.size)]]
+        self._turned = np.r_[:FIRST, FIRST + np.r_[biases(x.size)]]     # errors that turn
         self._felt = np.r_[PHI, self._turned[-3:]]
         self._find_places()
 
@@ -378,7 +378,7 @@ class Filters:
         rest = self._turning_force()
         half = self._shift(d, rest)[:, lead]
         d = d[lead]
-        # exp(d)^-1 exp(d + e) ~ exp(G e), of the errors that turn
+        # exp(d)^-1 exp(d + e) ~ exp(G e)
         G = np.zeros((len(d), FIRST + 6, FIRST + 6))
         back, back0 = half.swapaxes(2, 3)
         G[:, PHI, PHI], G[:, PHI0, PHI0] = back, back0
@@ -386,9 +386,8 @@ class Filters:
         G[:, XI, PHI], G[:, RHO, PHI] = -0.5 * skew(d[:, XI]), -0.5 * skew(d[:, RHO])
         G[:, FIRST:-3, FIRST:-3] = G[:, -3:, -3:] = back @ back
         G[:, -3:, PHI] = back @ back @ skew(rest[lead]) @ (_EYE - half[0])
-        turned = self._turned
-        self.P[:, turned] = G @ self.P[:, turned]
-        self.P[:, :, turned] = self.P[:, :, turned] @ G.swapaxes(1, 2)
+        self.P[:, self._turned] = G @ self.P[:, self._turned]
+        self.P[:, :, self._turned] = self.P[:, :, self._turned] @ G.swapaxes(1, 2)
 
     def _shift(self, d: Array, rest: 'Array | None' = None) -> Array:
         """
