@@ -28,10 +28,9 @@ Biases of gyros and accelerometers turn with it,
 
     b_true = b + exp(-phi) db    a_true = a + g - exp(-phi) (g - da + phi x g)
 
-with g the force at rest: what the mean makes of it, C (g - da + phi x g), holds whatever phi is. That
-is so where da is open; the better it is known, the less g counts. Neither the propagation of errors,
-which is exact but for noise, nor a measurement's derivative holds an attitude, so all means that
-differ in their heading share one covariance (docs, "Theory").
+with g the force at rest as far as da is open: what a mean makes of it, C (g - da + phi x g), holds
+whatever phi is. Neither the propagation of errors, exact but for noise, nor the derivative of a
+measurement holds an attitude: means that differ in their heading share one covariance.
 """
 
 from typing import NamedTuple
@@ -356,8 +355,8 @@ class Filters:
     def _turning_force(self) -> Array:
         """Return the force at rest, (B, 3), as far as a bias that turns with a tilt is in it."""
         accel = self._felt[3:]
-        open_bias = self.P[:, accel, accel].sum(axis=1)
-        share = open_bias / (open_bias + STANDARD_GRAVITY ** 2 * self._apparent_tilt())
+        bias = self.P[:, accel, accel].sum(axis=1)
+        share = bias / (bias + STANDARD_GRAVITY ** 2 * self._apparent_tilt())
         return STANDARD_GRAVITY * share[self.place, None] * self.C[:, 2]
 
     def _move(self, test: _Test, use: np.ndarray, lead: Index,
