@@ -516,6 +516,50 @@ def test_a_chip_at_rest_is_no_surer_of_its_tilt_than_of_its_accelerometers():
     assert least > 0.8 * np.degrees(PRESETS['chip'].accel_bias_std / STANDARD_GRAVITY)
 
 
+def test_a_chip_at_rest_knows_no_rate_about_the_vertical():
+    """Noise that looks like a turn must not say that there is one, however quiet the receiver."""
+    s = simulated('static', imu_grade='chip', duration=40.0, seed=1, gnss_rate=10.0, imu_rate=50.0,
+                  velocity_std=0.02)
+    aligner, epochs = aligned(s, imu_grade='chip')
+    assert aligner.status().gyro_bias_std[2] > 0.7 * PRESETS['chip'].gyro_bias_std
+    assert min(epoch.current.sigma_deg[2] for epoch in epochs if epoch.current) > 90.0
+
+
+def test_a_tilt_and_a_bias_that_are_known_together_stay_so():
+    """A bias of 0.5 m/s^2 is a tilt whose square counts beside velocities of 0.02 m/s."""
+    s = simulated('hover', imu_grade='chip', duration=60.0, seed=6, gnss_rate=10.0,
+                  imu_rate=50.0, velocity_std=0.02)
+    _, epochs = aligned(s, imu_grade='chip')
+    errors = [normalised_error(epoch.current, s) / 3 for epoch in epochs
+              if epoch.current and epoch.current.sigma_deg[2] < 5.0]
+    assert len(errors) > 100
+    assert np.mean(errors) < 2.0
+
+
+@pytest.mark.filterwarnings('error')
+def test_covariances_stay_positive_with_sharp_positions_at_20_hz():
+    """An asymmetry from rounding grew 15 times an epoch at a start; then came NaN."""
+    s = simulated('swing', imu_grade='navigation', duration=20.0, stand_still=3.0, gnss_rate=20.0,
+                  position_std=0.02, lever_arm=(8.0, 5.0, -5.0))
+    _, epochs = aligned(s, velocity=False, use_velocity=False)
+    for epoch in epochs:
+        if epoch.current:
+            assert np.linalg.eigvalsh(epoch.current.covariance)[0] > 0
+
+
+def test_coarse_positions_at_10_hz_start():
+    """What they say of the attitude grows with the square of the time, not with their number."""
+    s = simulated('static', duration=15.0, gnss_rate=10.0, imu_rate=50.0, position_std=5.0)
+    _, epochs = aligned(s, velocity=False, use_velocity=False)
+    assert 5.0 < next(epoch.t_s for epoch in epochs if epoch.current) < 10.0
+
+
+def test_positions_too_coarse_to_start_say_so():
+    s = simulated('static', duration=10.0, gnss_rate=50.0, imu_rate=50.0, position_std=20.0)
+    aligner, _ = aligned(s, velocity=False, use_velocity=False)
+    assert 'too noisy to start with' in aligner.status().reason
+
+
 @pytest.mark.parametrize('gnss_rate, seed', (
     (1.0, 1), *(pytest.param(2.0, seed, marks=pytest.mark.campaign) for seed in (1, 3))))
 def test_five_minutes_at_rest_do_not_spoil_the_drive_after_them(gnss_rate, seed):
