@@ -103,7 +103,8 @@ class Aligner:
         self._last_ns: int | None = None            # the last epoch since t0; None before it
         self._start_ns = self._measured_ns = 0      # t0 before it moves; the last measurement
         self._without_velocity = False              # though velocities came
-        self._verdict = Verdict(State.WAITING_FOR_IMU, 'no IMU sample yet')
+        since = 'since it started over' if self._started_over else 'yet'
+        self._verdict = Verdict(State.WAITING_FOR_IMU, f'no IMU sample {since}')
         self._time_to_align_s: float | None = None
         self._initial: Attitude | None = None
         self._current: Attitude | None = None

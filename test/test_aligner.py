@@ -202,6 +202,7 @@ def test_reset_starts_over(flight):
     status = aligner.status()
     assert status.state is State.WAITING_FOR_IMU and status.initial is None
     assert aligner.declared is None and status.counts['resets'] == 1
+    assert status.reason == 'no IMU sample since it started over'
     assert aligner.take_events()[-1] == (Severity.WARNING, 'alignment starts over: test')
     epochs = feed_part(aligner, flight, 15.0)
     assert aligner.status().t0_ns > flight.imu_stamps_ns[0] + 14 * SECOND
