@@ -24,20 +24,20 @@ whose measurements are late by its delay sees. Errors are
     C_true = C exp(phi)    u_true = u + C J xi    w_true = w + C J rho    C0_true = C0 exp(phi0)
 
 with J the left Jacobian of SO(3) at phi: (phi, xi, rho) is the logarithm of an error in SE2(3).
-Biases of gyros and accelerometers turn with it,
+Lever arm and biases of gyros and accelerometers turn with it,
 
-    b_true = b + exp(-phi) db    a_true = a + g - exp(-phi) (g - da + phi x g)
+    l_true = l + exp(-phi) dl   b_true = b + exp(-phi) db   a_true = a + g - exp(-phi) (g - alpha)
 
-with g the force at rest as far as da is open: what a mean makes of it, C (g - da + phi x g), holds
-whatever phi is. Neither the propagation of errors, exact but for noise, nor the derivative of a
-measurement holds an attitude: means that differ in their heading share one covariance.
+with alpha = da - phi x g and g the force at rest, as far as da is open: what a mean makes of that
+force, and where the antenna is, holds whatever phi is. Neither the propagation of errors nor the
+derivative of a measurement holds an attitude, so all headings share one covariance ("Theory").
 """
 
 from typing import NamedTuple
 
 from ins_align.config import STANDARD_GRAVITY
 from ins_align.estimation.states import (
-    biases, FIRST, GYRO, Linearised, Measured, PHI, PHI0, RHO, XI)
+    biases, FIRST, GYRO, LEVER_ARM, Linearised, Measured, PHI, PHI0, RHO, XI)
 from ins_align.geometry.rotation import apply, Array, cross, exp_so3, Index, log_so3, skew
 import numpy as np
 
@@ -55,8 +55,8 @@ FITS = 3.0
 NEGLIGIBLE, CLOSE, SETTLED = 12.0, 0.01, 1e-8
 # Corrections so small (rad) leave the axes of the errors as they are.
 NO_TURN = 1e-3
-# A rate that is not known turns biases of the accelerometers against the tilt that they look like:
-# an error of second order. What is known of them is lost at the rate's variance times this (s).
+# A rate that is not known turns biases of the accelerometers against the tilt that they look like.
+# What is known of them is lost at the rate's variance times this (s).
 TURNING = 90.0
 # An epoch speaks of the heading alone where the sigma of the tilt that the accelerometers show is
 # at most this share of the heading's. Information on it (1/rad^2) that is less than the second is
@@ -120,8 +120,7 @@ class Filters:
     owed : ndarray, shape (M,)
         Information on the heading, 1/rad^2, that epochs to come may give by chance besides.
     accel_expected, accel_variance : ndarray, shapes (3,) and (M, 3)
-        Biases of the accelerometers, m/s^2, as they are expected before the data, and their
-        variances, (m/s^2)^2.
+        Biases of the accelerometers before the data, m/s^2, and their variances, (m/s^2)^2.
     place : ndarray of int, shape (B,), or slice
         The place in `ids` of each mean's rival; all of them where each rival has one mean.
     lead : ndarray of int, shape (M,)
@@ -145,7 +144,7 @@ class Filters:
         accel = biases(x.size)[1]
         self.accel_expected = x[accel]
         self.accel_variance = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, accel].copy()
-        self._turned = np.r_[:FIRST, FIRST + np.r_[biases(x.size)]]     # errors that turn
+        self._turned = np.r_[:FIRST, FIRST + np.r_[(LEVER_ARM, *biases(x.size))]]
         self._felt = np.r_[PHI, self._turned[-3:]]
         self._find_places()
 
@@ -354,8 +353,7 @@ class Filters:
 
     def _turning_force(self) -> Array:
         """Return the force at rest, (B, 3), as far as a bias that turns with a tilt is in it."""
-        accel = self._felt[3:]
-        bias = self.P[:, accel, accel].sum(axis=1)
+        bias = self.P[:, self._felt[3:], self._felt[3:]].sum(axis=1)
         share = bias / (bias + STANDARD_GRAVITY ** 2 * self._apparent_tilt())
         return STANDARD_GRAVITY * share[self.place, None] * self.C[:, 2]
 
@@ -378,12 +376,13 @@ class Filters:
         half = self._shift(d, rest)[:, lead]
         d = d[lead]
         # exp(d)^-1 exp(d + e) ~ exp(G e)
-        G = np.zeros((len(d), FIRST + 6, FIRST + 6))
-        back, back0 = half.swapaxes(2, 3)
-        G[:, PHI, PHI], G[:, PHI0, PHI0] = back, back0
+        G = np.zeros((len(d), FIRST + 9, FIRST + 9))
+        back = half[0].swapaxes(1, 2)
+        G[:, PHI, PHI], G[:, PHI0, PHI0] = half.swapaxes(2, 3)
         G[:, XI, XI] = G[:, RHO, RHO] = back
         G[:, XI, PHI], G[:, RHO, PHI] = -0.5 * skew(d[:, XI]), -0.5 * skew(d[:, RHO])
-        G[:, FIRST:-3, FIRST:-3] = G[:, -3:, -3:] = back @ back
+        for k in range(FIRST, FIRST + 9, 3):
+            G[:, k:k + 3, k:k + 3] = back @ back
         G[:, -3:, PHI] = back @ back @ skew(rest[lead]) @ (_EYE - half[0])
         self.P[:, self._turned] = G @ self.P[:, self._turned]
         self.P[:, :, self._turned] = self.P[:, :, self._turned] @ G.swapaxes(1, 2)
@@ -392,7 +391,7 @@ class Filters:
         """
         Correct the means by errors, shape (B, n); return half of their turns, now and at t0.
 
-        Biases turn with them where `rest` is given, as `_turning_force` returns it.
+        Parameters turn with them where `rest` is given, as `_turning_force` returns it.
         """
         half = exp_so3(0.5 * np.stack([d[:, PHI], d[:, PHI0]]))
         turn, turn0 = half @ half
@@ -402,13 +401,14 @@ class Filters:
         if rest is not None:
             x, back = x.copy(), turn.swapaxes(1, 2)
             gyro, accel = biases(x.shape[1])
+            x[:, LEVER_ARM] = apply(back, x[:, LEVER_ARM])
             x[:, gyro] = apply(back, x[:, gyro])
             x[:, accel] = rest - apply(back, rest - x[:, accel] + cross(d[:, PHI], rest))
         self.x = self.x + x
         self.C, self.C0 = self.C @ turn, self.C0 @ turn0
         return half
 
-    # What does not depend on a measurement
+    # Without a measurement
 
     def turned(self, C_nn0: Array, s_v: Array, s_p: Array) -> None:
         """Go on in another n0; its axes, and what an antenna that rests has there of s."""
