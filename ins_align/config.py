@@ -71,6 +71,8 @@ PRESETS = {
     # zero-rate 1 deg/s, 0.014 deg/s/sqrt(Hz). Soldering and temperature come on top.
     'chip': _imu_noise(0.9, 0.27, 1.0, 0.5, 0.03, 0.45),
 }
+# What a chip reaches in a minute or two of turns, deg.
+CHIP_THRESHOLDS = {'tilt_std_threshold': 1.0, 'heading_std_threshold': 2.0}
 
 
 def _parameter(default: Any, description: str, unit: str = '', minimum: float | None = None,

@@ -28,12 +28,11 @@ import math
 from pathlib import Path
 from typing import Any
 
-from ins_align.config import PRESETS
+from ins_align.config import CHIP_THRESHOLDS, PRESETS
 from ins_align.experiments.common import (
     aligned_row, Case, Groups, JsonDict, parallel, Report, run_case, run_cases)
 from ins_align.experiments.spoilt import directions, GNSS, Random, SECOND, Stream
 from ins_align.geometry.rotation import Array
-from ins_align.recordings.imu_survey import CHIP_THRESHOLDS
 from ins_align.simulation.simulate import gauss_markov
 import numpy as np
 

@@ -27,7 +27,7 @@ import math
 from typing import NamedTuple
 
 from ins_align.checks import ANY_GYRO_RATE, degrees_fault
-from ins_align.config import Config, ImuNoise, PRESETS
+from ins_align.config import CHIP_THRESHOLDS, Config, ImuNoise, PRESETS
 from ins_align.estimation.receiver import MOVING
 from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, skew
@@ -48,8 +48,6 @@ MIN_REST = 5.0  # s
 ON_LATTICE = 0.1  # of a quantum: how far a value may be off its multiples
 MIN_REPEATS = 3  # samples for each value: with fewer the digits of a text may be the quantum
 MIN_ZEROS, MIN_ZERO_SHARE = 20, 0.01  # samples that are exactly 0 because of a dead band
-# What a chip reaches in a minute or two of turns, deg.
-CHIP_THRESHOLDS = {'tilt_std_threshold': 1.0, 'heading_std_threshold': 2.0}
 
 CELL = 0.05  # s over which the IMU is integrated at a time
 FIT_WINDOW, MIN_EPOCHS = 10.0, 20  # s and GNSS epochs in a window
