@@ -536,6 +536,15 @@ def test_a_tilt_and_a_bias_that_are_known_together_stay_so():
     assert np.mean(errors) < 2.0
 
 
+@pytest.mark.parametrize('grade', ['navigation', 'mems'])
+def test_a_lever_arm_is_not_shown_at_rest(grade):
+    """Nor does it, unknown by a metre, feign a heading beside positions of 2 cm at 20 Hz."""
+    s = simulated('static', imu_grade=grade, duration=10.0, gnss_rate=20.0, position_std=0.02)
+    aligner, epochs = aligned(s, velocity=False, use_velocity=False, lever_arm_std=1.0)
+    assert min(aligner.status().lever_arm_std) > 0.9
+    assert min(epoch.current.sigma_deg[2] for epoch in epochs if epoch.current) > 75.0
+
+
 @pytest.mark.filterwarnings('error')
 def test_covariances_stay_positive_with_sharp_positions_at_20_hz():
     """An asymmetry from rounding grew 15 times an epoch at a start; then came NaN."""

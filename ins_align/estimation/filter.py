@@ -24,21 +24,18 @@ whose measurements are late by its delay sees. Errors are
     C_true = C exp(phi)    u_true = u + C J xi    w_true = w + C J rho    C0_true = C0 exp(phi0)
 
 with J the left Jacobian of SO(3) at phi: (phi, xi, rho) is the logarithm of an error in SE2(3).
-Lever arm and biases of gyros and accelerometers turn with it,
-
-    l_true = l + exp(-phi) dl   b_true = b + exp(-phi) db   a_true = a + g - exp(-phi) (g - alpha)
-
-with alpha = da - phi x g and g the force at rest, as far as da is open: what a mean makes of that
-force, and where the antenna is, holds whatever phi is. Neither the propagation of errors nor the
-derivative of a measurement holds an attitude, so all headings share one covariance ("Theory").
+Lever arm and biases turn with the attitude (`states.turned_parameters`). Neither the propagation
+of errors, which is exact but for noise, nor a measurement's derivative holds an attitude, so all
+means that differ in their heading share one covariance (docs, "Theory").
 """
 
 from typing import NamedTuple
 
 from ins_align.config import STANDARD_GRAVITY
 from ins_align.estimation.states import (
-    biases, FIRST, GYRO, LEVER_ARM, Linearised, Measured, PHI, PHI0, RHO, XI)
-from ins_align.geometry.rotation import apply, Array, cross, exp_so3, Index, log_so3, skew
+    biases, FIRST, GYRO, Linearised, Measured, PHI, PHI0, RHO, transport, turned_parameters,
+    turning)
+from ins_align.geometry.rotation import apply, Array, exp_so3, Index, log_so3, skew
 import numpy as np
 
 # Normalised innovation squared of three rows above which a measurement is an outlier: one good
@@ -144,7 +141,7 @@ class Filters:
         accel = biases(x.size)[1]
         self.accel_expected = x[accel]
         self.accel_variance = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, accel].copy()
-        self._turned = np.r_[:FIRST, FIRST + np.r_[(LEVER_ARM, *biases(x.size))]]
+        self._turned = turning(x.size)
         self._felt = np.r_[PHI, self._turned[-3:]]
         self._find_places()
 
@@ -327,7 +324,7 @@ class Filters:
         of a correction goes back for each radian that it turns the heading, (M, n) or None.
         """
         lead, before = self.lead, self.P
-        up = self.C[lead][:, 2]
+        up = self.C[lead, 2]
         self._reduce(test, taken, lead)
         column, variance = of_heading(self.P, up)
         heard = taken & (self._apparent_tilt() < TILT_KNOWN ** 2 * variance)
@@ -375,15 +372,7 @@ class Filters:
         rest = self._turning_force()
         half = self._shift(d, rest)[:, lead]
         d = d[lead]
-        # exp(d)^-1 exp(d + e) ~ exp(G e)
-        G = np.zeros((len(d), FIRST + 9, FIRST + 9))
-        back = half[0].swapaxes(1, 2)
-        G[:, PHI, PHI], G[:, PHI0, PHI0] = half.swapaxes(2, 3)
-        G[:, XI, XI] = G[:, RHO, RHO] = back
-        G[:, XI, PHI], G[:, RHO, PHI] = -0.5 * skew(d[:, XI]), -0.5 * skew(d[:, RHO])
-        for k in range(FIRST, FIRST + 9, 3):
-            G[:, k:k + 3, k:k + 3] = back @ back
-        G[:, -3:, PHI] = back @ back @ skew(rest[lead]) @ (_EYE - half[0])
+        G = transport(d, half, rest[lead])
         self.P[:, self._turned] = G @ self.P[:, self._turned]
         self.P[:, :, self._turned] = self.P[:, :, self._turned] @ G.swapaxes(1, 2)
 
@@ -397,13 +386,7 @@ class Filters:
         turn, turn0 = half @ half
         moved = d[:, 3:9].reshape(-1, 2, 3) @ (self.C @ half[0]).swapaxes(1, 2)     # half[0] ~ J
         self.u, self.w = self.u + moved[:, 0], self.w + moved[:, 1]
-        x = d[:, FIRST:]
-        if rest is not None:
-            x, back = x.copy(), turn.swapaxes(1, 2)
-            gyro, accel = biases(x.shape[1])
-            x[:, LEVER_ARM] = apply(back, x[:, LEVER_ARM])
-            x[:, gyro] = apply(back, x[:, gyro])
-            x[:, accel] = rest - apply(back, rest - x[:, accel] + cross(d[:, PHI], rest))
+        x = d[:, FIRST:] if rest is None else turned_parameters(d, half[0], rest)
         self.x = self.x + x
         self.C, self.C0 = self.C @ turn, self.C0 @ turn0
         return half

@@ -20,7 +20,7 @@ A leaf of the imports: places, shapes and names that the modules of the estimati
 from dataclasses import dataclass
 import math
 
-from ins_align.geometry.rotation import Array
+from ins_align.geometry.rotation import apply, Array, cross, Index, skew
 import numpy as np
 
 # Places in the error state; the parameters follow from FIRST on: lever arm, delay, errors of the
@@ -44,6 +44,54 @@ def biases(m: int) -> tuple[slice, slice]:
     """Return the places of the biases of gyros and accelerometers among m parameters."""
     gyro, accel = (slice(triad.start, triad.start + 3) for triad in triads(m))
     return gyro, accel
+
+
+def turning(m: int) -> Index:
+    """Return the places, (21,), of the errors that turn with the attitude, of m parameters."""
+    return np.r_[:FIRST, FIRST + np.r_[(LEVER_ARM, *biases(m))]]
+
+
+def turned_parameters(d: Array, half: Array, rest: Array) -> Array:
+    """
+    Return by how much errors d, (B, n), change the parameters, (B, m).
+
+    `half` is half of the turn by phi, (B, 3, 3). Lever arms and biases turn with it,
+
+        l_true = l + J(-phi) dl
+        b_true = b + exp(-phi) db
+        a_true = a + g - exp(-phi) (g - da + phi x g)
+
+    with g the force at rest, `rest`, (B, 3): where the antenna is, and what a mean makes of rate
+    and force at rest, is then linear in the errors, however large phi is.
+    """
+    back = half.swapaxes(1, 2)
+    x = d[:, FIRST:].copy()
+    gyro, accel = biases(x.shape[1])
+    x[:, LEVER_ARM] = apply(back, x[:, LEVER_ARM])          # J(-phi) ~ exp(-phi / 2)
+    x[:, gyro] = apply(back @ back, x[:, gyro])
+    x[:, accel] = rest - apply(back @ back, rest - x[:, accel] + cross(d[:, PHI], rest))
+    return x
+
+
+def transport(d: Array, half: Array, rest: Array) -> Array:
+    """
+    Return G of ``exp(d)^-1 exp(d + e) ~ exp(G e)``, (B, 21, 21), of the errors of `turning`.
+
+    `half` has half of the turns by phi and phi0, (2, B, 3, 3); the rest as `turned_parameters`.
+    """
+    G = np.zeros((len(d), FIRST + 9, FIRST + 9))
+    back = half[0].swapaxes(1, 2)
+    G[:, PHI, PHI], G[:, PHI0, PHI0] = half.swapaxes(2, 3)
+    lever, gyro, accel = (slice(FIRST + k, FIRST + k + 3) for k in (0, 3, 6))
+    of_lever, *of_biases = (slice(FIRST + place.start, FIRST + place.stop)
+                            for place in (LEVER_ARM, *biases(d.shape[1] - FIRST)))
+    for rows, sign, errors in (XI, -0.5, XI), (RHO, -0.5, RHO), (lever, 0.5, of_lever):
+        G[:, rows, rows], G[:, rows, PHI] = back, sign * skew(d[:, errors])
+    for rows, errors, force in zip((gyro, accel), of_biases, (np.zeros(rest.shape), rest)):
+        now = apply(back @ back, force - d[:, errors] + cross(d[:, PHI], force))
+        G[:, rows, rows] = back @ back
+        G[:, rows, PHI] = back @ back @ skew(force) - skew(now) @ back
+    return G
 
 
 def log_sum(values: Array) -> float:
