@@ -54,7 +54,7 @@ NEGLIGIBLE, CLOSE, SETTLED = 12.0, 0.01, 1e-8
 NO_TURN = 1e-3
 # A rate that is not known turns biases of the accelerometers against the tilt that they look like.
 # What is known of them is lost at the rate's variance times this (s).
-TURNING = 90.0
+TURNING = 30.0
 # An epoch speaks of the heading alone where the sigma of the tilt that the accelerometers show is
 # at most this share of the heading's. Information on it (1/rad^2) that is less than the second is
 # none; what epochs say less than chance, the next ones may say more, at most the third.
