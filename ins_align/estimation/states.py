@@ -58,17 +58,17 @@ def turned_parameters(d: Array, half: Array, rest: Array) -> Array:
     `half` is half of the turn by phi, (B, 3, 3). Lever arms and biases turn with it,
 
         l_true = l + J(-phi) dl
-        b_true = b + exp(-phi) db
+        b_true = b + J(-phi) db
         a_true = a + g - exp(-phi) (g - da + phi x g)
 
-    with g the force at rest, `rest`, (B, 3): where the antenna is, and what a mean makes of rate
-    and force at rest, is then linear in the errors, however large phi is.
+    with g the force at rest, `rest`, (B, 3): where the antenna is, how the attitude at t0 follows
+    from that now, and what a mean makes of the force at rest, is then linear in the errors.
     """
     back = half.swapaxes(1, 2)
     x = d[:, FIRST:].copy()
     gyro, accel = biases(x.shape[1])
-    x[:, LEVER_ARM] = apply(back, x[:, LEVER_ARM])          # J(-phi) ~ exp(-phi / 2)
-    x[:, gyro] = apply(back @ back, x[:, gyro])
+    for place in LEVER_ARM, gyro:
+        x[:, place] = apply(back, x[:, place])              # J(-phi) ~ exp(-phi / 2)
     x[:, accel] = rest - apply(back @ back, rest - x[:, accel] + cross(d[:, PHI], rest))
     return x
 
@@ -82,15 +82,13 @@ def transport(d: Array, half: Array, rest: Array) -> Array:
     G = np.zeros((len(d), FIRST + 9, FIRST + 9))
     back = half[0].swapaxes(1, 2)
     G[:, PHI, PHI], G[:, PHI0, PHI0] = half.swapaxes(2, 3)
-    lever, gyro, accel = (slice(FIRST + k, FIRST + k + 3) for k in (0, 3, 6))
-    of_lever, *of_biases = (slice(FIRST + place.start, FIRST + place.stop)
-                            for place in (LEVER_ARM, *biases(d.shape[1] - FIRST)))
-    for rows, sign, errors in (XI, -0.5, XI), (RHO, -0.5, RHO), (lever, 0.5, of_lever):
-        G[:, rows, rows], G[:, rows, PHI] = back, sign * skew(d[:, errors])
-    for rows, errors, force in zip((gyro, accel), of_biases, (np.zeros(rest.shape), rest)):
-        now = apply(back @ back, force - d[:, errors] + cross(d[:, PHI], force))
-        G[:, rows, rows] = back @ back
-        G[:, rows, PHI] = back @ back @ skew(force) - skew(now) @ back
+    places = turning(d.shape[1] - FIRST)
+    for k, sign in (3, -0.5), (6, -0.5), (12, 0.5), (15, 0.5):
+        rows = slice(k, k + 3)
+        G[:, rows, rows], G[:, rows, PHI] = back, sign * skew(d[:, places[rows]])
+    now = apply(back @ back, rest - d[:, places[-3:]] + cross(d[:, PHI], rest))
+    G[:, -3:, -3:] = back @ back
+    G[:, -3:, PHI] = back @ back @ skew(rest) - skew(now) @ back
     return G
 
 
