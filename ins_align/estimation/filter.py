@@ -141,8 +141,8 @@ class Filters:
         accel = biases(x.size)[1]
         self.accel_expected = x[accel]
         self.accel_variance = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, accel].copy()
-        self._turned = turning(x.size)
-        self._felt = np.r_[PHI, self._turned[-3:]]
+        self._turning = turning(x.size)
+        self._felt = np.r_[PHI, self._turning[-3:]]
         self._find_places()
 
     # Which mean is whose, and how likely
@@ -373,8 +373,8 @@ class Filters:
         half = self._shift(d, rest)[:, lead]
         d = d[lead]
         G = transport(d, half, rest[lead])
-        self.P[:, self._turned] = G @ self.P[:, self._turned]
-        self.P[:, :, self._turned] = self.P[:, :, self._turned] @ G.swapaxes(1, 2)
+        self.P[:, self._turning] = G @ self.P[:, self._turning]
+        self.P[:, :, self._turning] = self.P[:, :, self._turning] @ G.swapaxes(1, 2)
 
     def _shift(self, d: Array, rest: 'Array | None' = None) -> Array:
         """
