@@ -371,8 +371,7 @@ class Filters:
             return
         rest = self._turning_force()
         half = self._shift(d, rest)[:, lead]
-        d = d[lead]
-        G = transport(d, half, rest[lead])
+        G = transport(d[lead][:, self._turning], half, rest[lead])
         self.P[:, self._turning] = G @ self.P[:, self._turning]
         self.P[:, :, self._turning] = self.P[:, :, self._turning] @ G.swapaxes(1, 2)
 

@@ -69,26 +69,31 @@ def turned_parameters(d: Array, half: Array, rest: Array) -> Array:
     gyro, accel = biases(x.shape[1])
     for place in LEVER_ARM, gyro:
         x[:, place] = apply(back, x[:, place])              # J(-phi) ~ exp(-phi / 2)
-    x[:, accel] = rest - apply(back @ back, rest - x[:, accel] + cross(d[:, PHI], rest))
+    x[:, accel] = rest - _felt(d[:, PHI], x[:, accel], back, rest)
     return x
+
+
+def _felt(phi: Array, d_accel: Array, back: Array, rest: Array) -> Array:
+    """Return what is felt at rest when the mean has been corrected, (B, 3)."""
+    return apply(back @ back, rest - d_accel + cross(phi, rest))
 
 
 def transport(d: Array, half: Array, rest: Array) -> Array:
     """
     Return G of ``exp(d)^-1 exp(d + e) ~ exp(G e)``, (B, 21, 21), of the errors of `turning`.
 
-    `half` has half of the turns by phi and phi0, (2, B, 3, 3); the rest as `turned_parameters`.
+    d, (B, 21), are those alone. `half` has half of the turns by phi and phi0, (2, B, 3, 3); `rest`
+    is as in `turned_parameters`.
     """
-    G = np.zeros((len(d), FIRST + 9, FIRST + 9))
+    G = np.zeros((*d.shape, d.shape[1]))
     back = half[0].swapaxes(1, 2)
     G[:, PHI, PHI], G[:, PHI0, PHI0] = half.swapaxes(2, 3)
-    places = turning(d.shape[1] - FIRST)
-    for k, sign in (3, -0.5), (6, -0.5), (12, 0.5), (15, 0.5):
-        rows = slice(k, k + 3)
-        G[:, rows, rows], G[:, rows, PHI] = back, sign * skew(d[:, places[rows]])
-    now = apply(back @ back, rest - d[:, places[-3:]] + cross(d[:, PHI], rest))
-    G[:, -3:, -3:] = back @ back
-    G[:, -3:, PHI] = back @ back @ skew(rest) - skew(now) @ back
+    lever, gyro, accel = slice(12, 15), slice(15, 18), slice(18, 21)
+    for rows, sign in (XI, -0.5), (RHO, -0.5), (lever, 0.5), (gyro, 0.5):
+        G[:, rows, rows], G[:, rows, PHI] = back, sign * skew(d[:, rows])
+    G[:, accel, accel] = back @ back
+    G[:, accel, PHI] = (back @ back @ skew(rest)
+                        - skew(_felt(d[:, PHI], d[:, accel], back, rest)) @ back)
     return G
 
 
