@@ -21,6 +21,7 @@ from alignment import (
 from dense_solution import dense_solution
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config, PRESETS, STANDARD_GRAVITY
+from ins_align.estimation import rivals
 from ins_align.estimation.bank import Bank, RESOLVED_STD
 from ins_align.estimation.filter import Filters
 from ins_align.estimation.linearised import linearised
@@ -296,8 +297,13 @@ def test_blocks_of_any_length_give_the_same(scenario, changes):
 
 @pytest.mark.parametrize('scenario, grade', [
     ('flight', 'mems'), ('car', 'mems'), ('launch', 'tactical'), ('hover', 'mems')])
-def test_no_sigma_steps_up(scenario, grade):
-    """Nothing is lost without an outage and an outlier; a heading is found, and stays."""
+def test_no_sigma_steps_up(scenario, grade, monkeypatch):
+    """
+    Nothing is lost without an outage and an outlier; a heading is found, and stays.
+
+    A worse level of the IMU that becomes likelier is no loss: there is one level here.
+    """
+    monkeypatch.setattr(rivals, 'LEVELS', rivals.LEVELS[:1])
     s = simulated(scenario, imu_grade=grade, duration=60.0, seed=2)
     bank, epochs, imu = prepared(s, lever_arm_std=1.0, gnss_delay_std=0.1)
     before, rejected, compared = None, 0, 0
@@ -307,7 +313,7 @@ def test_no_sigma_steps_up(scenario, grade):
             continue
         now = np.concatenate([sigmas(bank.initial()), sigmas(bank.current())])
         if before is not None and bank.fit().rejected == rejected:
-            assert np.all(now < 1.15 * before), now / before
+            assert np.all(now < 1.08 * before), now / before
             compared += 1
         before, rejected = now, bank.fit().rejected
     assert compared > 200
@@ -543,6 +549,17 @@ def test_a_lever_arm_is_not_shown_at_rest(grade):
     aligner, epochs = aligned(s, velocity=False, use_velocity=False, lever_arm_std=1.0)
     assert min(aligner.status().lever_arm_std) > 0.9
     assert min(epoch.current.sigma_deg[2] for epoch in epochs if epoch.current) > 75.0
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_lever_arm_that_swings_does_not_show_a_tilt(seed):
+    """In a hover, unknown by a metre, beside positions of 2 cm at 20 Hz; the bias hides a tilt."""
+    s = simulated('hover', imu_grade='chip', duration=10.0, gnss_rate=20.0, position_std=0.02,
+                  lever_arm=(0.3, 0.3, 0.3), seed=seed)
+    _, epochs = aligned(s, use_position=True, lever_arm_std=1.0)
+    at_5_s = next(epoch.current for epoch in epochs if epoch.t_s > 5.0)
+    # The Cramer-Rao bound of an IMU that has no errors but biases is 2.8 deg.
+    assert min(at_5_s.sigma_deg[:2]) > 2.0
 
 
 @pytest.mark.filterwarnings('error')

@@ -24,7 +24,7 @@ whose measurements are late by its delay sees. Errors are
     C_true = C exp(phi)    u_true = u + C J xi    w_true = w + C J rho    C0_true = C0 exp(phi0)
 
 with J the left Jacobian of SO(3) at phi: (phi, xi, rho) is the logarithm of an error in SE2(3).
-Lever arm and biases turn with the attitude (`states.turned_parameters`). Neither the propagation
+Biases of the accelerometers turn with the attitude (`states.turned_parameters`). Neither the propagation
 of errors, which is exact but for noise, nor a measurement's derivative holds an attitude, so all
 means that differ in their heading share one covariance (docs, "Theory").
 """
@@ -33,8 +33,8 @@ from typing import NamedTuple
 
 from ins_align.config import STANDARD_GRAVITY
 from ins_align.estimation.states import (
-    biases, FIRST, GYRO, Linearised, Measured, PHI, PHI0, RHO, transport, turned_parameters,
-    turning)
+    biases, FIRST, GYRO, LEVER_ARM, Linearised, Measured, PHI, PHI0, RHO, transport,
+    turned_parameters)
 from ins_align.geometry.rotation import apply, Array, exp_so3, Index, log_so3, skew
 import numpy as np
 
@@ -59,6 +59,8 @@ TURNING = 30.0
 # at most this share of the heading's. Information on it (1/rad^2) that is less than the second is
 # none; what epochs say less than chance, the next ones may say more, at most the third.
 TILT_KNOWN, NO_NEWS, MOST_OWED = 0.5, 1e-9, 2.0
+# What the product of two errors does lasts so long (s).
+PRODUCT_TIME = 0.5
 # What is beyond first order in an innovation counts from so much of the receiver's noise on.
 BENT = 0.05
 _EYE = np.eye(3)
@@ -141,8 +143,8 @@ class Filters:
         accel = biases(x.size)[1]
         self.accel_expected = x[accel]
         self.accel_variance = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, accel].copy()
-        self._turning = turning(x.size)
-        self._felt = np.r_[PHI, self._turning[-3:]]
+        accel_places = np.arange(FIRST + accel.start, FIRST + accel.stop)
+        self._turning, self._felt = np.r_[:FIRST, accel_places], np.r_[PHI, accel_places]
         self._find_places()
 
     # Which mean is whose, and how likely
@@ -244,6 +246,8 @@ class Filters:
         H = model.H[k, kind]
         # What the receiver states is about axes of n0, which the means see in different ways.
         stated = C.swapaxes(1, 2) @ (measured.covariance[k, kind] * noise * noise[:, None]) @ C
+        swung = self._swung(H[..., FIRST:][..., LEVER_ARM], model.duration[k])
+        stated = stated + swung[q, None, None] * _EYE
         missing = measured.s[k, kind] - (self.w if kind else self.u)
         innovation = (apply(C.swapaxes(1, 2), missing) + model.expected[k, kind][q]
                       - apply(H[q][..., FIRST:], self.x - model.point[q]))
@@ -260,6 +264,20 @@ class Filters:
         sigmas = np.sqrt((C[i] @ test.S[i] @ C[i].T).diagonal())
         return Innovation(float(test.nis[i]) / 3, C[i] @ innovation[i] / sigmas,
                           bool(taken[best]), not taken[self.evidence.argmax()])
+
+    def _swung(self, arm: Array, duration: float) -> Array:
+        """
+        Return the variance, (M,), of what an unknown turn makes of an unknown lever arm.
+
+        `arm`, (M, 3, 3), has a measurement's derivatives to the lever arm. The product of two
+        errors is in no derivative, and lasts from epoch to epoch, which are `duration` (s) apart.
+        """
+        lever = self.P[:, FIRST:, FIRST:][:, LEVER_ARM, LEVER_ARM]
+        unknown = np.trace(arm @ lever @ arm.swapaxes(1, 2), axis1=1, axis2=2)
+        turn = np.trace(self.P[:, PHI, PHI], axis1=1, axis2=2)
+        # Of a vector product of two that are independent, and alike in all directions.
+        variance: Array = 2 / 9 * turn * unknown * max(1.0, PRODUCT_TIME / max(duration, 1e-3))
+        return variance
 
     def hold(self, held: np.ndarray, H: Array, variance: Array, innovation: Array,
              backwards: Array, tumbled: np.ndarray) -> None:

@@ -46,30 +46,20 @@ def biases(m: int) -> tuple[slice, slice]:
     return gyro, accel
 
 
-def turning(m: int) -> Index:
-    """Return the places, (21,), of the errors that turn with the attitude, of m parameters."""
-    return np.r_[:FIRST, FIRST + np.r_[(LEVER_ARM, *biases(m))]]
-
-
 def turned_parameters(d: Array, half: Array, rest: Array) -> Array:
     """
     Return by how much errors d, (B, n), change the parameters, (B, m).
 
-    `half` is half of the turn by phi, (B, 3, 3). Lever arms and biases turn with it,
+    `half` is half of the turn by phi, (B, 3, 3). Biases of the accelerometers turn with it,
 
-        l_true = l + J(-phi) dl
-        b_true = b + J(-phi) db
         a_true = a + g - exp(-phi) (g - da + phi x g)
 
-    with g the force at rest, `rest`, (B, 3): where the antenna is, how the attitude at t0 follows
-    from that now, and what a mean makes of the force at rest, is then linear in the errors.
+    with g the force at rest, `rest`, (B, 3): what a mean makes of that force is then linear in the
+    errors.
     """
-    back = half.swapaxes(1, 2)
     x = d[:, FIRST:].copy()
-    gyro, accel = biases(x.shape[1])
-    for place in LEVER_ARM, gyro:
-        x[:, place] = apply(back, x[:, place])              # J(-phi) ~ exp(-phi / 2)
-    x[:, accel] = rest - _felt(d[:, PHI], x[:, accel], back, rest)
+    accel = biases(x.shape[1])[1]
+    x[:, accel] = rest - _felt(d[:, PHI], x[:, accel], half.swapaxes(1, 2), rest)
     return x
 
 
@@ -80,17 +70,17 @@ def _felt(phi: Array, d_accel: Array, back: Array, rest: Array) -> Array:
 
 def transport(d: Array, half: Array, rest: Array) -> Array:
     """
-    Return G of ``exp(d)^-1 exp(d + e) ~ exp(G e)``, (B, 21, 21), of the errors of `turning`.
+    Return G of ``exp(d)^-1 exp(d + e) ~ exp(G e)``, (B, 15, 15).
 
-    d, (B, 21), are those alone. `half` has half of the turns by phi and phi0, (2, B, 3, 3); `rest`
-    is as in `turned_parameters`.
+    d and e, (B, 15), are errors of attitude, velocity, position, attitude at t0, and biases of the
+    accelerometers. `half` has half of the turns by phi and phi0, (2, B, 3, 3); `rest` is as in
+    `turned_parameters`.
     """
     G = np.zeros((*d.shape, d.shape[1]))
-    back = half[0].swapaxes(1, 2)
+    back, accel = half[0].swapaxes(1, 2), slice(FIRST, FIRST + 3)
     G[:, PHI, PHI], G[:, PHI0, PHI0] = half.swapaxes(2, 3)
-    lever, gyro, accel = slice(12, 15), slice(15, 18), slice(18, 21)
-    for rows, sign in (XI, -0.5), (RHO, -0.5), (lever, 0.5), (gyro, 0.5):
-        G[:, rows, rows], G[:, rows, PHI] = back, sign * skew(d[:, rows])
+    for rows in XI, RHO:
+        G[:, rows, rows], G[:, rows, PHI] = back, -0.5 * skew(d[:, rows])
     G[:, accel, accel] = back @ back
     G[:, accel, PHI] = (back @ back @ skew(rest)
                         - skew(_felt(d[:, PHI], d[:, accel], back, rest)) @ back)
