@@ -12,12 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Experiments ``declare`` and ``declare-worse``: whether what is declared is right, and how soon.
+Experiments ``declare``, ``declare-worse`` and ``settings``: whether what is declared is right.
 
 Simulated vehicles of every kind with every fault that a user can make: is the attitude right
 when the aligner says that it is aligned? Does it keep silent where heading cannot be observed? How
 long does it wait beyond the time that the data need? ``declare-worse`` has IMUs and receivers
-worse than configured.
+worse than configured, ``settings`` everything as it is configured, but rates, noises, lever arms
+and mountings of all sizes.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from pathlib import Path
 from typing import Any
 
 from ins_align.aligner import State
-from ins_align.config import Config, PRESETS
+from ins_align.config import CHIP_THRESHOLDS, Config, PRESETS
 from ins_align.experiments.common import (
-    bound_of, Case, cell, combination, follow, GRADES, groups_of, JsonDict, moment_row, parallel,
-    prepare, Report, run_case, setup)
-from ins_align.experiments.spoilt import Random
+    aligned_row, bound_of, Case, cell, combination, follow, GRADES, groups_of, JsonDict,
+    moment_row, parallel, prepare, Report, run_case, setup)
+from ins_align.experiments.spoilt import Random, Stream
 from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
 
@@ -250,3 +251,63 @@ def draw_worse(seed: int) -> Case:
         arguments |= WORSE[fault]
     return Case(PAIR.join(faults) or 'none', ((scenario, 'mems'),), None, arguments,
                 {'imu_grade': 'mems'})
+
+
+# settings: everything is as it is configured
+
+MOVING = tuple(name for name in SCENARIOS if name not in ('straight', 'static'))
+# Parameters of what the GNSS measures.
+MEASURED: dict[str, JsonDict] = {
+    'velocities': {}, 'positions': {'use_velocity': False}, 'both': {'use_position': True}}
+
+
+def run_settings(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
+    """Run ``settings``, seeds 0 to `runs`."""
+    [found] = parallel(run_case, [[(draw_settings, seed) for seed in range(runs)]], jobs,
+                       'settings')
+    report.text(
+        f'{runs} runs that have nothing wrong and are configured as they are, but for noise that '
+        f'half of the receivers do not state: motions ({", ".join(MOVING)}) after up to three '
+        'minutes at rest, IMUs at 25 to 400 Hz mounted in any way, GNSS at 1 to 20 Hz, '
+        'velocities of 0.02 to 0.3 m/s, positions of 0.02 to 2.5 m, delays to 0.15 s, lever arms '
+        'to 12 m that are known to 0.05 or 1 m per axis.')
+    report.table('By grade of the IMU, and by what the GNSS measures', [
+        aligned_row(name, [each for each in found if name in each['name'].split(PAIR)])
+        for name in (*PRESETS, *MEASURED)] + [aligned_row('all', found)])
+    return {'runs': found}
+
+
+def draw_settings(seed: int) -> Case:
+    """Draw a run of ``settings``."""
+    scenario, grade, measured, stated = combination(
+        seed, [7], MOVING, PRESETS, MEASURED, (True, False))
+    random = np.random.default_rng([7, seed])
+
+    def one_of(*values: float) -> float:
+        return float(random.choice(values))
+
+    noise, rest, gnss_rate = PRESETS[grade], one_of(0, 0, 3, 20, 60, 180), one_of(1, 2, 5, 10, 20)
+    axes = 0.3 * noise.gyro_scale_std
+    lever_arm = one_of(0.3, 1.5, 8.0) * random.uniform(-1, 1, 3)
+    lever_std = one_of(0.05, 1.0)
+    turn = np.array([180, 90, 180] if random.random() < 0.5 else [10, 10, 10])
+    arguments = {
+        **setup(random), 'duration': rest + DURATION, 'stand_still': rest,
+        'lever_arm': lever_arm.tolist(),
+        'mount_rpy_deg': (turn * random.uniform(-1, 1, 3)).tolist(),
+        'gnss_rate': gnss_rate, 'imu_rate': max(one_of(25, 50, 100, 200, 400), 2 * gnss_rate),
+        'imu_jitter': one_of(0, 0, 0.3), 'gnss_delay': one_of(0, 0, 0.05, 0.15),
+        'velocity_std': one_of(0.02, 0.1, 0.3), 'position_std': one_of(0.02, 0.5, 2.5),
+        'gyro_scale_std': noise.gyro_scale_std, 'rate_random_walk': noise.rate_random_walk,
+        'gyro_misalignment_std': axes, 'accel_scale_std': axes, 'accel_misalignment_std': axes}
+    config = {
+        'lever_arm': tuple((lever_arm + lever_std * random.standard_normal(3)).tolist()),
+        'lever_arm_std': lever_std, **MEASURED[measured],
+        **(CHIP_THRESHOLDS if grade == 'chip' else {})}
+    return Case(f'{grade}{PAIR}{measured}', ((scenario, grade),),
+                None if stated else _state_nothing, arguments, config)
+
+
+def _state_nothing(stream: Stream, random: Random) -> None:
+    stream.velocity['covariance'] = stream.fix['covariance'] = 0.0
+    stream.fix['covariance_type'] = 0

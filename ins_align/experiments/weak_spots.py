@@ -202,7 +202,6 @@ CHIPS = tuple((scenario, 'chip') for scenario in ('car', 'flight', 'launch', 'ho
 OF_CHIPS = {'imu_grade': 'chip', **CHIP_THRESHOLDS}
 TOLD = {'gnss_delay_std': 0.0, 'lever_arm_std': 0.05}
 LONG, LATER, HOURS = {'duration': 120.0}, {'duration': 150.0}, {'duration': 900.0}
-QUIET, COARSE = {'velocity_std': 0.02}, {'position_std': 5.0, 'gnss_rate': 10.0}
 EXACT = {'velocity_std': 0.0}           # noise is added by what spoils it
 RTK, WANDERING = {'position_std': 0.05}, {'position_std': 0.5, 'position_drift_std': 1.5}
 AWAY = {'duration': 300.0, 'outages': ((60.0, 300.0),)}
@@ -216,10 +215,6 @@ SPOTS = tuple(case._replace(simulate={'duration': DURATION, **case.simulate}) fo
     *(Case(f'a chip, {rest:g} s at rest before', CHIPS, None,
            {'duration': rest + 90.0, 'stand_still': rest}, OF_CHIPS, part=part)
       for rest, part in ((20.0, 1), (120.0, 2))),
-    *(Case(f'{name}, 60 s at rest before, velocities of 0.02 m/s', motions, None,
-           {'duration': 150.0, 'stand_still': 60.0, **QUIET}, config)
-      for name, motions, config in (('a chip', CHIPS, OF_CHIPS), ('MEMS', CAR + HOVER, {}))),
-    Case('positions of 5 m at 10 Hz alone', MIXED, None, COARSE, {'use_velocity': False}),
     # Told wrongly
     Case('told for certain, and right', MIXED, config=TOLD),
     *(Case(f'told for certain, delay {by:g} s off', MIXED, simulate={'gnss_delay': by},
