@@ -227,7 +227,7 @@ class Bank:
 
     def _anchor(self, filters: Filters, track: InertialTrack) -> None:
         """Freeze n0 at the last epoch that was processed; the track is there."""
-        filters.turned(track.C_n0n.T, track.still_v, track.s_p)
+        filters.change_axes(track.C_n0n.T, track.still_v, track.s_p)
         self._freeze(self._last)
 
     def _step(self, filters: Filters, model: Linearised, k: int, measured: Measured) -> None:

@@ -144,7 +144,8 @@ class Filters:
         self.accel_expected = x[accel]
         self.accel_variance = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, accel].copy()
         accel_places = np.arange(FIRST + accel.start, FIRST + accel.stop)
-        self._turning, self._felt = np.r_[:FIRST, accel_places], np.r_[PHI, accel_places]
+        self._felt = np.r_[PHI, accel_places]
+        self._transported = np.r_[:FIRST, accel_places]
         self._find_places()
 
     # Which mean is whose, and how likely
@@ -366,7 +367,7 @@ class Filters:
         P = self.P[:, self._felt[:, None], self._felt]
         return np.einsum('mij,mij->m', tilt @ P, tilt)
 
-    def _turning_force(self) -> Array:
+    def _force_at_rest(self) -> Array:
         """Return the force at rest, (B, 3), as far as a bias that turns with a tilt is in it."""
         bias = self.P[:, self._felt[3:], self._felt[3:]].sum(axis=1)
         share = bias / (bias + STANDARD_GRAVITY ** 2 * self._apparent_tilt())
@@ -387,17 +388,17 @@ class Filters:
                                          np.abs(d[lead, PHI0]).max()) < NO_TURN:
             self._shift(d)
             return
-        rest = self._turning_force()
+        rest = self._force_at_rest()
         half = self._shift(d, rest)[:, lead]
-        G = transport(d[lead][:, self._turning], half, rest[lead])
-        self.P[:, self._turning] = G @ self.P[:, self._turning]
-        self.P[:, :, self._turning] = self.P[:, :, self._turning] @ G.swapaxes(1, 2)
+        G = transport(d[lead][:, self._transported], half, rest[lead])
+        self.P[:, self._transported] = G @ self.P[:, self._transported]
+        self.P[:, :, self._transported] = self.P[:, :, self._transported] @ G.swapaxes(1, 2)
 
     def _shift(self, d: Array, rest: 'Array | None' = None) -> Array:
         """
         Correct the means by errors, shape (B, n); return half of their turns, now and at t0.
 
-        Parameters turn with them where `rest` is given, as `_turning_force` returns it.
+        Parameters turn with them where `rest` is given, as `_force_at_rest` returns it.
         """
         half = exp_so3(0.5 * np.stack([d[:, PHI], d[:, PHI0]]))
         turn, turn0 = half @ half
@@ -410,7 +411,7 @@ class Filters:
 
     # Without a measurement
 
-    def turned(self, C_nn0: Array, s_v: Array, s_p: Array) -> None:
+    def change_axes(self, C_nn0: Array, s_v: Array, s_p: Array) -> None:
         """Go on in another n0; its axes, and what an antenna that rests has there of s."""
         self.C = C_nn0 @ self.C
         self.u, self.w = (self.u - s_v) @ C_nn0.T, (self.w - s_p) @ C_nn0.T
@@ -450,7 +451,7 @@ class Filters:
         merged = leads[near]
         d = np.zeros_like(away)
         d[merged] = mean[near]
-        self._shift(d, self._turning_force())
+        self._shift(d, self._force_at_rest())
         self.weight[merged] = 0.0
         kept = ~near[place]
         kept[merged] = True
