@@ -42,9 +42,10 @@ BEST_VARIANCE = 1e-6
 # Distance over which velocity and position are compared: at least this, and so many sigmas.
 MIN_DISTANCE = 10.0
 DISTANCE_SIGMAS = 8.0
-# Mismatch, as a share of the distance, that no noise explains, and how many in a row convict.
+# Mismatch, as a share of the distance, that no noise explains, and how many in a row convict; of
+# those that fit with north and east exchanged fewer do.
 MAX_MISMATCH = 0.5
-CONVICTING = 4
+CONVICTING, CONVICTING_AS_NED = 4, 3
 # So many fixes in a row have to agree, to within the same share of the distance, at its end.
 AGREEING = 3
 
@@ -254,10 +255,10 @@ class VelocityCheck:
     @property
     def fault(self) -> str:
         """Fault in words; empty when nothing is known to be wrong."""
-        if self.bad_in_a_row < CONVICTING:
-            return ''
-        if self._as_ned_in_a_row >= CONVICTING:
+        if min(self.bad_in_a_row, self._as_ned_in_a_row) >= CONVICTING_AS_NED:
             return ('the GNSS velocity contradicts the change of position, and would fit it with '
                     'north and east exchanged: set velocity_frame to the other one (enu, ned)')
+        if self.bad_in_a_row < CONVICTING:
+            return ''
         return ('the GNSS velocity contradicts the change of position: check that it is given in '
                 'a world frame (velocity_frame) and in m/s')
