@@ -1270,8 +1270,8 @@ def test_noise_that_the_receiver_overstates_is_found(scenario, longer):
 def test_errors_that_last_are_not_taken_for_a_quiet_receiver():
     """Of a receiver that filters, at 10 Hz: in the first 0.3 s they do not show."""
     s = simulated('car', imu_grade='mems', gnss_rate=10.0, velocity_std=0.01, duration=30.0,
-                  seed=0, gyro_bias_std=0.1)
-    lasting = gauss_markov(s.gnss_stamps_ns * 1e-9, 0.1, 0.5, np.random.default_rng(100))
+                  seed=4, gyro_bias_std=0.1)
+    lasting = gauss_markov(s.gnss_stamps_ns * 1e-9, 0.1, 0.5, np.random.default_rng(104))
     result = align(s.imu_stamps_ns, s.gyro, s.accel,
                    [Fix(stamp_ns, *lla, None, 0) for stamp_ns, lla
                     in zip(s.gnss_stamps_ns.tolist(), s.lla_deg.tolist())],

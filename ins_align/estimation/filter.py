@@ -24,9 +24,9 @@ whose measurements are late by its delay sees. Errors are
     C_true = C exp(phi)    u_true = u + C J xi    w_true = w + C J rho    C0_true = C0 exp(phi0)
 
 with J the left Jacobian of SO(3) at phi: (phi, xi, rho) is the logarithm of an error in SE2(3).
-Biases of the accelerometers turn with the attitude (`states.turned_parameters`). Neither the propagation
-of errors, which is exact but for noise, nor a measurement's derivative holds an attitude, so all
-means that differ in their heading share one covariance (docs, "Theory").
+Biases of the accelerometers turn with the attitude (`states.turned_parameters`). Neither the
+propagation of errors, exact but for noise, nor a measurement's derivative holds an attitude, so
+all means that differ in their heading share one covariance (docs, "Theory").
 """
 
 from typing import NamedTuple
@@ -143,9 +143,8 @@ class Filters:
         accel = biases(x.size)[1]
         self.accel_expected = x[accel]
         self.accel_variance = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, accel].copy()
-        accel_places = np.arange(FIRST + accel.start, FIRST + accel.stop)
-        self._felt = np.r_[PHI, accel_places]
-        self._transported = np.r_[:FIRST, accel_places]
+        self._felt = np.r_[PHI, FIRST + np.r_[accel]]
+        self._transported = np.r_[:FIRST, FIRST + np.r_[accel]]
         self._find_places()
 
     # Which mean is whose, and how likely

@@ -20,7 +20,7 @@ A leaf of the imports: places, shapes and names that the modules of the estimati
 from dataclasses import dataclass
 import math
 
-from ins_align.geometry.rotation import apply, Array, cross, Index, skew
+from ins_align.geometry.rotation import apply, Array, cross, skew
 import numpy as np
 
 # Places in the error state; the parameters follow from FIRST on: lever arm, delay, errors of the

@@ -30,10 +30,10 @@ NAMES = {
     'bound': ('The estimator at the Cramer-Rao bound', 'bound.run', 100),
     'declare': ('Declared means right', 'declare.run', 1000),
     'declare-worse': ('IMUs worse than configured', 'declare.run_worse', 500),
-    'settings': ('Right whatever the settings', 'declare.run_settings', 200),
     'faults': ('What drivers get wrong', 'faults.run', 1000),
     'weak-spots': ('Where it is wrong and sure of itself', 'weak_spots.run', 24),
     'vehicle': ('What a vehicle knows of its motion', 'weak_spots.run_vehicle', 24),
+    'settings': ('Right whatever the settings', 'declare.run_settings', 200),
     'recordings': ('Real recordings', 'recordings.run', 0)}
 NEED_DATA, TAKE_DATA = ('recordings',), ('vehicle', 'recordings')
 # Only by name: it measures the machine too, and needs ROS. Its runs are minutes of data.
