@@ -295,15 +295,18 @@ def test_blocks_of_any_length_give_the_same(scenario, changes):
                 assert np.allclose(P, Q, rtol=1e-5, atol=1e-5 * P[0, 0])
 
 
-@pytest.mark.parametrize('scenario, grade', [
-    ('flight', 'mems'), ('car', 'mems'), ('launch', 'tactical'), ('hover', 'mems')])
-def test_no_sigma_steps_up(scenario, grade, monkeypatch):
-    """
-    Nothing is lost without an outage and an outlier; a heading is found, and stays.
+STEPS = ('flight', 'mems'), ('car', 'mems'), ('launch', 'tactical'), ('hover', 'mems')
 
-    A worse level of the IMU that becomes likelier is no loss: there is one level here.
-    """
-    monkeypatch.setattr(rivals, 'LEVELS', rivals.LEVELS[:1])
+
+@pytest.mark.parametrize('scenario, grade, levels, most', [
+    # A worse level of the IMU that becomes likelier is no loss: one level says what filters lose.
+    *((*motion, 1, 1.08) for motion in STEPS),
+    *((*motion, None, 1.15) for motion in STEPS[1:]),
+    pytest.param(*STEPS[0], None, 1.15, marks=pytest.mark.xfail(
+        strict=True, reason='1.153, where a worse level becomes likelier'))])
+def test_no_sigma_steps_up(scenario, grade, levels, most, monkeypatch):
+    """Nothing is lost without an outage and an outlier; a heading is found, and stays."""
+    monkeypatch.setattr(rivals, 'LEVELS', rivals.LEVELS[:levels])
     s = simulated(scenario, imu_grade=grade, duration=60.0, seed=2)
     bank, epochs, imu = prepared(s, lever_arm_std=1.0, gnss_delay_std=0.1)
     before, rejected, compared = None, 0, 0
@@ -313,7 +316,7 @@ def test_no_sigma_steps_up(scenario, grade, monkeypatch):
             continue
         now = np.concatenate([sigmas(bank.initial()), sigmas(bank.current())])
         if before is not None and bank.fit().rejected == rejected:
-            assert np.all(now < 1.08 * before), now / before
+            assert np.all(now < most * before), now / before
             compared += 1
         before, rejected = now, bank.fit().rejected
     assert compared > 200

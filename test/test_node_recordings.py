@@ -30,7 +30,7 @@ LATENESS = 5.0  # s
 @pytest.mark.parametrize(('name', 'start', 'duration', 'parameters'), [
     ('uav_thor75', 150.0, 45.0, {}),
     ('car_drive0708', 20.0, 60.0, {'lever_arm': '[0.0, 0.05, 0.0]', 'heading_std_threshold': 1.5}),
-    ('quad_dot08.bag', 0.0, 40.0, {'tilt_std_threshold': 0.8})])
+    ('quad_dot08.bag', 0.0, 40.0, {})])
 def test_recording(name, start, duration, parameters, tmp_path):
     bag = real_recording(name)
     parameters = {**parameters, 'gnss_lateness': LATENESS}

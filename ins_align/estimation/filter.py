@@ -246,8 +246,8 @@ class Filters:
         H = model.H[k, kind]
         # What the receiver states is about axes of n0, which the means see in different ways.
         stated = C.swapaxes(1, 2) @ (measured.covariance[k, kind] * noise * noise[:, None]) @ C
-        swung = self._swung(H[..., FIRST:][..., LEVER_ARM], model.duration[k])
-        stated = stated + swung[q, None, None] * _EYE
+        arm_noise = self._arm_noise(H[..., FIRST:][..., LEVER_ARM], model.duration[k])
+        stated = stated + arm_noise[q, None, None] * _EYE
         missing = measured.s[k, kind] - (self.w if kind else self.u)
         innovation = (apply(C.swapaxes(1, 2), missing) + model.expected[k, kind][q]
                       - apply(H[q][..., FIRST:], self.x - model.point[q]))
@@ -265,7 +265,7 @@ class Filters:
         return Innovation(float(test.nis[i]) / 3, C[i] @ innovation[i] / sigmas,
                           bool(taken[best]), not taken[self.evidence.argmax()])
 
-    def _swung(self, arm: Array, duration: float) -> Array:
+    def _arm_noise(self, arm: Array, duration: float) -> Array:
         """
         Return the variance, (M,), of what an unknown turn makes of an unknown lever arm.
 

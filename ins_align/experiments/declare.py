@@ -35,6 +35,7 @@ from ins_align.experiments.common import (
     aligned_row, bound_of, Case, cell, combination, follow, GRADES, groups_of, JsonDict,
     moment_row, parallel, prepare, Report, run_case, setup)
 from ins_align.experiments.spoilt import Random, Stream
+from ins_align.simulation.arguments import errors_of
 from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
 
@@ -286,8 +287,7 @@ def draw_settings(seed: int) -> Case:
     def one_of(*values: float) -> float:
         return float(random.choice(values))
 
-    noise, rest, gnss_rate = PRESETS[grade], one_of(0, 0, 3, 20, 60, 180), one_of(1, 2, 5, 10, 20)
-    axes = 0.3 * noise.gyro_scale_std
+    rest, gnss_rate = one_of(0, 0, 3, 20, 60, 180), one_of(1, 2, 5, 10, 20)
     lever_arm = one_of(0.3, 1.5, 8.0) * random.uniform(-1, 1, 3)
     lever_std = one_of(0.05, 1.0)
     turn = np.array([180, 90, 180] if random.random() < 0.5 else [10, 10, 10])
@@ -298,8 +298,7 @@ def draw_settings(seed: int) -> Case:
         'gnss_rate': gnss_rate, 'imu_rate': max(one_of(25, 50, 100, 200, 400), 2 * gnss_rate),
         'imu_jitter': one_of(0, 0, 0.3), 'gnss_delay': one_of(0, 0, 0.05, 0.15),
         'velocity_std': one_of(0.02, 0.1, 0.3), 'position_std': one_of(0.02, 0.5, 2.5),
-        'gyro_scale_std': noise.gyro_scale_std, 'rate_random_walk': noise.rate_random_walk,
-        'gyro_misalignment_std': axes, 'accel_scale_std': axes, 'accel_misalignment_std': axes}
+        **errors_of(PRESETS[grade])}
     config = {
         'lever_arm': tuple((lever_arm + lever_std * random.standard_normal(3)).tolist()),
         'lever_arm_std': lever_std, **MEASURED[measured],

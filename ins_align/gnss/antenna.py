@@ -255,7 +255,7 @@ class VelocityCheck:
     @property
     def fault(self) -> str:
         """Fault in words; empty when nothing is known to be wrong."""
-        if min(self.bad_in_a_row, self._as_ned_in_a_row) >= CONVICTING_AS_NED:
+        if self._as_ned_in_a_row >= CONVICTING_AS_NED:        # all of them bad
             return ('the GNSS velocity contradicts the change of position, and would fit it with '
                     'north and east exchanged: set velocity_frame to the other one (enu, ned)')
         if self.bad_in_a_row < CONVICTING:

@@ -35,14 +35,22 @@ _MAX_SAMPLES = 20_000_000
 # As far as the parameters of the aligner go that make up for them.
 _MOST = {field.name: field.metadata['maximum'] for field in dataclasses.fields(Config)
          if field.metadata['maximum'] is not None}
-# Errors that a chip has by default; the other grades have noise and biases alone. The estimator
-# takes misalignment and the errors of the accelerometers for 3 tenths of the gyros' scale factor
-# errors.
-_CHIP = PRESETS['chip']
-_OF_CHIP = {
-    'gyro_scale_std': _CHIP.gyro_scale_std, 'rate_random_walk': _CHIP.rate_random_walk,
-    **dict.fromkeys(('gyro_misalignment_std', 'accel_scale_std', 'accel_misalignment_std'),
-                    0.3 * _CHIP.gyro_scale_std)}
+
+
+def errors_of(noise: ImuNoise) -> dict[str, float]:
+    """
+    Return the arguments of an IMU that has all errors which the estimator expects of its grade.
+
+    It takes misalignment and the errors of the accelerometers for 3 tenths of the gyros' scale
+    factor errors.
+    """
+    return {'gyro_scale_std': noise.gyro_scale_std, 'rate_random_walk': noise.rate_random_walk,
+            **dict.fromkeys(('gyro_misalignment_std', 'accel_scale_std',
+                             'accel_misalignment_std'), 0.3 * noise.gyro_scale_std)}
+
+
+# What a chip has by default; the other grades have noise and biases alone.
+_OF_CHIP = errors_of(PRESETS['chip'])
 
 
 class SimulationError(UsageError):
