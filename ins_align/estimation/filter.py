@@ -46,10 +46,8 @@ GATE = 25.0
 # Log likelihood ratio of a motion that fits a vehicle, to one whose slips are so much larger that
 # a normalised innovation squared of twice this, of two rows, is as likely.
 FITS = 3.0
-# A rival that is less likely than the best by this (log) is no part of a mixture, whose mean is
-# found when all attitudes are so close to it (rad) that rotations add up like vectors, or it moves
-# no more (rad).
-NEGLIGIBLE, CLOSE, SETTLED = 12.0, 0.01, 1e-8
+# A rival that is less likely than the best by this (log) is no part of a mixture.
+NEGLIGIBLE = 12.0
 # Corrections so small (rad) leave the axes of the errors as they are.
 NO_TURN = 1e-3
 # A rate that is not known turns biases of the accelerometers against the tilt that they look like.
@@ -143,7 +141,7 @@ class Filters:
         accel = biases(x.size)[1]
         self.accel_expected = x[accel]
         self.accel_variance = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, accel].copy()
-        self._felt = np.r_[PHI, FIRST + np.r_[accel]]
+        self._tilt_and_bias = np.r_[PHI, FIRST + np.r_[accel]]
         self._transported = np.r_[:FIRST, FIRST + np.r_[accel]]
         self._find_places()
 
@@ -363,12 +361,12 @@ class Filters:
         across = skew(self.C[self.lead, 2])
         felt = np.concatenate([across, np.broadcast_to(_EYE / STANDARD_GRAVITY, across.shape)], 2)
         tilt = across @ felt
-        P = self.P[:, self._felt[:, None], self._felt]
+        P = self.P[:, self._tilt_and_bias[:, None], self._tilt_and_bias]
         return np.einsum('mij,mij->m', tilt @ P, tilt)
 
     def _force_at_rest(self) -> Array:
         """Return the force at rest, (B, 3), as far as a bias that turns with a tilt is in it."""
-        bias = self.P[:, self._felt[3:], self._felt[3:]].sum(axis=1)
+        bias = self.P[:, self._tilt_and_bias[3:], self._tilt_and_bias[3:]].sum(axis=1)
         share = bias / (bias + STANDARD_GRAVITY ** 2 * self._apparent_tilt())
         return STANDARD_GRAVITY * share[self.place, None] * self.C[:, 2]
 
@@ -473,16 +471,11 @@ class Filters:
         C = np.stack([self.C0[use], self.C[use]])
         covariance = C @ np.stack([self.P[of, PHI0, PHI0],
                                    self.P[of, PHI, PHI]]) @ C.swapaxes(-1, -2)
-        mean = C[:, share.argmax()]
-        if len(share) > 1:
-            for _ in range(3):
-                away = log_so3(C @ mean[:, None].swapaxes(-1, -2))
-                shift = share @ away
-                mean = exp_so3(shift) @ mean
-                away = away - shift[:, None]
-                if np.abs(away).max() < CLOSE or np.abs(shift).max() < SETTLED:
-                    break
-            covariance = covariance + away[..., :, None] * away[..., None, :]
+        U, _, V = np.linalg.svd((share @ C.reshape(2, -1, 9)).reshape(2, 3, 3))
+        U[..., 2] *= np.linalg.det(U @ V)[:, None]      # or it is a reflection
+        mean = U @ V
+        away = log_so3(C @ mean[:, None].swapaxes(-1, -2))
+        covariance = covariance + away[..., :, None] * away[..., None, :]
         return mean, (share @ covariance.reshape(2, -1, 9)).reshape(2, 3, 3)
 
 

@@ -83,14 +83,11 @@ class Rival:
         return bool(self.better)
 
 
-# An IMU may be so many times worse than configured, in the biases of its gyros and of its
-# accelerometers, at such a log prior; the first level is the configuration. Scale factors and
-# misalignment are at most so many times larger.
-WORSE_GYROS = (1.0, 0.0), (3.0, -5.5), (10.0, -11.0)
-WORSE_ACCELS = (1.0, 0.0), (3.0, -3.0), (10.0, -5.0)
+# The biases of an IMU's gyros, its accelerometers or both may be so many times larger than
+# configured, at such a log prior. Scale factors and misalignment are at most so many times larger.
+WORSE = ((1, 1, 0), (1, 3, -3), (1, 10, -5), (3, 1, -5.5), (10, 1, -11), (10, 10, -16))
 WORSE_SCALE = 3.0
-LEVELS = tuple(Rival(gyro=gyro, accel=accel, prior=for_gyro + for_accel)
-               for accel, for_accel in WORSE_ACCELS for gyro, for_gyro in WORSE_GYROS)
+LEVELS = tuple(Rival(gyro=gyro, accel=accel, prior=prior) for gyro, accel, prior in WORSE)
 SIGNS = (
     Rival('the accelerations reversed (sign of gravity instead of specific force?)',
           signs=(1.0, 1.0, 1.0, -1.0)),
