@@ -291,9 +291,10 @@ def level_in_words(level: Rival, noise: ImuNoise, x: Array, P: Array) -> str:
     if settings:
         return ('; the biases of the IMU are larger than configured, which sigmas allow for: set '
                 + ' and '.join(settings))
-    sensors, factor = (('gyros', level.gyro) if level.gyro > 1 else
-                       ('accelerometers', level.accel))
-    return (f'; the {sensors} look worse than configured, as with {factor:g} times the bias, '
+    worse = [sensors for sensors, factor in (
+        ('gyros', level.gyro), ('accelerometers', level.accel)) if factor > 1]
+    return (f'; the {" and ".join(worse)} look worse than configured, as with '
+            f'{max(level.gyro, level.accel):g} times the bias, '
             'which sigmas allow for: coarse readings, scale factors, vibration or GNSS errors '
             'that last')
 
