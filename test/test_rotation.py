@@ -158,6 +158,15 @@ def test_cumulative_rotations_are_the_products_one_by_one(count):
     assert np.array_equal(steps, original)
 
 
+def test_the_nearest_rotation_solves_wahbas_problem():
+    """Of matrices of any kind, also where a reflection is nearer."""
+    matrices = np.random.default_rng(4).normal(size=(20, 3, 3))
+    assert {True, False} == set((np.linalg.det(matrices) < 0).tolist())
+    for matrix, nearest in zip(matrices, rotation.nearest_rotation(matrices)):
+        expected = Rotation.align_vectors(matrix.T, np.eye(3))[0].as_matrix()
+        assert np.allclose(nearest, expected, atol=1e-12)
+
+
 def test_orthonormalized_takes_out_what_is_no_rotation(random_rotations):
     matrix = random_rotations[0].as_matrix()
     spoilt = matrix + 1e-6 * np.random.default_rng(5).standard_normal((3, 3))

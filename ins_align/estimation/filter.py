@@ -35,7 +35,8 @@ from ins_align.config import STANDARD_GRAVITY
 from ins_align.estimation.states import (
     biases, FIRST, GYRO, LEVER_ARM, Linearised, Measured, PHI, PHI0, RHO, transport,
     turned_parameters)
-from ins_align.geometry.rotation import apply, Array, exp_so3, Index, log_so3, skew
+from ins_align.geometry.rotation import (
+    apply, Array, exp_so3, Index, log_so3, nearest_rotation, skew)
 import numpy as np
 
 # Normalised innovation squared of three rows above which a measurement is an outlier: one good
@@ -471,9 +472,7 @@ class Filters:
         C = np.stack([self.C0[use], self.C[use]])
         covariance = C @ np.stack([self.P[of, PHI0, PHI0],
                                    self.P[of, PHI, PHI]]) @ C.swapaxes(-1, -2)
-        U, _, V = np.linalg.svd((share @ C.reshape(2, -1, 9)).reshape(2, 3, 3))
-        U[..., 2] *= np.linalg.det(U @ V)[:, None]      # or it is a reflection
-        mean = U @ V
+        mean = nearest_rotation((share @ C.reshape(2, -1, 9)).reshape(2, 3, 3))
         away = log_so3(C @ mean[:, None].swapaxes(-1, -2))
         covariance = covariance + away[..., :, None] * away[..., None, :]
         return mean, (share @ covariance.reshape(2, -1, 9)).reshape(2, 3, 3)

@@ -83,8 +83,9 @@ class Rival:
         return bool(self.better)
 
 
-# The biases of an IMU's gyros, its accelerometers or both may be so many times larger than
-# configured, at such a log prior. Scale factors and misalignment are at most so many times larger.
+# The biases of an IMU's gyros and of its accelerometers may be so many times larger than
+# configured, at such a log prior; the first level is the configuration. Scale factors and
+# misalignment are at most so many times larger.
 WORSE = ((1, 1, 0), (1, 3, -3), (1, 10, -5), (3, 1, -5.5), (10, 1, -11), (10, 10, -16))
 WORSE_SCALE = 3.0
 LEVELS = tuple(Rival(gyro=gyro, accel=accel, prior=prior) for gyro, accel, prior in WORSE)

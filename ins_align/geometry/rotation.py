@@ -233,6 +233,14 @@ def roll_pitch_yaw(matrix: ArrayLike) -> Array:
                      _arctan2(m[..., 1, 0], m[..., 0, 0])], axis=-1)
 
 
+def nearest_rotation(matrix: Array) -> Array:
+    """Return the rotations nearest to matrices, shape (..., 3, 3), in the sum of squares."""
+    U, _, V = np.linalg.svd(matrix)
+    U[..., 2] *= np.sign(np.linalg.det(U @ V))[..., None]      # or it is a reflection
+    nearest: Array = U @ V
+    return nearest
+
+
 def orthonormalized(matrix: Array) -> Array:
     """Return the nearest rotation to first order, against the rounding of long products."""
     return 1.5 * matrix - 0.5 * matrix @ (matrix.swapaxes(-1, -2) @ matrix)

@@ -30,7 +30,8 @@ from ins_align.checks import ANY_GYRO_RATE, degrees_fault
 from ins_align.config import CHIP_THRESHOLDS, Config, ImuNoise, PRESETS
 from ins_align.estimation.receiver import MOVING
 from ins_align.geometry.earth import EARTH_RATE
-from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, skew
+from ins_align.geometry.rotation import (
+    Array, cumulative_rotations, exp_so3, nearest_rotation, skew)
 from ins_align.gnss.motion import GRID, Series
 from ins_align.imu.buffer import MAX_GAP_NS, SAME_VALUES
 from ins_align.imu.noise import force_fault, white_noise
@@ -385,9 +386,7 @@ def _fit(imu: _Imu, times: Array, v_n: Array, good: Array, gravity: float,
     weight = (good / np.maximum(good.sum(axis=1, keepdims=True), 1.0))[..., None]
     centred = [vectors - np.sum(weight * vectors, axis=1, keepdims=True)
                for vectors in (seen, felt)]
-    U, _, Vt = np.linalg.svd(np.swapaxes(weight * centred[0], 1, 2) @ centred[1])
-    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-    C_n0 = U @ Vt
+    C_n0 = nearest_rotation(np.swapaxes(weight * centred[0], 1, 2) @ centred[1])
     count, epochs = times.shape
     start = np.broadcast_to(np.eye(3), by_gyro.shape)
     J = np.concatenate([start, -skew(felt), by_gyro, by_lever, by_accel],
