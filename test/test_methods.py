@@ -116,6 +116,15 @@ def test_biases_spoil_the_note_and_not_the_bank():
     assert np.median(errors['bank']) < 0.5 < 1.0 < np.median(errors['vif'])
 
 
+@pytest.mark.parametrize('method', FORMULAS)
+def test_formula_gives_no_attitude_before_its_sigma_means_something(method):
+    _, epochs = aligned(simulated('flight', duration=4.0), **FORMULAS[method])
+    known = [epoch for epoch in epochs if epoch.initial is not None]
+    assert 0 < len(known) < len(epochs)
+    assert all(np.isfinite(attitude.covariance).all() for epoch in known
+               for attitude in (epoch.initial, epoch.current))
+
+
 def test_what_the_note_does_not_estimate_it_says_to_be_as_configured():
     s = simulated('flight', ideal=True, duration=12.2)
     status = aligned(s, method='vif')[0].status()

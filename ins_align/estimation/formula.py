@@ -230,7 +230,7 @@ class NoteMethod:
         else:
             return
         self._offered += 1
-        if self._moments.count < 3:
+        if self._rows <= 0:
             return
         C, residual, A = self._moments.solve()
         A_n = C @ A @ C.T
@@ -274,16 +274,19 @@ class NoteMethod:
 
     def fit(self) -> Fit:
         """Return how well the data fit."""
-        rows = 3 * self._moments.count - 3 - 3 * self._nuisance
-        if self._solution is None or rows <= 0:
+        if self._solution is None:
             return Fit(self._offered, delay=self._config.gnss_delay)
-        return Fit(self._offered, rows=rows, misfit=self._residual / sum(self._noise()) / rows,
-                   delay=self._config.gnss_delay)
+        return Fit(self._offered, rows=self._rows, delay=self._config.gnss_delay,
+                   misfit=self._residual / sum(self._noise()) / self._rows)
+
+    @property
+    def _rows(self) -> int:
+        """Return how many rows of the pairs are redundant."""
+        return 3 * (self._moments.count - 1 - self._nuisance)
 
     def _factor(self) -> float:
         """Return the factor on variances for data that fit worse than stated."""
-        fit = self.fit()
-        return max(1.0, fit.misfit) if fit.rows else math.inf
+        return max(1.0, self.fit().misfit)
 
     def move_t0(self) -> None:
         """Leave t0 where it is."""
