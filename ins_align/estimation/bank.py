@@ -30,7 +30,7 @@ from ins_align.estimation.linearised import EARLIEST, LATEST, linearised
 from ins_align.estimation.receiver import MOVING, ReceiverNoise
 from ins_align.estimation.rivals import level_in_words, Parameters, Rivals, SHARE
 from ins_align.estimation.start import (
-    all_headings, draw_anew, HEADINGS, OPEN_POSITION, RoughAttitude, Start)
+    all_headings, draw_anew, HEADINGS, OPEN_POSITION, RoughAttitude, Start, STEADY_VELOCITY)
 from ins_align.estimation.states import (
     biases, DELAY, FIRST, GYRO, Linearised, Measured, OF_VEHICLE, triads)
 from ins_align.estimation.track import InertialTrack
@@ -122,6 +122,7 @@ class Bank:
         self._innovation = NOTHING_NEW
         self._receiver = ReceiverNoise()
         self._in_a_row = 0                          # epochs that were rejected
+        self._vertical = True                       # whether it is measured
         # n0 and the point of linearisation hold for so many epochs, of which so many are left.
         self._point: Array | None = None
         self._span = self._left = 1
@@ -239,6 +240,10 @@ class Bank:
         kinds = [kind for kind, present in enumerate(measured.present[k]) if present]
         if not kinds:
             return
+        # A vehicle's velocity upwards in its own axes says something of the vertical one.
+        vertical = vehicle is not None or measured.vertical[k]
+        if vertical and not self._vertical:
+            filters.forget_vertical(measured.still[k, 2], STEADY_VELOCITY, OPEN_POSITION)
         news, receiver = [], self._receiver
         moving = bool(np.linalg.norm(measured.s[k, 0] - measured.still[k]) > MOVING)
         for kind in kinds:
@@ -251,6 +256,9 @@ class Bank:
         self._rejected[2] += not all(new.taken for new in news)
         self._in_a_row = self._in_a_row + 1 if any(new.fits_none for new in news) else 0
         self._innovation = news[0].normalised
+        if not vertical:
+            filters.forget_vertical(measured.still[k, 2])
+        self._vertical = vertical
         if vehicle is not None and due:
             vehicle.look(filters, model, k, measured)
         self._rivals.select(filters)

@@ -34,15 +34,14 @@ from typing import NamedTuple
 from ins_align.config import STANDARD_GRAVITY
 from ins_align.estimation.states import (
     biases, FIRST, GYRO, LEVER_ARM, Linearised, Measured, PHI, PHI0, RHO, transport,
-    turned_parameters)
+    turned_parameters, XI)
 from ins_align.geometry.rotation import (
     apply, Array, exp_so3, Index, log_so3, nearest_rotation, skew)
 import numpy as np
 
-# Normalised innovation squared of three rows above which a measurement is an outlier: one good
-# one in 60 000 is (chi-square with three degrees of freedom). To the weights it counts as this
-# much, so whatever else rejects a measurement must not leave its value below. A measurement beyond
-# 5 sigma in any direction is beyond this.
+# Normalised innovation squared of three rows above which a measurement is an outlier, as it is
+# beyond 5 sigma in any direction: one good one in 60 000 is (chi-square with three degrees of
+# freedom). To the weights an outlier counts as this much.
 GATE = 25.0
 # Log likelihood ratio of a motion that fits a vehicle, to one whose slips are so much larger that
 # a normalised innovation squared of twice this, of two rows, is as likely.
@@ -174,9 +173,8 @@ class Filters:
         for name in self._OF_MEANS:
             setattr(self, name, getattr(self, name)[means])
         left = np.isin(self.ids, self.rival)
-        if not left.all():
-            for name in self._OF_RIVALS:
-                setattr(self, name, getattr(self, name)[left])
+        for name in self._OF_RIVALS:
+            setattr(self, name, getattr(self, name)[left])
         self._find_places()
 
     def _weigh(self, log_likelihood: Array, real: 'Array | float' = 1.0) -> Array:
@@ -419,6 +417,16 @@ class Filters:
         self.C0 = C_n0n.T @ self.C
         self.P[:, PHI0] = self.P[:, PHI]
         self.P[:, :, PHI0] = self.P[:, :, PHI]
+
+    def forget_vertical(self, s_z: float, v_std: float = 0.0, p_std: float = 0.0) -> None:
+        """Let the vertical velocity be `s_z`, and know of it and of the position the sigmas only."""
+        up = self.C[self.lead, 2]
+        along = up[:, :, None] * up[:, None]
+        for rows, std in (XI, v_std), (RHO, p_std):
+            self.P[:, rows] -= along @ self.P[:, rows]
+            self.P[:, :, rows] -= self.P[:, :, rows] @ along
+            self.P[:, rows, rows] += std ** 2 * along
+        self.u[:, 2] = s_z
 
     def open_position(self, std: float) -> None:
         """Forget the position."""

@@ -119,5 +119,6 @@ class Measured:
     s: Array  #: (K, 2, 3), s_v and s_p
     covariance: Array  #: (K, 2, 3, 3)
     present: list[tuple[bool, bool]]  #: whether there is a velocity, a position
+    vertical: list[bool]  #: whether what is vertical is measured, of either
     stated: list[tuple[bool, bool]]  #: whether the receiver states its noise
     still: Array  #: (K, 3), s_v of what rests

@@ -23,6 +23,9 @@ from ins_align.geometry.rotation import Array, cross, running_sum
 from ins_align.gnss.messages import AntennaEpoch, velocities_of
 import numpy as np
 
+# Sigma (m/s, m) from which on a vertical velocity or position is not measured.
+UNMEASURED = 100.0
+
 
 @dataclass(frozen=True)
 class InertialTrack:
@@ -118,8 +121,12 @@ class InertialTrack:
         C_n0n = self.C_n0n[:, None]
         covariance = np.array([[epoch.velocity_covariance, epoch.position_covariance]
                                for epoch in epochs])
+        present = np.array([(epoch.v_n is not None, epoch.position_measured and use_position)
+                            for epoch in epochs])
+        vertical = np.any(present & (covariance[..., 2, 2] < UNMEASURED ** 2), axis=1)
+        if use_position:            # what comes between positions is no reason to forget them
+            vertical |= ~present[:, 1]
         return Measured(
             np.stack([self.s_v(velocities_of(epochs)), self.s_p], axis=1),
-            C_n0n @ covariance @ C_n0n.swapaxes(-1, -2),
-            [(epoch.v_n is not None, epoch.position_measured and use_position)
-             for epoch in epochs], [epoch.stated for epoch in epochs], self.still_v)
+            C_n0n @ covariance @ C_n0n.swapaxes(-1, -2), present.tolist(), vertical.tolist(),
+            [epoch.stated for epoch in epochs], self.still_v)

@@ -24,6 +24,7 @@ and mountings of all sizes.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 import itertools
 import math
 from pathlib import Path
@@ -258,8 +259,10 @@ def draw_worse(seed: int) -> Case:
 
 MOVING = tuple(name for name in SCENARIOS if name not in ('straight', 'static'))
 # Parameters of what the GNSS measures.
+HORIZONTAL = 'horizontal velocities'
 MEASURED: dict[str, JsonDict] = {
-    'velocities': {}, 'positions': {'use_velocity': False}, 'both': {'use_position': True}}
+    'velocities': {}, HORIZONTAL: {'velocity_vertical': 'absent'},
+    'positions': {'use_velocity': False}, 'both': {'use_position': True}}
 
 
 def run_settings(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
@@ -304,9 +307,12 @@ def draw_settings(seed: int) -> Case:
         'lever_arm_std': lever_std, **MEASURED[measured],
         **(CHIP_THRESHOLDS if grade == 'chip' else {})}
     return Case(f'{grade}{PAIR}{measured}', ((scenario, grade),),
-                None if stated else _state_nothing, arguments, config)
+                partial(_send, stated=stated, vertical=measured != HORIZONTAL), arguments, config)
 
 
-def _state_nothing(stream: Stream, random: Random) -> None:
-    stream.velocity['covariance'] = stream.fix['covariance'] = 0.0
-    stream.fix['covariance_type'] = 0
+def _send(stream: Stream, random: Random, stated: bool, vertical: bool) -> None:
+    if not stated:
+        stream.velocity['covariance'] = stream.fix['covariance'] = 0.0
+        stream.fix['covariance_type'] = 0
+    if not vertical:
+        stream.velocity['velocity'][:, 2] = 0.0
