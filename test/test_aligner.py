@@ -1354,6 +1354,36 @@ def test_a_receiver_that_never_measures_the_vertical_is_noticed(flight, result):
     assert run(lambda v: 0.0 * v).counts['velocity_no_vertical'] == 0
 
 
+@pytest.mark.parametrize('scenario', ['car', 'flight', 'hover'])
+def test_a_velocity_that_nothing_measures_says_nothing_about_the_tilt(scenario):
+    """It is unknown to metres per second, and turns with errors of the attitude."""
+    squares = []
+    for seed in range(2):
+        s = simulated(scenario, imu_grade='chip', duration=20.0, seed=seed, gnss_rate=20.0,
+                      velocity_std=0.02)
+        _, epochs = aligned(s, imu_grade='chip', velocity_vertical='absent')
+        squares += [normalised_error(epoch.current, s) / 3 for epoch in epochs
+                    if epoch.current is not None and epoch.t_s > 3.0]
+    # 0.6 to 2.4 where the vertical velocity is measured.
+    assert np.mean(squares) < 3.0
+
+
+def test_a_vertical_velocity_that_is_measured_again_is_used_again():
+    s = simulated('flight', imu_grade='tactical', duration=60.0, seed=1)
+    again = 75 + int(np.argmax(np.abs(s.velocity[75:225, 2])))
+    assert abs(s.velocity[again, 2]) > 1.0
+
+    def change(k, kind, message):
+        missing = kind == 'velocity' and 50 <= k < again
+        return message._replace(vertical=False) if missing else message
+
+    aligner = Aligner(config_for(s))
+    epochs = give_all(aligner, s, change=change)
+    assert aligner.counts['epochs_rejected_velocity'] == 0
+    assert epochs[-1].state is State.ALIGNED
+    assert normalised_error(epochs[-1].current, s) < chi2.ppf(0.9999, 3)
+
+
 @pytest.mark.parametrize('scenario, wrong', [('flight', 'late'), ('car', 'turned')])
 def test_a_receiver_that_is_wrong_at_first_is_not_held_against_it(scenario, wrong):
     """A receiver is wrong for two minutes, 1.6 s late or turned by 60 deg, and right then."""
