@@ -419,8 +419,8 @@ class Filters:
         self.P[:, :, PHI0] = self.P[:, :, PHI]
 
     def forget_vertical(self, s_z: float, v_std: float = 0.0, p_std: float = 0.0) -> None:
-        """Let the vertical velocity be `s_z`, known of it and of the position but the sigmas."""
-        up = self.C[self.lead, 2]
+        """Let the vertical velocity be `s_z`; of it and of the position only sigmas are known."""
+        up = self.C[self.lead, 2]       # to the likeliest mean of each rival
         along = up[:, :, None] * up[:, None]
         for rows, std in (XI, v_std), (RHO, p_std):
             self.P[:, rows] -= along @ self.P[:, rows]
