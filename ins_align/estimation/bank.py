@@ -122,7 +122,7 @@ class Bank:
         self._innovation = NOTHING_NEW
         self._receiver = ReceiverNoise()
         self._in_a_row = 0                          # epochs that were rejected
-        self._vertical = True                       # whether it is measured
+        self._vertical_measured = True              # at the last epoch
         # n0 and the point of linearisation hold for so many epochs, of which so many are left.
         self._point: Array | None = None
         self._span = self._left = 1
@@ -242,7 +242,7 @@ class Bank:
             return
         # A vehicle's velocity upwards in its own axes says something of the vertical one.
         vertical = vehicle is not None or measured.vertical[k]
-        if vertical and not self._vertical:
+        if vertical and not self._vertical_measured:
             filters.forget_vertical(measured.still[k, 2], STEADY_VELOCITY, OPEN_POSITION)
         news, receiver = [], self._receiver
         moving = bool(np.linalg.norm(measured.s[k, 0] - measured.still[k]) > MOVING)
@@ -258,7 +258,7 @@ class Bank:
         self._innovation = news[0].normalised
         if not vertical:
             filters.forget_vertical(measured.still[k, 2])
-        self._vertical = vertical
+        self._vertical_measured = vertical
         if vehicle is not None and due:
             vehicle.look(filters, model, k, measured)
         self._rivals.select(filters)

@@ -35,7 +35,7 @@ from ins_align.config import CHIP_THRESHOLDS, Config, PRESETS
 from ins_align.experiments.common import (
     aligned_row, bound_of, Case, cell, combination, follow, GRADES, groups_of, JsonDict,
     moment_row, parallel, prepare, Report, run_case, setup)
-from ins_align.experiments.spoilt import Random, Stream
+from ins_align.experiments.spoilt import Random, Stream, vertical_absent
 from ins_align.simulation.arguments import errors_of
 from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
@@ -315,4 +315,4 @@ def _send(stream: Stream, random: Random, stated: bool, vertical: bool) -> None:
         stream.velocity['covariance'] = stream.fix['covariance'] = 0.0
         stream.fix['covariance_type'] = 0
     if not vertical:
-        stream.velocity['velocity'][:, 2] = 0.0
+        vertical_absent(stream, random)

@@ -310,7 +310,8 @@ def _gnss_clock(stream: Stream, shift: int) -> None:
         rows['stamp'] += shift
 
 
-def _vertical_absent(stream: Stream, random: Random, **config: str) -> None:
+def vertical_absent(stream: Stream, random: Random, **config: str) -> None:
+    """Send 0 for the vertical velocity, as NMEA drivers do."""
     stream.velocity['velocity'][:, 2] = 0.0
     stream.config |= config
 
@@ -449,9 +450,9 @@ FAULTS: dict[str, Callable[[Stream, Random], Any]] = {
         [18 * SECOND, -HOUR, HOUR, -stream.first, 24 * HOUR]))),
     'GNSS clock seconds off': lambda stream, random: _gnss_clock(stream, int(
         random.choice([-1, 1]) * random.uniform(0.2, 5.0) * SECOND)),
-    'vertical absent, told': lambda stream, random: _vertical_absent(
+    'vertical absent, told': lambda stream, random: vertical_absent(
         stream, random, velocity_vertical='absent'),
-    'vertical absent, not told': _vertical_absent,
+    'vertical absent, not told': vertical_absent,
     'velocity of a body': _body_frame, 'IMU jitter': _imu_jitter, 'IMU twice': _imu_duplicates,
     'IMU out of order': _imu_out_of_order, 'IMU samples missing': _imu_missing,
     'IMU gap': lambda stream, random: stream.lose(['imu'], stream.windows(
