@@ -30,7 +30,7 @@ from ins_align.estimation.linearised import EARLIEST, LATEST, linearised
 from ins_align.estimation.receiver import MOVING, ReceiverNoise
 from ins_align.estimation.rivals import level_in_words, Parameters, Rivals, SHARE
 from ins_align.estimation.start import (
-    all_headings, draw_anew, HEADINGS, OPEN_POSITION, RoughAttitude, Start, STEADY_VELOCITY)
+    draw_anew, HEADINGS, OPEN_POSITION, RoughAttitude, Start, STEADY_VELOCITY)
 from ins_align.estimation.states import (
     biases, DELAY, FIRST, GYRO, Linearised, Measured, OF_VEHICLE, triads)
 from ins_align.estimation.track import InertialTrack
@@ -305,13 +305,14 @@ class Bank:
     def _begin_with(self, rough: RoughAttitude) -> None:
         """Start filters for all headings and rivals at t0, and feed them what has come since."""
         epochs, imu = self._start.epochs, self._start.imu
-        C = np.concatenate([all_headings(rough, sign) for sign in self._rivals.signs[:, 3]])
+        x = self._known[0].x
+        C, P = zip(*(self._start.filters(rough, x, known.P, sign) for known, sign in zip(
+            self._known, self._rivals.signs[:, 3].tolist())))
         rival = np.repeat(np.arange(len(self._rivals.table)), HEADINGS)
-        P = self._start.covariance(rough, np.array([known.P for known in self._known]))
         v_n = next((epoch.v_n for epoch in epochs if epoch.v_n is not None), np.zeros(3))
         self._freeze(epochs[0])
         inertial = self._inertial.along(epochs, self._n0_ns)
-        self._filters = filters = Filters(C, v_n, self._known[0].x, rival, P,
+        self._filters = filters = Filters(np.concatenate(C), v_n, x, rival, np.array(P),
                                           np.array([known.walk for known in self._known]),
                                           self._rivals.prior, self._rivals.counts)
         for k in range(len(epochs)):

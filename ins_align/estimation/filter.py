@@ -53,10 +53,9 @@ NO_TURN = 1e-3
 # A rate that is not known turns biases of the accelerometers against the tilt that they look like.
 # What is known of them is lost at the rate's variance times this (s).
 TURNING = 30.0
-# An epoch speaks of the heading alone where the sigma of the tilt that the accelerometers show is
-# at most this share of the heading's. Information on it (1/rad^2) that is less than the second is
-# none; what epochs say less than chance, the next ones may say more, at most the third.
-TILT_KNOWN, NO_NEWS, MOST_OWED = 0.5, 1e-9, 2.0
+# Information on the heading (1/rad^2) that is less than the first is none; what epochs say less
+# than chance, the next ones may say more, at most the second.
+NO_NEWS, MOST_OWED = 1e-9, 2.0
 # What the product of two errors does lasts so long (s).
 PRODUCT_TIME = 0.5
 # What is beyond first order in an innovation counts from so much of the receiver's noise on.
@@ -342,31 +341,25 @@ class Filters:
         up = self.C[lead, 2]
         self._reduce(test, taken, lead)
         column, variance = of_heading(self.P, up)
-        heard = taken & (self._apparent_tilt() < TILT_KNOWN ** 2 * variance)
-        if not heard.any():
-            return np.zeros(len(lead)), None
         W = test.inverse[lead] @ noise[lead]
         chance = self.owed + np.trace(W - W @ W, axis1=1, axis2=2)
         said = np.maximum(1 / variance - 1 / of_heading(before, up)[1], NO_NEWS)
-        gone = heard * np.clip(chance, 0.0, said)
-        self.owed = np.where(heard, np.minimum(chance - gone, MOST_OWED), self.owed)
+        gone = taken * np.clip(chance, 0.0, said)
+        self.owed = np.where(taken, np.minimum(chance - gone, MOST_OWED), self.owed)
         self.P += (gone / (1 - gone * variance))[:, None, None] * (
             column[:, :, None] * column[:, None])
         feigned = gone / said
         return feigned, (feigned / variance)[:, None] * column
 
-    def _apparent_tilt(self) -> Array:
-        """Return the variance, (M,), of the tilt that the accelerometers show."""
-        across = skew(self.C[self.lead, 2])
-        felt = np.concatenate([across, np.broadcast_to(_EYE / STANDARD_GRAVITY, across.shape)], 2)
-        tilt = across @ felt
-        P = self.P[:, self._tilt_and_bias[:, None], self._tilt_and_bias]
-        return np.einsum('mij,mij->m', tilt @ P, tilt)
-
     def _force_at_rest(self) -> Array:
         """Return the force at rest, (B, 3), as far as a bias that turns with a tilt is in it."""
+        across = skew(self.C[self.lead, 2])
+        felt = np.concatenate([across, np.broadcast_to(_EYE / STANDARD_GRAVITY, across.shape)], 2)
+        tilt = across @ felt        # that the accelerometers show
+        P = self.P[:, self._tilt_and_bias[:, None], self._tilt_and_bias]
+        apparent = np.einsum('mij,mij->m', tilt @ P, tilt)
         bias = self.P[:, self._tilt_and_bias[3:], self._tilt_and_bias[3:]].sum(axis=1)
-        share = bias / (bias + STANDARD_GRAVITY ** 2 * self._apparent_tilt())
+        share = bias / (bias + STANDARD_GRAVITY ** 2 * apparent)
         return STANDARD_GRAVITY * share[self.place, None] * self.C[:, 2]
 
     def _move(self, test: _Test, use: np.ndarray, lead: Index,

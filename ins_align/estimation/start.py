@@ -22,14 +22,14 @@ from dataclasses import replace
 import math
 from typing import NamedTuple
 
-from ins_align.config import Config
+from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimation.filter import Filters, of_heading
 from ins_align.estimation.moments import AttitudeMoments
 from ins_align.estimation.receiver import LEAST_NOISE, LOUD, MOVING, QUIET
-from ins_align.estimation.states import FIRST, PHI, PHI0, RHO, XI
+from ins_align.estimation.states import FIRST, PHI, PHI0, RHO, triads, XI
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.rotation import (
-    apply, Array, cross, cumulative_rotations, exp_so3, Index, log_so3)
+    apply, Array, cross, cumulative_rotations, exp_so3, Index, log_so3, skew)
 from ins_align.gnss.messages import (
     AntennaEpoch, NO_VERTICAL, UNKNOWN_ALTITUDE_STD, velocities_of)
 from ins_align.imu.preintegration import Intervals
@@ -39,7 +39,7 @@ import numpy as np
 # positions with a noise of some metres say grows with the square of the time that they span.
 FIRST_EPOCHS, MAX_WAITING = 4, 256
 # The vector from which a bank starts is so many times its noise.
-START_RATIO = 20.0
+START_RATIO = 40.0
 # Epochs whose sigma is so many times that of the best say nothing to a start.
 UNCERTAIN = 10.0
 # Epochs over so many seconds may tell less noise than is stated or configured: errors that last
@@ -53,7 +53,9 @@ TOO_NOISY = ('{epochs} GNSS epochs in {seconds:.0f} s are too noisy to start wit
 # to be flat to a tenth, and narrow, for errors of a heading are linearised.
 HEADINGS = 72
 STEP_STD = 0.4 * 2 * math.pi / HEADINGS
-TILT_STD = math.radians(10.0)
+# The tilt of the start is used with so many times its sigma, for the epochs that it is from are
+# used again, and with another one (rad), for what the formula does not know, as the lever arm.
+AGAIN, TILT_STD = 3.5, math.radians(3.0)
 # Headings are drawn anew when each has become as uncertain as this (rad).
 BLURRED = 0.2
 _EVEN = 2 * math.pi / HEADINGS * np.arange(HEADINGS)[:, None]
@@ -70,6 +72,7 @@ class RoughAttitude(NamedTuple):
     kind: int  #: 0 from velocities, 1 from positions
     stated: bool  #: whether the receiver states variances
     noise: float  #: factor on the receiver's variances
+    std: float  #: of the direction of the axis in n0, rad
 
 
 class Start:
@@ -132,8 +135,6 @@ class Start:
             seconds = time[places[-1]] - time[places[0]]
             if noise < 1 and seconds < LONG_ENOUGH and len(epochs) < MAX_WAITING:
                 return None
-            if values[-1] < START_RATIO ** 2 * usual * noise:
-                return None
             if noise < LOUD:
                 break
             if len(places) <= FIRST_EPOCHS + kind:
@@ -145,6 +146,8 @@ class Start:
             if (residual - min(left)) * (rows - 3) <= 3 * OUTLYING * min(left):
                 break
             places = np.delete(places, int(np.argmin(left)))
+        if values[-1] < START_RATIO ** 2 * usual * noise:
+            return None
         for k in np.setdiff1d(np.flatnonzero(use), places).tolist():
             self.epochs[k] = replace(epochs[k], **(
                 {'position_measured': False} if kind else {'v_n': None}))
@@ -153,7 +156,8 @@ class Start:
             self._drop_first()
             return self.solve(use_position)
         return RoughAttitude(C, vectors[:, -1], kind, stated,
-                             noise if noise > LOUD or noise < 1 or not stated else 1.0)
+                             noise if noise > LOUD or noise < 1 or not stated else 1.0,
+                             math.sqrt(usual * noise / values[-1]))
 
     @property
     def lacks(self) -> str:
@@ -196,34 +200,51 @@ class Start:
         horizontal = np.trace(covariance[:, :2, :2], axis1=1, axis2=2)
         return np.minimum(np.trace(covariance, axis1=1, axis2=2) / 3, horizontal)
 
-    def covariance(self, rough: RoughAttitude, known: Array) -> Array:
+    def filters(self, rough: RoughAttitude, x: Array, known: Array,
+                accel_sign: float) -> tuple[Array, Array]:
         """
-        Return the covariance of each rival's errors at t0, shape (M, n, n).
+        Return attitudes of a rival all round the axis, and the covariance of errors at t0.
 
-        `rough` is what `solve` returned, `known`, (M, m, m), the covariance of the parameters.
+        What accelerometers measure wrongly of gravity, ``b + M f``, is in the rough attitude: a
+        tilt of ``f x (b + M f) / f^2``.
+
+        Parameters
+        ----------
+        rough : RoughAttitude
+            As `solve` returned it.
+        x, known : ndarray, shapes (m,) and (m, m)
+            Parameters of the body and their covariance.
+        accel_sign : float
+            Of the accelerometers.
+
+        Returns
+        -------
+        C, P : ndarray, shapes (HEADINGS, 3, 3) and (n, n)
+
         """
-        along = np.outer(rough.axis, rough.axis)
-        attitude = TILT_STD ** 2 * (np.eye(3) - along) + STEP_STD ** 2 * along
-        M, m = known.shape[:2]
-        P = np.zeros((M, FIRST + m, FIRST + m))
+        C, axis = rough.C, rough.axis
+        if accel_sign < 0:
+            # With the accelerations reversed it is half a turn about any axis across.
+            across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+            C = C @ exp_so3(math.pi * across / np.linalg.norm(across))
+        upwards = math.copysign(accel_sign, float(axis @ self.imu.v.sum(axis=0)))
+        force = upwards * STANDARD_GRAVITY * axis
+        accel = triads(x.size)[1]
+        felt = np.hstack([np.eye(3), np.kron(np.eye(3), force)])[:, :accel.stop - accel.start]
+        tilt = skew(force) @ felt / STANDARD_GRAVITY ** 2
+        along = np.outer(axis, axis)
+        attitude = (tilt @ known[accel, accel] @ tilt.T + STEP_STD ** 2 * along
+                    + (AGAIN ** 2 * rough.std ** 2 + TILT_STD ** 2) * (np.eye(3) - along))
+        P = np.zeros((FIRST + x.size, FIRST + x.size))
+        P[FIRST:, FIRST:] = known
         for rows in (PHI, PHI0):
-            for columns in (PHI, PHI0):
-                P[:, rows, columns] = attitude
+            P[rows, PHI] = P[rows, PHI0] = attitude
+            P[rows, FIRST:] = tilt @ known[accel]
+            P[FIRST:, rows] = P[rows, FIRST:].T
         steady = any(epoch.v_n is not None for epoch in self.epochs)
-        P[:, XI, XI] = (STEADY_VELOCITY if steady else OPEN_VELOCITY) ** 2 * np.eye(3)
-        P[:, RHO, RHO] = OPEN_POSITION ** 2 * np.eye(3)
-        P[:, FIRST:, FIRST:] = known
-        return P
-
-
-def all_headings(rough: RoughAttitude, accel_sign: float) -> Array:
-    """Return attitudes all round the axis, shape (HEADINGS, 3, 3)."""
-    C, axis = rough.C, rough.axis
-    if accel_sign < 0:
-        # With the accelerations reversed it is half a turn about any axis across.
-        across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-        C = C @ exp_so3(math.pi * across / np.linalg.norm(across))
-    return C @ exp_so3(_EVEN * axis)
+        P[XI, XI] = (STEADY_VELOCITY if steady else OPEN_VELOCITY) ** 2 * np.eye(3)
+        P[RHO, RHO] = OPEN_POSITION ** 2 * np.eye(3)
+        return C @ exp_so3(_EVEN * axis) @ exp_so3(tilt @ x[accel]), P
 
 
 def draw_anew(filters: Filters) -> None:
