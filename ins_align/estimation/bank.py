@@ -306,7 +306,7 @@ class Bank:
         """Start filters for all headings and rivals at t0, and feed them what has come since."""
         epochs, imu = self._start.epochs, self._start.imu
         x = self._known[0].x
-        C, P = zip(*(self._start.filters(rough, x, known.P, sign) for known, sign in zip(
+        C, P = zip(*(self._start.means(rough, x, known.P, sign) for known, sign in zip(
             self._known, self._rivals.signs[:, 3].tolist())))
         rival = np.repeat(np.arange(len(self._rivals.table)), HEADINGS)
         v_n = next((epoch.v_n for epoch in epochs if epoch.v_n is not None), np.zeros(3))

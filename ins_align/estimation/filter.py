@@ -325,8 +325,7 @@ class Filters:
         P = self.P - HP.swapaxes(1, 2) @ (inverse * taken[:, None, None]) @ HP
         self.P = 0.5 * (P + P.swapaxes(1, 2))       # or rounding grows
 
-    def _learn(self, test: _Test, noise: Array,
-               taken: np.ndarray) -> 'tuple[Array, Array | None]':
+    def _learn(self, test: _Test, noise: Array, taken: np.ndarray) -> tuple[Array, Array]:
         """
         Reduce the covariances, but not by what noise may have said of the heading.
 
@@ -335,7 +334,7 @@ class Filters:
         mean, or less, W being the receiver's share of an innovation (docs, "Theory").
 
         Returns the share of what was said of the heading that may be chance, shape (M,), and what
-        of a correction goes back for each radian that it turns the heading, (M, n) or None.
+        of a correction goes back for each radian that it turns the heading, (M, n).
         """
         lead, before = self.lead, self.P
         up = self.C[lead, 2]

@@ -200,10 +200,10 @@ class Start:
         horizontal = np.trace(covariance[:, :2, :2], axis1=1, axis2=2)
         return np.minimum(np.trace(covariance, axis1=1, axis2=2) / 3, horizontal)
 
-    def filters(self, rough: RoughAttitude, x: Array, known: Array,
-                accel_sign: float) -> tuple[Array, Array]:
+    def means(self, rough: RoughAttitude, x: Array, known: Array,
+              accel_sign: float) -> tuple[Array, Array]:
         """
-        Return attitudes of a rival all round the axis, and the covariance of errors at t0.
+        Return the attitudes of a rival, all round the axis, and the covariance of errors at t0.
 
         What accelerometers measure wrongly of gravity, ``b + M f``, is in the rough attitude: a
         tilt of ``f x (b + M f) / f^2``.
