@@ -47,6 +47,8 @@ UNCERTAIN = 10.0
 LONG_ENOUGH = 1.0
 # One epoch is an outlier if it is so unlike the others: F statistic of its residuals over theirs.
 OUTLYING = 20.0
+# Among so many it is looked for before they are enough, which they hardly are with it.
+FEW = 64
 TOO_NOISY = ('{epochs} GNSS epochs in {seconds:.0f} s are too noisy to start with: fewer epochs a '
              'second, which are waited for longer, would do')
 # Headings, every five degrees, and their sigma (rad): wide enough for the sum of their densities
@@ -135,7 +137,8 @@ class Start:
             seconds = time[places[-1]] - time[places[0]]
             if noise < 1 and seconds < LONG_ENOUGH and len(epochs) < MAX_WAITING:
                 return None
-            if noise < LOUD:
+            enough = values[-1] >= START_RATIO ** 2 * usual * noise
+            if noise < LOUD or not (enough or len(places) <= FEW):
                 break
             if len(places) <= FIRST_EPOCHS + kind:
                 if noise > OUTLYING:                # and they do not tell which is the outlier
@@ -146,7 +149,7 @@ class Start:
             if (residual - min(left)) * (rows - 3) <= 3 * OUTLYING * min(left):
                 break
             places = np.delete(places, int(np.argmin(left)))
-        if values[-1] < START_RATIO ** 2 * usual * noise:
+        if not enough:
             return None
         for k in np.setdiff1d(np.flatnonzero(use), places).tolist():
             self.epochs[k] = replace(epochs[k], **(
