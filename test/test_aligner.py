@@ -1173,7 +1173,10 @@ def test_an_outlier_among_the_first_epochs_is_left_out_of_the_start(flight, posi
         aligner = Aligner(config_for(flight, use_velocity=False if positions else 'auto'))
         return aligner, give_all(aligner, flight, change=change)
 
-    (without, others), (aligner, epochs) = run(math.nan), run(1e-3 if positions else 30.0)
+    (_, plain), (without, others), (aligner, epochs) = map(
+        run, (0.0, math.nan, 1e-3 if positions else 30.0))
+    sigmas = epochs[-1].current.sigma_deg / plain[-1].current.sigma_deg
+    assert np.all(sigmas < 1.2)
     name = f'epochs_rejected_{"position" if positions else "velocity"}'
     assert aligner.counts[name] == without.counts.get(name, 0) + 1
     for ours, theirs in zip((epochs[-1].initial, epochs[-1].current),

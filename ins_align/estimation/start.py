@@ -230,7 +230,8 @@ class Start:
             # With the accelerations reversed it is half a turn about any axis across.
             across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
             C = C @ exp_so3(math.pi * across / np.linalg.norm(across))
-        upwards = math.copysign(accel_sign, float(axis @ self.imu.v.sum(axis=0)))
+        gained = np.sum([imu.v[0] for imu in self._imu], axis=0)
+        upwards = math.copysign(accel_sign, float(axis @ gained))
         force = upwards * STANDARD_GRAVITY * axis
         accel = triads(x.size)[1]
         felt = np.hstack([np.eye(3), np.kron(np.eye(3), force)])[:, :accel.stop - accel.start]
