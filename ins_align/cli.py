@@ -42,7 +42,7 @@ ALIGNED, NOT_ALIGNED, UNUSABLE, INTERRUPTED, NO_READER = 0, 1, 2, 130, 141
 PACKAGES = {'backports': 'backports.zstd', 'PIL': 'pillow', 'pyins': 'python-ins',
             'yaml': 'pyyaml'}
 
-SCENARIOS = 'flight, car, straight, static, hover, launch, reverse, swing, highway'
+SCENARIOS = 'flight, car, straight, static, hover, launch, reverse, swing, highway, robot'
 
 BAG_HELP = 'rosbag2 directory or file (.mcap, .db3), or ROS 1 .bag'
 

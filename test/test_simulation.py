@@ -19,8 +19,9 @@ import math
 from ins_align.config import config_from_mapping, ImuNoise, load_params, PRESETS
 from ins_align.geometry.rotation import log_so3, matrix_from_quaternion, matrix_from_rpy
 from ins_align.gnss.messages import ENU_FROM_NED
+from ins_align.simulation import scenarios
 from ins_align.simulation.scenarios import FLU_FROM_FRD, START_NS
-from ins_align.simulation.simulate import SCENARIOS, simulate, SimulationError, write_bag
+from ins_align.simulation.simulate import simulate, SimulationError, write_bag
 import numpy as np
 import pytest
 
@@ -51,7 +52,7 @@ def angle_deg(C_1, C_2):
 
 
 @pytest.mark.parametrize('scenario, options', [
-    *((name, {}) for name in SCENARIOS),
+    *((name, {}) for name in scenarios.SCENARIOS),
     ('flight', {'latitude_deg': -40.0}),
     ('flight', {'latitude_deg': 80.0, 'heading_deg': 130.0}),
     ('flight', {'imu_jitter': 0.3}),

@@ -142,7 +142,8 @@ SILENT = tuple(Case(scenario, ((scenario, 'mems'),), None, {'duration': SILENT_D
 
 def time_to_heading(runs: int, jobs: int | None) -> list[JsonDict]:
     """Time to a declared heading, where the bound crosses the threshold, and when it does."""
-    cases = [time_case(*kind) for kind in itertools.product(SCENARIOS, GRADES, (True, False))]
+    cases = [time_case(*kind)
+             for kind in itertools.product((*SCENARIOS, 'robot'), GRADES, (True, False))]
     [crossings] = parallel(crossing_time, [cases], jobs, 'bounds')
     reachable = [each for each in zip(cases, crossings) if each[1] is not None]
     seeds = range(TIME_SEED, TIME_SEED + runs)

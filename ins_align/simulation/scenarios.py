@@ -46,6 +46,10 @@ _CITY = ((1.0, 0.0, 0.0), (6.0, 2.0, 0.0), (5.0, 0.0, 0.0), (3.0, -2.0, 0.0),
          (5.2, 0.0, 0.3), (4.0, 2.0, 0.0), (6.0, 0.0, 0.05), (4.0, -2.0, 0.0),
          (4.5, 0.0, -0.35), (4.0, 1.5, 0.0), (5.0, 0.0, -0.06), (6.0, -2.0, 0.0),
          (4.0, 0.0, 0.0))
+# A robot turns on the spot too.
+_YARD = ((1.0, 0.0, 0.0), (1.5, 0.5, 0.0), (12.0, 0.0, 0.0), (1.5, -0.5, 0.0), (3.2, 0.0, 1.0),
+         (1.5, 0.4, 0.0), (8.0, 0.0, 0.15), (6.0, 0.0, -0.2), (1.5, -0.4, 0.0), (3.0, 0.0, -0.7),
+         (2.0, 0.0, 0.0), (2.0, -0.2, 0.0), (3.0, 0.0, 0.2), (2.0, 0.2, 0.0))
 _BACK_OUT = ((2.0, 0.0, 0.0), (2.0, -0.75, 0.0), (5.0, 0.0, 0.25), (2.0, 0.75, 0.0),
              (1.0, 0.0, 0.0))
 _THROW = ((2.0, 0.5, 3.5), (0.0, 30.0, 0.0))  # durations, accelerations
@@ -150,11 +154,12 @@ def _flight(time: Array, duration: float) -> Motion:
     return Motion(_along(speed, course, climb), np.stack([roll, pitch, yaw], axis=-1))
 
 
-def _road(time: Array, duration: float, first: _Rows = ()) -> Motion:
+def _road(time: Array, duration: float, first: _Rows = (), block: _Rows = _CITY,
+          bumps: float = 1.0) -> Motion:
     """Drive through streets, corners, bends and traffic lights, after what comes first."""
-    acceleration, rate = _course(first, _CITY, duration, 0.8)
+    acceleration, rate = _course(first, block, duration, 0.8)
     speed_along = acceleration.antiderivative()
-    speed, d = speed_along(time), speed_along.antiderivative()(time)
+    speed, d = speed_along(time), bumps * speed_along.antiderivative()(time)
     yaw, turn = rate.antiderivative()(time), rate(time)
     # Slopes and bumps belong to places: a car at rest does not move on them.
     slope = _wave(d, 0.03, 310.0) + _wave(d, 0.004, 9.7)
@@ -217,6 +222,7 @@ SCENARIOS = {
     'reverse': Scenario(partial(_road, first=_BACK_OUT), 100.0, 1.0),
     'swing': Scenario(partial(_steady, speed=5.0, waves=_SEA), 100.0, 5.0),
     'highway': Scenario(partial(_steady, speed=10.0, waves=_GUSTS), 60.0, 5.0),
+    'robot': Scenario(partial(_road, block=_YARD, bumps=10.0), 100.0, 1.0),
 }
 
 
