@@ -56,10 +56,8 @@ TURNING = 30.0
 # Information on the heading (1/rad^2) that is less than the first is none; what epochs say less
 # than chance, the next ones may say more, at most the second.
 NO_NEWS, MOST_OWED = 1e-9, 2.0
-# What the product of two errors does lasts so long (s).
-PRODUCT_TIME = 0.5
-# What is beyond first order in an innovation counts from so much of the receiver's noise on.
-BENT = 0.05
+# What the product of two errors does lasts so long (s), the second where one of them is the rate's.
+PRODUCT_TIME, RATE_TIME = 0.5, 10.0
 _EYE = np.eye(3)
 
 
@@ -80,7 +78,6 @@ class _Test(NamedTuple):
     inverse: Array          # of S
     weighted: Array         # (B, r), S^-1 times the innovation
     nis: Array              # (B,), normalised innovation squared
-    second_order: bool
 
 
 class Filters:
@@ -242,12 +239,12 @@ class Filters:
         H = model.H[k, kind]
         # What the receiver states is about axes of n0, which the means see in different ways.
         stated = C.swapaxes(1, 2) @ (measured.covariance[k, kind] * noise * noise[:, None]) @ C
-        arm_noise = self._arm_noise(H[..., FIRST:][..., LEVER_ARM], model.duration[k])
+        arm_noise = self._arm_noise(H[..., FIRST:][..., LEVER_ARM], model.duration[k], kind == 0)
         stated = stated + arm_noise[q, None, None] * _EYE
         missing = measured.s[k, kind] - (self.w if kind else self.u)
         innovation = (apply(C.swapaxes(1, 2), missing) + model.expected[k, kind][q]
                       - apply(H[q][..., FIRST:], self.x - model.point[q]))
-        test = self._second_look(self._test(H, stated, innovation), stated, innovation)
+        test = self._test(H, stated, innovation)
         good = test.nis < GATE
         # By the means before the measurement, which an outlier must not choose.
         taken = self._by_most(good)
@@ -261,19 +258,27 @@ class Filters:
         return Innovation(float(test.nis[i]) / 3, C[i] @ innovation[i] / sigmas,
                           bool(taken[best]), not taken[self.evidence.argmax()])
 
-    def _arm_noise(self, arm: Array, duration: float) -> Array:
+    def _arm_noise(self, arm: Array, duration: float, swings: bool) -> Array:
         """
-        Return the variance, (M,), of what an unknown turn makes of an unknown lever arm.
+        Return the variance, (M,), of what unknown turns and rates make of an unknown lever arm.
 
         `arm`, (M, 3, 3), has a measurement's derivatives to the lever arm. The product of two
         errors is in no derivative, and lasts from epoch to epoch, which are `duration` (s) apart.
+        An arm that a velocity sees swing does so at the error of the rate, too.
         """
-        lever = self.P[:, FIRST:, FIRST:][:, LEVER_ARM, LEVER_ARM]
-        unknown = np.trace(arm @ lever @ arm.swapaxes(1, 2), axis1=1, axis2=2)
-        turn = np.trace(self.P[:, PHI, PHI], axis1=1, axis2=2)
-        # Of a vector product of two that are independent, and alike in all directions.
-        variance: Array = 2 / 9 * turn * unknown * max(1.0, PRODUCT_TIME / max(duration, 1e-3))
-        return variance
+        parameters = self.P[:, FIRST:, FIRST:]
+        lever = parameters[:, LEVER_ARM, LEVER_ARM]
+
+        def product(a: Array, b: Array, lasts: float) -> Array:
+            """Of vectors that are independent, and alike in all directions."""
+            variance: Array = 2 / 9 * np.trace(a, axis1=1, axis2=2) * np.trace(b, axis1=1, axis2=2)
+            return variance * max(1.0, lasts / max(duration, 1e-3))
+
+        noise = product(self.P[:, PHI, PHI], arm @ lever @ arm.swapaxes(1, 2), PRODUCT_TIME)
+        if swings:
+            gyro, _ = biases(parameters.shape[1])
+            noise = noise + product(parameters[:, gyro, gyro], lever, RATE_TIME)
+        return noise
 
     def hold(self, held: np.ndarray, H: Array, variance: Array, innovation: Array,
              backwards: Array, tumbled: np.ndarray) -> None:
@@ -297,27 +302,14 @@ class Filters:
         self._reduce(test, taken, lead)
         self._move(test, good & taken[q], lead)
 
-    def _second_look(self, test: _Test, noise: Array, innovation: Array) -> _Test:
-        """
-        Test an innovation again to second order, unless the noise hides it.
-
-        An innovation is ``J m`` and noise, with m linear in the errors; ``J m ~ m + phi x m / 2``.
-        """
-        m = innovation - apply(noise, test.weighted)
-        variance = np.trace(self.P[:, PHI, PHI], axis1=1, axis2=2)[self.place]
-        if np.all(variance * np.einsum('bi,bi->b', m, m)
-                  <= BENT ** 2 * np.trace(noise, axis1=1, axis2=2)):
-            return test
-        more = -0.5 * skew(m)       # in the derivative to phi, which S has on both sides
-        HP = test.HP + more @ self.P[:, PHI][self.place]
-        S = test.S + more @ test.HP[..., PHI].swapaxes(1, 2) + HP[..., PHI] @ more.swapaxes(1, 2)
-        return _tested(HP, S, innovation, True)
-
     def _test(self, H: Array, noise: Array, innovation: Array) -> _Test:
         """Test an innovation, (B, r), with the derivatives of the rivals, (M, r, n)."""
         HP = H @ self.P
         S = (HP @ H.swapaxes(1, 2))[self.place] + noise
-        return _tested(HP[self.place], S, innovation, False)
+        inverse = np.asarray(np.linalg.inv(S), float)
+        weighted = apply(inverse, innovation)
+        return _Test(HP[self.place], S, inverse, weighted,
+                     np.einsum('ij,ij->i', innovation, weighted))
 
     def _reduce(self, test: _Test, taken: np.ndarray, lead: Index) -> None:
         """Take off the covariances what was measured of the means that lead."""
@@ -372,8 +364,7 @@ class Filters:
         if back is not None:
             heading = np.einsum('bi,bi->b', d[:, PHI], self.C[:, 2])
             d = d - heading[:, None] * back[self.place]
-        if not test.second_order and max(np.abs(d[lead, PHI]).max(),
-                                         np.abs(d[lead, PHI0]).max()) < NO_TURN:
+        if max(np.abs(d[lead, PHI]).max(), np.abs(d[lead, PHI0]).max()) < NO_TURN:
             self._shift(d)
             return
         rest = self._force_at_rest()
@@ -482,11 +473,3 @@ def of_heading(P: Array, up: Array) -> tuple[Array, Array]:
     """Return its covariance with all errors, shape (M, n), and its variance, (M,)."""
     column = apply(P[:, :, PHI], up)
     return column, np.einsum('ij,ij->i', up, column[:, PHI])
-
-
-def _tested(HP: Array, S: Array, innovation: Array, second_order: bool) -> _Test:
-    """Test innovations of a covariance, (B, r, r)."""
-    inverse = np.asarray(np.linalg.inv(S), float)
-    weighted = apply(inverse, innovation)
-    return _Test(HP, S, inverse, weighted, np.einsum('ij,ij->i', innovation, weighted),
-                 second_order)
