@@ -56,7 +56,7 @@ TURNING = 30.0
 # Information on the heading (1/rad^2) that is less than the first is none; what epochs say less
 # than chance, the next ones may say more, at most the second.
 NO_NEWS, MOST_OWED = 1e-9, 2.0
-# What the product of two errors does lasts so long (s), the second where one of them is the rate's.
+# What the product of two errors does lasts so long (s): where one is an attitude's, a rate's.
 PRODUCT_TIME, RATE_TIME = 0.5, 10.0
 _EYE = np.eye(3)
 
