@@ -551,7 +551,7 @@ def test_a_tilt_and_a_bias_that_are_known_together_stay_so():
     """A bias of 0.5 m/s^2 is a tilt whose square counts beside velocities of 0.02 m/s."""
     errors = []
     for seed in range(4, 7):
-        s = simulated('hover', imu_grade='chip', duration=40.0, seed=seed, gnss_rate=10.0,
+        s = simulated('hover', imu_grade='chip', duration=25.0, seed=seed, gnss_rate=10.0,
                       imu_rate=50.0, velocity_std=0.02)
         _, epochs = aligned(s, imu_grade='chip')
         errors += [normalised_error(epoch.current, s) / 3 for epoch in epochs
