@@ -56,7 +56,7 @@ TURNING = 30.0
 # Information on the heading (1/rad^2) that is less than the first is none; what epochs say less
 # than chance, the next ones may say more, at most the second.
 NO_NEWS, MOST_OWED = 1e-9, 2.0
-# What the product of two errors does lasts so long (s): where one is an attitude's, a rate's.
+# What an unknown lever arm does together with an unknown attitude, or rate, lasts so long (s).
 PRODUCT_TIME, RATE_TIME = 0.5, 10.0
 _EYE = np.eye(3)
 
@@ -268,16 +268,12 @@ class Filters:
         """
         parameters = self.P[:, FIRST:, FIRST:]
         lever = parameters[:, LEVER_ARM, LEVER_ARM]
-
-        def product(a: Array, b: Array, lasts: float) -> Array:
-            """Of vectors that are independent, and alike in all directions."""
-            variance: Array = 2 / 9 * np.trace(a, axis1=1, axis2=2) * np.trace(b, axis1=1, axis2=2)
-            return variance * max(1.0, lasts / max(duration, 1e-3))
-
-        noise = product(self.P[:, PHI, PHI], arm @ lever @ arm.swapaxes(1, 2), PRODUCT_TIME)
+        noise = (max(1.0, PRODUCT_TIME / max(duration, 1e-3))
+                 * _product(self.P[:, PHI, PHI], arm @ lever @ arm.swapaxes(1, 2)))
         if swings:
             gyro, _ = biases(parameters.shape[1])
-            noise = noise + product(parameters[:, gyro, gyro], lever, RATE_TIME)
+            noise = noise + (max(1.0, RATE_TIME / max(duration, 1e-3))
+                             * _product(parameters[:, gyro, gyro], lever))
         return noise
 
     def hold(self, held: np.ndarray, H: Array, variance: Array, innovation: Array,
@@ -473,3 +469,13 @@ def of_heading(P: Array, up: Array) -> tuple[Array, Array]:
     """Return its covariance with all errors, shape (M, n), and its variance, (M,)."""
     column = apply(P[:, :, PHI], up)
     return column, np.einsum('ij,ij->i', up, column[:, PHI])
+
+
+def _product(A: Array, B: Array) -> Array:
+    """
+    Return the variance, (M,), of the vector product of vectors of covariances A, B, (M, 3, 3).
+
+    They are independent, and taken as alike in all directions.
+    """
+    variance: Array = 2 / 9 * np.trace(A, axis1=1, axis2=2) * np.trace(B, axis1=1, axis2=2)
+    return variance

@@ -156,7 +156,11 @@ def _flight(time: Array, duration: float) -> Motion:
 
 def _road(time: Array, duration: float, first: _Rows = (), block: _Rows = _CITY,
           bumps: float = 1.0) -> Motion:
-    """Drive through streets, corners, bends and traffic lights, after what comes first."""
+    """
+    Drive a block again and again, by default of streets and corners, after what comes first.
+
+    `bumps` says how many times closer together slopes and bumps are than those of streets.
+    """
     acceleration, rate = _course(first, block, duration, 0.8)
     speed_along = acceleration.antiderivative()
     speed, d = speed_along(time), bumps * speed_along.antiderivative()(time)
