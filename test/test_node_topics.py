@@ -66,7 +66,7 @@ class NavsatTransform:
 @pytest.mark.parametrize('gnss_rate', [5.0, *(
     pytest.param(rate, marks=pytest.mark.campaign) for rate in (1.0, 10.0))])
 def test_who_listens_gets_the_heading_whenever_it_joins(gnss_rate, tmp_path):
-    simulation = simulate('flight', imu_grade='tactical', seed=3, duration=DURATION,
+    simulation = simulate('flight', imu_grade='tactical', seed=1, duration=DURATION,
                           gnss_rate=gnss_rate)
     messages = simulated_messages(simulation)
     start_ns = messages[0][0]
@@ -94,7 +94,7 @@ def test_who_listens_gets_the_heading_whenever_it_joins(gnss_rate, tmp_path):
 
 
 def test_numbers_for_plots(tmp_path):
-    simulation = simulate('flight', imu_grade='tactical', seed=3, duration=16.0)
+    simulation = simulate('flight', imu_grade='tactical', seed=1, duration=16.0)
     angles, sigmas, states = [], [], []
     with Listener() as listener, running_node(PARAMETERS):
         for msg_type, topic, store in ((Vector3Stamped, 'roll_pitch_yaw_deg', angles),

@@ -70,7 +70,7 @@ def _felt(phi: Array, d_accel: Array, back: Array, rest: Array) -> Array:
 
 def transport(d: Array, half: Array, rest: Array) -> Array:
     """
-    Return G of ``exp(d)^-1 exp(d + e) ~ exp(G e)``, (B, 15, 15).
+    Return G, (B, 15, 15): errors d + e of a mean are about G e where d has corrected it.
 
     d and e, (B, 15), are errors of attitude, velocity, position, attitude at t0, and biases of the
     accelerometers. `half` has half of the turns by phi and phi0, (2, B, 3, 3); `rest` is as in
@@ -79,8 +79,7 @@ def transport(d: Array, half: Array, rest: Array) -> Array:
     G = np.zeros((*d.shape, d.shape[1]))
     back, accel = half[0].swapaxes(1, 2), slice(FIRST, FIRST + 3)
     G[:, PHI, PHI], G[:, PHI0, PHI0] = half.swapaxes(2, 3)
-    for rows in XI, RHO:
-        G[:, rows, rows], G[:, rows, PHI] = back, -0.5 * skew(d[:, rows])
+    G[:, XI, XI] = G[:, RHO, RHO] = back
     G[:, accel, accel] = back @ back
     G[:, accel, PHI] = (back @ back @ skew(rest)
                         - skew(_felt(d[:, PHI], d[:, accel], back, rest)) @ back)

@@ -247,6 +247,8 @@ SPOTS = tuple(case._replace(simulate={'duration': DURATION, **case.simulate}) fo
     Case('GNSS every 5 s, navigation grade', (('flight', 'navigation'),), None,
          {'gnss_rate': 0.2, 'duration': 100.0}),
     Case('1 Hz sent again at 5 Hz', CAR + FLIGHT, _resent),
+    Case('no GNSS for two minutes from 15 s on', CAR + FLIGHT + HOVER, None,
+         {'duration': 170.0, 'outages': ((15.0, 135.0),)}),
     Case('GNSS stays away after 60 s', CAR + FLIGHT, None, AWAY, part=3),
     Case('GNSS stays away after 60 s, vif', (('flight', 'tactical'),), None,
          {**AWAY, 'duration': 600.0, 'outages': ((60.0, 600.0),)}, {'method': 'vif'}, part=6),
