@@ -536,17 +536,15 @@ def test_a_chip_at_rest_is_no_surer_of_its_tilt_than_of_its_accelerometers():
     assert least > 0.8 * np.degrees(PRESETS['chip'].accel_bias_std / STANDARD_GRAVITY)
 
 
-@pytest.mark.parametrize('lever_arm_std, least', [(0.0, 75.0), (1.0, 100.0)])
+@pytest.mark.parametrize('lever_arm_std, least', [(0.0, 95.0), (1.0, 100.0)])
 def test_a_chip_at_rest_knows_no_rate_about_the_vertical(lever_arm_std, least):
     """Noise that looks like a turn must not say that there is one, however quiet the receiver."""
-    sigmas = []
-    for seed in range(4):
+    for seed in range(2):
         s = simulated('static', imu_grade='chip', duration=40.0, seed=seed, gnss_rate=10.0,
                       imu_rate=50.0, velocity_std=0.02)
         aligner, epochs = aligned(s, imu_grade='chip', lever_arm_std=lever_arm_std)
         assert aligner.status().gyro_bias_std[2] > 0.7 * PRESETS['chip'].gyro_bias_std
-        sigmas.append(min(epoch.current.sigma_deg[2] for epoch in epochs if epoch.current))
-    assert np.mean(sigmas) > least
+        assert min(epoch.current.sigma_deg[2] for epoch in epochs if epoch.current) > least
 
 
 @pytest.mark.parametrize('grade', ['navigation', 'mems', 'chip'])
@@ -557,7 +555,7 @@ def test_a_start_at_rest_feigns_no_heading(seed, grade):
                   heading_deg=40.0 * seed, mount_rpy_deg=(15.0, -15.0, 0.0))
     s = replace(s, velocity_covariance=np.zeros((3, 3)))    # which states nothing
     epochs = feed(Aligner(Config(imu_grade=grade, gnss_lateness=1.0)), s)
-    assert min(epoch.current.sigma_deg[2] for epoch in epochs if epoch.current) > 80.0
+    assert min(epoch.current.sigma_deg[2] for epoch in epochs if epoch.current) > 100.0
 
 
 def test_a_tilt_and_a_bias_that_are_known_together_stay_so():
