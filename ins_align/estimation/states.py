@@ -72,6 +72,7 @@ def transport(d: Array, half: Array, rest: Array) -> Array:
     """
     Return G, (B, 15, 15): errors d + e of a mean are about G e where d has corrected it.
 
+    Velocity and position, once measured, do not turn with the attitude (docs, "Theory").
     d and e, (B, 15), are errors of attitude, velocity, position, attitude at t0, and biases of the
     accelerometers. `half` has half of the turns by phi and phi0, (2, B, 3, 3); `rest` is as in
     `turned_parameters`.
