@@ -72,7 +72,9 @@ def transport(d: Array, half: Array, rest: Array) -> Array:
     """
     Return G, (B, 15, 15): errors d + e of a mean are about G e where d has corrected it.
 
-    Velocity and position, once measured, do not turn with the attitude (docs, "Theory").
+    What the group adds to velocity and position, the product of their correction and an error of
+    the attitude, is left out: a measurement takes it off again (docs, "Theory").
+
     d and e, (B, 15), are errors of attitude, velocity, position, attitude at t0, and biases of the
     accelerometers. `half` has half of the turns by phi and phi0, (2, B, 3, 3); `rest` is as in
     `turned_parameters`.
