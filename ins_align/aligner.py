@@ -83,7 +83,7 @@ class Aligner:
         """Forget everything but the counts."""
         lateness_ns = round(self.config.gnss_lateness * 1e9) + max(self._delay_ns, 0)
         self._imu = ImuBuffer(lateness_ns, self._counts, self.config.imu_noise)
-        self._gnss = GnssBuffer(lateness_ns, self._counts)
+        self._gnss = GnssBuffer(lateness_ns, self._counts, max(-self._delay_ns, 0))
         self._refusal = ''                          # why velocities cannot be used
         self._first_t0_ns: int | None = None
         self._forget(None)

@@ -29,8 +29,8 @@ from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, Index
 from ins_align.gnss.messages import Fix, numbers_of, usable, Velocity
 from ins_align.gnss.motion import (
-    EMPTY, GRID, on_grid, Series, series_of, track, velocity_frame, velocity_from_positions,
-    VelocityFrame, without_wild_positions)
+    differences, EMPTY, GRID, on_grid, Series, series_of, track, velocity_frame,
+    velocity_from_positions, VelocityFrame, without_wild_positions)
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.results import State, Status
 import numpy as np
@@ -191,9 +191,7 @@ class InputChecks:
 
     def faults(self) -> list[str]:
         """Return what is wrong with units and coordinates, each in a sentence."""
-        fixes, velocities = (
-            series_of(*np.split(np.array(rows), [1], axis=1)) if rows else EMPTY
-            for rows in (self._fixes, self._velocities))
+        fixes, velocities = self._gnss()
         motion = on_grid(velocities) if velocities.times.size > 1 else velocity_from_positions(
             track(fixes))
         cells = sorted(self._cells)
@@ -204,6 +202,18 @@ class InputChecks:
         exchanged = exchange_fault(fixes, velocities) or (
             BEYOND_THE_POLES if self._beyond_the_poles > MIN_LATE else '')
         return [fault for fault in (degrees, exchanged) if fault]
+
+    def velocities(self) -> Series:
+        """Return the latest velocities, m/s, of positions where there are no others."""
+        fixes, velocities = self._gnss()
+        return velocities if velocities.times.size else differences(track(fixes))
+
+    def _gnss(self) -> tuple[Series, Series]:
+        """Return the latest positions, degrees and m, and velocities, m/s."""
+        fixes, velocities = (
+            series_of(*np.split(np.array(rows), [1], axis=1)) if rows else EMPTY
+            for rows in (self._fixes, self._velocities))
+        return fixes, velocities
 
     def late_messages(self) -> list[str]:
         """Return that messages come too late, in a sentence, where they do."""

@@ -136,7 +136,7 @@ class Config:
         'measured', 'absent: the receiver does not measure the vertical velocity and sends 0, as '
         'NMEA drivers do', choices=('measured', 'absent'))
     gnss_delay: float = _parameter(
-        0.0, 'a GNSS measurement is older than its stamp by this much', 's', -10.0, 10.0)
+        0.0, 'a GNSS measurement is older than its stamp by this much', 's', -60.0, 60.0)
     gnss_delay_std: float = _parameter(
         0.1, 'how well the delay is known, 1 sigma; above 0 it is estimated too', 's', 0.0, 10.0)
     gnss_lateness: float = _parameter(

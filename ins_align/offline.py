@@ -16,17 +16,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 import os
 from typing import Any, TYPE_CHECKING, Union
 
 from ins_align.aligner import Aligner
 from ins_align.checks import InputChecks
-from ins_align.config import Config, config_from_mapping, ConfigError
+from ins_align.config import Config, config_from_mapping, ConfigError, STANDARD_GRAVITY
 from ins_align.geometry.rotation import Array, Index, Transform
 from ins_align.gnss import messages
 from ins_align.gnss.messages import Fix, usable, Velocity
+from ins_align.gnss.motion import series_of
 from ins_align.imu.buffer import MAX_GAP_NS
-from ins_align.results import Epoch, in_order_of_time, Reference, Result
+from ins_align.recordings.motion_fit import fit_motion, MAX_DELAY_STD
+from ins_align.results import Epoch, in_order_of_time, Reference, Result, State
 import numpy as np
 
 if TYPE_CHECKING:
@@ -81,6 +84,19 @@ class _Run:
         self._checks.add(stamps_ns, gyro, accel, [
             (before, message) for before, message in gnss
             if isinstance(message, (Fix, Velocity))])
+
+    def other_delay(self, stamps_ns: Index, samples: Array) -> str:
+        """Say that the motion, with samples of shape (N, 6), shows another delay; or ''."""
+        good = np.isfinite(samples).all(axis=1)
+        found = fit_motion(series_of(stamps_ns[good] * 1e-9, samples[good]),
+                           self._checks.velocities(), STANDARD_GRAVITY)
+        if found.get('gnss_delay_std', MAX_DELAY_STD) >= MAX_DELAY_STD:
+            return ''
+        delay, config = found['gnss_delay'], self._config
+        if abs(delay - config.gnss_delay) < 3.0 * max(config.gnss_delay_std, MAX_DELAY_STD):
+            return ''
+        return (f'the motion fits GNSS stamps that are {delay:.2f} s late: check the clocks, or '
+                f'set gnss_delay={delay:.2f}')
 
     def result(self, **of_recording: Any) -> Result:
         """Return what came of it, at the end."""
@@ -206,7 +222,12 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
                              [message.stamp_ns for message in gnss], side='right')
     run = _Run(settings)
     run.add(stamps_ns, rates, forces, list(zip(before.tolist(), gnss)))
-    return run.result()
+    result = run.result()
+    if result.status.state not in (State.ALIGNED, State.FAULT) and (
+            delay := run.other_delay(stamps_ns, np.hstack([rates, forces]))):
+        result = replace(result, status=replace(
+            result.status, reason=f'{result.status.reason}; {delay}'))
+    return result
 
 
 def _numbers(given: Any) -> Array:
@@ -267,7 +288,8 @@ def _messages(name: str, given: Any, kind: type, unit_ns: float, config: Config)
     known = table.shape[1] > 4
     covariances = np.zeros((len(table), 6, 6))
     if table.shape[1] == 7:
-        covariances[:, [0, 1, 2], [0, 1, 2]] = np.square(table[:, 4:])
+        # What is below 0 is no standard deviation, and no covariance: none is known.
+        covariances[:, [0, 1, 2], [0, 1, 2]] = table[:, 4:] * np.abs(table[:, 4:])
     elif known:
         covariances[:, :3, :3] = table[:, 4:].reshape(-1, 3, 3)
     if kind is Velocity:

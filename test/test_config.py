@@ -79,7 +79,7 @@ def test_lever_arm_refused(value):
 
 @pytest.mark.parametrize('name, value', [
     ('hold_time', math.nan), ('hold_time', -1.0), ('hold_time', '2'), ('hold_time', True),
-    ('hold_time', None), ('heading_std_threshold', 0.0), ('gnss_delay', 11.0),
+    ('hold_time', None), ('heading_std_threshold', 0.0), ('gnss_delay', 61.0),
     ('gnss_delay', 10 ** 400), ('method', 'kalman'), ('method', 1), ('free_start', 1),
     ('free_start', 'maybe'), ('use_velocity', 1), ('use_position', 'yes'),
     ('world_frame_id', ''), ('world_frame_id', '/map'), ('world_frame_id', 'a b'),

@@ -129,7 +129,7 @@ def test_an_imu_as_good_as_its_grade_needs_no_setting(tmp_path, seed):
     ('flight', {'duration': 120.0}), pytest.param(
         'car', {'duration': 200.0, 'gnss_rate': 1.0}, marks=pytest.mark.campaign)])
 @pytest.mark.parametrize('delay', [
-    -0.1, pytest.param(0.3, marks=pytest.mark.campaign), 0.8])
+    -0.1, pytest.param(0.3, marks=pytest.mark.campaign), 0.8, -18.0])
 def test_delay_of_the_receiver(tmp_path, scenario, arguments, delay):
     """Whatever the lever arm is, which nobody has stated."""
     truth = simulate(scenario, seed=4, gnss_delay=max(delay, 0.0),

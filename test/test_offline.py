@@ -221,6 +221,28 @@ def test_units_that_are_wrong_are_named():
     assert change['state'] == 'FAULT' and 'deg/s' in change['reason']
 
 
+@pytest.mark.parametrize('off', [-18.0, 3.0])
+def test_a_clock_that_is_off_is_told_from_the_motion(off):
+    """Arrays have no order of arrival that would show it: GPS time, UTC, a wrong second."""
+    s = simulated('car', duration=120.0, seed=2)
+    fixes, velocities = tables(s)
+    for table in fixes, velocities:
+        table[:, 0] += off * 1e9
+    result = ins_align.align(*imu(s), fixes, velocities, **LEVER)
+    assert not result.aligned
+    _, _, delay = result.status.reason.rpartition('check the clocks, or set gnss_delay=')
+    assert float(delay) == pytest.approx(off, abs=0.05)
+    again = ins_align.align(*imu(s), fixes, velocities, **LEVER, gnss_delay=float(delay))
+    assert again.aligned and normalised_error(again.current, s) < chi2.ppf(0.9999, 3)
+
+
+def test_no_delay_is_told_where_the_clock_is_right(flight):
+    fixes, velocities = tables(flight)
+    reason = ins_align.align(*imu(flight), fixes, velocities, **LEVER,
+                             heading_std_threshold=0.01).status.reason
+    assert 'heading sigma' in reason and 'gnss_delay' not in reason
+
+
 def test_no_data():
     nothing = np.zeros((0, 3))
     result = ins_align.align(np.zeros(0), nothing, nothing, [])

@@ -243,7 +243,7 @@ class Bank:
         # A vehicle's velocity upwards in its own axes says something of the vertical one.
         vertical = vehicle is not None or measured.vertical[k]
         if vertical and not self._vertical_measured:
-            filters.forget_vertical(measured.still[k, 2], STEADY_VELOCITY, OPEN_POSITION)
+            filters.reset_vertical(measured.still[k, 2], STEADY_VELOCITY, OPEN_POSITION)
         news, receiver = [], self._receiver
         moving = bool(np.linalg.norm(measured.s[k, 0] - measured.still[k]) > MOVING)
         for kind in kinds:
@@ -257,7 +257,7 @@ class Bank:
         self._in_a_row = self._in_a_row + 1 if any(new.fits_none for new in news) else 0
         self._innovation = news[0].normalised
         if not vertical:
-            filters.forget_vertical(measured.still[k, 2])
+            filters.reset_vertical(measured.still[k, 2])
         self._vertical_measured = vertical
         if vehicle is not None and due:
             vehicle.look(filters, model, k, measured)

@@ -268,12 +268,11 @@ class Filters:
         """
         parameters = self.P[:, FIRST:, FIRST:]
         lever = parameters[:, LEVER_ARM, LEVER_ARM]
-        noise = (max(1.0, PRODUCT_TIME / max(duration, 1e-3))
-                 * _product(self.P[:, PHI, PHI], arm @ lever @ arm.swapaxes(1, 2)))
+        seen = arm @ lever @ arm.swapaxes(1, 2)
+        noise = _product(self.P[:, PHI, PHI], seen, PRODUCT_TIME / max(duration, 1e-3))
         if swings:
             gyro, _ = biases(parameters.shape[1])
-            noise = noise + (max(1.0, RATE_TIME / max(duration, 1e-3))
-                             * _product(parameters[:, gyro, gyro], lever))
+            noise += _product(parameters[:, gyro, gyro], lever, RATE_TIME / max(duration, 1e-3))
         return noise
 
     def hold(self, held: np.ndarray, H: Array, variance: Array, innovation: Array,
@@ -397,7 +396,7 @@ class Filters:
         self.P[:, PHI0] = self.P[:, PHI]
         self.P[:, :, PHI0] = self.P[:, :, PHI]
 
-    def forget_vertical(self, s_z: float, v_std: float = 0.0, p_std: float = 0.0) -> None:
+    def reset_vertical(self, s_z: float, v_std: float = 0.0, p_std: float = 0.0) -> None:
         """Let the vertical velocity be `s_z`; of it and of the position only sigmas are known."""
         up = self.C[self.lead, 2]       # to the likeliest mean of each rival
         along = up[:, :, None] * up[:, None]
@@ -471,11 +470,12 @@ def of_heading(P: Array, up: Array) -> tuple[Array, Array]:
     return column, np.einsum('ij,ij->i', up, column[:, PHI])
 
 
-def _product(A: Array, B: Array) -> Array:
+def _product(A: Array, B: Array, epochs: float) -> Array:
     """
     Return the variance, (M,), of the vector product of vectors of covariances A, B, (M, 3, 3).
 
-    They are independent, and taken as alike in all directions.
+    They are independent, and taken as alike in all directions. An error that lasts for some epochs
+    counts as a noise with as many times the variance.
     """
     variance: Array = 2 / 9 * np.trace(A, axis1=1, axis2=2) * np.trace(B, axis1=1, axis2=2)
-    return variance
+    return max(1.0, epochs) * variance

@@ -57,7 +57,7 @@ HEADINGS = 72
 STEP_STD = 0.4 * 2 * math.pi / HEADINGS
 # The tilt of the start is used with so many times its sigma, for the epochs that it is from are
 # used again, and with another one (rad), for what the formula does not know, as the lever arm.
-AGAIN, TILT_STD = 3.5, math.radians(3.0)
+REUSED, TILT_STD = 3.5, math.radians(3.0)
 # Headings are drawn anew when each has become as uncertain as this (rad).
 BLURRED = 0.2
 _EVEN = 2 * math.pi / HEADINGS * np.arange(HEADINGS)[:, None]
@@ -238,7 +238,7 @@ class Start:
         tilt = skew(force) @ felt / STANDARD_GRAVITY ** 2
         along = np.outer(axis, axis)
         attitude = (tilt @ known[accel, accel] @ tilt.T + STEP_STD ** 2 * along
-                    + (AGAIN ** 2 * rough.std ** 2 + TILT_STD ** 2) * (np.eye(3) - along))
+                    + (REUSED ** 2 * rough.std ** 2 + TILT_STD ** 2) * (np.eye(3) - along))
         P = np.zeros((FIRST + x.size, FIRST + x.size))
         P[FIRST:, FIRST:] = known
         for rows in (PHI, PHI0):

@@ -60,9 +60,9 @@ class GnssBuffer:
     (``velocity_no_fix``).
     """
 
-    def __init__(self, lateness_ns: int, counts: Counter[str]) -> None:
-        """Start empty."""
-        self._lateness_ns = lateness_ns
+    def __init__(self, lateness_ns: int, counts: Counter[str], earliness_ns: int = 0) -> None:
+        """Start empty; stamps may be so far behind the IMU, and ahead by more than usual."""
+        self._lateness_ns, self._ahead_ns = lateness_ns, MAX_AHEAD_NS + earliness_ns
         self._counts = counts
         self._pending: dict[int, GnssEpoch] = {}
         self._said: tuple[float, ...] = ()          # position and velocity, released last
@@ -78,7 +78,7 @@ class GnssBuffer:
         message, fault = usable(message)
         stamp_ns = message.stamp_ns
         behind_ns = 0 if imu_newest_ns is None else imu_newest_ns - stamp_ns
-        off = behind_ns > self._lateness_ns or behind_ns < -MAX_AHEAD_NS
+        off = behind_ns > self._lateness_ns or behind_ns < -self._ahead_ns
         if fault:
             self._counts[f'{kind}_{fault}'] += 1
             if fault == 'nan' or off:

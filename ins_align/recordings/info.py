@@ -28,7 +28,6 @@ from ins_align.checks import (
 from ins_align.config import Config, config_from_mapping
 from ins_align.estimation.receiver import QUIET
 from ins_align.geometry.earth import normal_gravity
-from ins_align.gnss.buffer import MAX_AHEAD_NS
 from ins_align.gnss.messages import enu_from_ned, NO_VERTICAL
 from ins_align.gnss.motion import (
     differences, EMPTY, find_manoeuvres, MANOEUVRE_SPEED, MANOEUVRE_TIME, on_grid, Series, track,
@@ -36,7 +35,8 @@ from ins_align.gnss.motion import (
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings import BagError, printable
 from ins_align.recordings.bag import Bag
-from ins_align.recordings.imu_survey import fit_motion, survey_imu
+from ins_align.recordings.imu_survey import survey_imu
+from ins_align.recordings.motion_fit import fit_motion
 from ins_align.recordings.reader import choose_topics
 from ins_align.recordings.topic_survey import (
     in_words, read_candidates, Recorded, rounded, Surveyed)
@@ -46,7 +46,6 @@ import numpy as np
 WEAK_CHANGE = 1.0  # m/s: a smaller change shows no heading with a usual receiver
 MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
 MIN_AHEAD = 0.3  # s: clocks that differ by less may be jitter
-MAX_AHEAD = MAX_AHEAD_NS * 1e-9  # s: stamps further ahead are of another clock
 MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s and so many sigmas beyond it: a delay to be set
 FRAMES_THAT_FIT = ('enu', 'ned')
 FRAME_FAULTS = {
@@ -223,7 +222,7 @@ def _add_clocks(info: Info, imu: Recorded, gnss: list[Recorded]) -> None:
     """Say which stamps are of another clock than those of the IMU."""
     for data in gnss:
         age = data.age_s - imu.age_s
-        if data.stamps_ns.size and not -MAX_AHEAD < age < MAX_DELAY:
+        if data.stamps_ns.size and abs(age) >= MAX_DELAY:
             info.add(f'the stamps of {data.name} are {abs(age):.1f} s '
                      f'{"behind" if age > 0.0 else "ahead of"} those of {imu.name}: they are of '
                      'different clocks', fault=True)

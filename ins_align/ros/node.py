@@ -298,10 +298,10 @@ class AlignmentNode(Node):
     def _align(self) -> None:
         """Process what can be processed."""
         for epoch in self._aligner.update():
-            self._declare(epoch.initial if epoch.state is State.ALIGNED else None)
+            self._publish_declared(epoch.initial if epoch.state is State.ALIGNED else None)
             self._publish_numbers(epoch)
         if self._aligner.declared is None:
-            self._declare(None)
+            self._publish_declared(None)
 
     def _start_over(self, why: str) -> None:
         self._align()  # what came before counts, whenever it was taken in
@@ -336,7 +336,7 @@ class AlignmentNode(Node):
         if prediction is not None or self._prediction[0] is not None:
             self._prediction = prediction, self._imu_frame
 
-    def _declare(self, attitude: Attitude | None) -> None:
+    def _publish_declared(self, attitude: Attitude | None) -> None:
         """Publish the initial attitude once, or withdraw it."""
         if (attitude is None) == (self._declared is None):
             return
