@@ -25,10 +25,11 @@ from ins_align.geometry.rotation import exp_so3, log_so3, matrix_from_quaternion
 from ins_align.gnss.messages import Fix, Velocity
 from ins_align.offline import align
 from ins_align.results import Severity
-from ins_align.simulation.scenarios import Motion, Scenario, SCENARIOS
+from ins_align.simulation.scenarios import displaced, Motion, Scenario, SCENARIOS
 from ins_align.simulation.simulate import gauss_markov, give
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import chi2
 
 SECOND = 1_000_000_000
@@ -1283,6 +1284,24 @@ def test_errors_that_last_are_not_taken_for_a_quiet_receiver():
                     in zip(s.gnss_stamps_ns.tolist(), s.velocity + lasting)], velocity_std=0.1)
     errors = [normalised_error(epoch.current, s) for epoch in result.epochs if epoch.t_s > 8.0]
     assert len(errors) > 200 and max(errors) < 25.0
+
+
+@pytest.mark.parametrize('scenario', ['robot', 'hover'])
+def test_positions_that_come_more_often_say_no_more(scenario):
+    """A receiver filters over 2 s errors that last 20 s, at 20 Hz, and states none of it."""
+    s = simulated(scenario, imu_grade='mems', duration=100.0, gnss_rate=20.0, seed=2,
+                  position_std=0.01, lever_arm=(0.3, 0.2, 0.5))
+    wander = gauss_markov(s.gnss_stamps_ns * 1e-9, 1.0, 20.0, np.random.default_rng(2))
+    decay = math.exp(-1 / (2.0 * 20.0))
+    filtered = lfilter([1 - decay], [1, -decay], wander, axis=0)
+    result = align(s.imu_stamps_ns, s.gyro, s.accel,
+                   [Fix(stamp_ns, *lla, None, 0) for stamp_ns, lla in zip(
+                       s.gnss_stamps_ns.tolist(), displaced(s.lla_deg, filtered).tolist())],
+                   lever_arm=(0.3, 0.2, 0.5), heading_std_threshold=5.0, tilt_std_threshold=1.5)
+    assert result.aligned
+    sigmas = [np.max(np.abs(error_of(epoch.current, s)) / np.radians(epoch.current.sigma_deg))
+              for epoch in result.epochs if epoch.current is not None]
+    assert len(sigmas) > 1900 and max(sigmas) < 4.0
 
 
 @pytest.mark.parametrize('scenario', ['car', 'flight', 'static'])

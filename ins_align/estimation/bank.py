@@ -121,6 +121,7 @@ class Bank:
         self._C_nn0 = np.eye(3)
         self._innovation = NOTHING_NEW
         self._receiver = ReceiverNoise()
+        self._seconds = 0.0                         # since the first epoch that was processed
         self._in_a_row = 0                          # epochs that were rejected
         self._vertical_measured = True              # at the last epoch
         # n0 and the point of linearisation hold for so many epochs, of which so many are left.
@@ -235,6 +236,7 @@ class Bank:
         """Propagate all means over the interval before epoch k, and update them."""
         vehicle = self._vehicle
         filters.propagate(model, k)
+        self._seconds += model.duration[k]
         due = vehicle is not None and vehicle.is_due(model.duration[k])
         self._innovation = NOTHING_NEW
         kinds = [kind for kind, present in enumerate(measured.present[k]) if present]
@@ -249,7 +251,7 @@ class Bank:
         for kind in kinds:
             stated = measured.stated[k][kind]
             new = filters.update(model, k, kind, measured, receiver.factors(kind, stated))
-            receiver.hear(kind, stated, moving, new.square, new.normalised)
+            receiver.hear(kind, stated, moving, new.square, new.normalised, self._seconds)
             self._rejected[kind] += not new.taken
             news.append(new)
         self._offered += 1

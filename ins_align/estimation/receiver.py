@@ -25,6 +25,9 @@ import numpy as np
 LOUD, QUIET, LEAST_NOISE, FOLLOW, LATELY, CLIP = 2.0, 0.25, 1e-2, 0.02, 0.05, 5.0
 # Velocities below this (m/s) do not count as quiet: receivers smooth what stands.
 MOVING = 1.0
+# Errors of positions last so long (s): a receiver that states none filters, and what it sends more
+# often says no more.
+POSITIONS_LAST = 1.0
 # A mean of innovations over some epochs, which forgets this share with each, shows errors that
 # last; so much more than white noise makes of it is chance.
 LASTING, CHANCE = 0.2, 0.5
@@ -51,6 +54,8 @@ class ReceiverNoise:
         # horizontal and vertical.
         self._noise = np.zeros((2, 2, 2))
         self._quiet = np.ones(2)    # mean square of velocities in motion, horizontal and vertical
+        # Of positions: when the last one was heard, and their interval, up to how long they last.
+        self._heard_at, self._interval = 0.0, POSITIONS_LAST
         self.misfit = self._lasting = 1.0
         self._heard, self._mean = BELIEVED, np.zeros((2, 3))
 
@@ -63,14 +68,19 @@ class ReceiverNoise:
         return np.exp(0.5 * self._noise[int(stated), kind, [0, 0, 1]])
 
     def hear(self, kind: int, stated: bool, moving: bool, square: float,
-             normalised: Array) -> None:
+             normalised: Array, seconds: float) -> None:
         """
         Follow an innovation.
 
         It is of a velocity (kind 0) or a position (1), whose noise is stated or configured, while
         the antenna moves or not; normalised and squared, per row, and over its sigmas, east,
-        north, up, (3,).
+        north, up, (3,); so many seconds after the start.
         """
+        least_noise = LEAST_NOISE
+        if kind:
+            interval, self._heard_at = seconds - self._heard_at, seconds
+            self._interval += LATELY * (min(interval, POSITIONS_LAST) - self._interval)
+            least_noise *= POSITIONS_LAST / self._interval
         east, north, up = np.square(normalised).tolist()
         noise = self._noise[int(stated), kind]
         heard = np.minimum([0.5 * (east + north), up], CLIP)
@@ -79,7 +89,7 @@ class ReceiverNoise:
             if moving:
                 self._quiet += LATELY * (heard - self._quiet)
             estimated = (noise < 0.0) | (self._quiet < QUIET)
-        least = np.where(estimated & (moving | (not stated)), math.log(LEAST_NOISE),
+        least = np.where(estimated & (moving | (not stated)), math.log(least_noise),
                          np.minimum(noise, 0.0))
         noise += FOLLOW * (heard - np.where(estimated, 1.0, LOUD))
         np.maximum(noise, least, out=noise)
