@@ -15,6 +15,7 @@
 
 from collections import Counter
 from dataclasses import replace
+import math
 
 from alignment import (
     aligned, config_for, cut_at, feed, integrate, nanoseconds, normalised_error, simulated)
@@ -25,6 +26,7 @@ from ins_align.estimation import rivals
 from ins_align.estimation.bank import Bank, RESOLVED_STD
 from ins_align.estimation.filter import Filters
 from ins_align.estimation.linearised import linearised
+from ins_align.estimation.receiver import ReceiverNoise
 from ins_align.estimation.rivals import Parameters, Rival, SIGNS, STRAINED
 from ins_align.estimation.states import biases, DELAY, FIRST, GYRO, PHI, PHI0, triads
 from ins_align.experiments.common import error_of
@@ -589,6 +591,33 @@ def test_a_lever_arm_that_swings_does_not_show_a_tilt(seed):
     at_5_s = next(epoch.current for epoch in epochs if epoch.t_s > 5.0)
     # The Cramer-Rao bound of an IMU that has no errors but biases is 2.8 deg.
     assert min(at_5_s.sigma_deg[:2]) > 2.0
+
+
+@pytest.mark.parametrize('rate', [1.0, 5.0, 20.0])
+def test_errors_that_last_a_second_inflate_sigmas_at_any_rate(rate):
+    """
+    Against the sum of the autocorrelation, by which means over longer times are worse than white.
+
+    Of errors of first order it is (1 + r) / (1 - r); a second sees about half of it.
+    """
+    receiver, random = ReceiverNoise(), np.random.default_rng(3)
+    r = math.exp(-1 / rate)
+    innovation, inflations = random.standard_normal(3), []
+    for k in range(20_000):
+        innovation = r * innovation + math.sqrt(1 - r ** 2) * random.standard_normal(3)
+        receiver.hear(0, True, True, float(innovation @ innovation) / 3, innovation, k / rate)
+        inflations.append(receiver.inflation)
+    assert 0.35 < np.mean(inflations[1000:]) / ((1 + r) / (1 - r)) < 0.65
+
+
+@pytest.mark.parametrize('rate', [1.0, 5.0, 20.0])
+def test_white_errors_leave_sigmas_at_any_rate(rate):
+    receiver, random = ReceiverNoise(), np.random.default_rng(3)
+    inflations = []
+    for k, innovation in enumerate(random.standard_normal((20_000, 3))):
+        receiver.hear(0, True, True, float(innovation @ innovation) / 3, innovation, k / rate)
+        inflations.append(receiver.inflation)
+    assert np.mean(inflations[1000:]) < 1.05
 
 
 @pytest.mark.filterwarnings('error')

@@ -25,12 +25,10 @@ import numpy as np
 LOUD, QUIET, LEAST_NOISE, FOLLOW, LATELY, CLIP = 2.0, 0.25, 1e-2, 0.02, 0.05, 5.0
 # Velocities below this (m/s) do not count as quiet: receivers smooth what stands.
 MOVING = 1.0
-# Errors of positions last so long (s): a receiver that states none filters, and what it sends more
-# often says no more.
-POSITIONS_LAST = 1.0
-# A mean of innovations over some epochs, which forgets this share with each, shows errors that
-# last; so much more than white noise makes of it is chance.
-LASTING, CHANCE = 0.2, 0.5
+# Errors of receivers, which filter, last so long (s). A mean of innovations over that time, which
+# forgets at most this share with each, shows it; so much more than white noise makes of it is
+# chance. Positions that come more often and state no noise say no more.
+ERRORS_LAST, LASTING, CHANCE = 1.0, 0.2, 0.5
 # Factor on variances that is worth a word.
 MENTIONED = 1.5
 # Epochs over which the mean square of innovations is taken, and those it is believed to be 1 for.
@@ -54,8 +52,8 @@ class ReceiverNoise:
         # horizontal and vertical.
         self._noise = np.zeros((2, 2, 2))
         self._quiet = np.ones(2)    # mean square of velocities in motion, horizontal and vertical
-        # Of positions: when the last one was heard, and their interval, up to how long they last.
-        self._heard_at, self._interval = 0.0, POSITIONS_LAST
+        # When velocities and positions were heard last, and their intervals, up to `ERRORS_LAST`.
+        self._heard_at, self._interval = [0.0, 0.0], [ERRORS_LAST, ERRORS_LAST]
         self.misfit = self._lasting = 1.0
         self._heard, self._mean = BELIEVED, np.zeros((2, 3))
 
@@ -76,11 +74,9 @@ class ReceiverNoise:
         the antenna moves or not; normalised and squared, per row, and over its sigmas, east,
         north, up, (3,); so many seconds after the start.
         """
-        least_noise = LEAST_NOISE
-        if kind:
-            interval, self._heard_at = seconds - self._heard_at, seconds
-            self._interval += LATELY * (min(interval, POSITIONS_LAST) - self._interval)
-            least_noise *= POSITIONS_LAST / self._interval
+        interval, self._heard_at[kind] = seconds - self._heard_at[kind], seconds
+        self._interval[kind] += LATELY * (min(interval, ERRORS_LAST) - self._interval[kind])
+        alike = ERRORS_LAST / self._interval[kind]      # epochs whose errors may be the same
         east, north, up = np.square(normalised).tolist()
         noise = self._noise[int(stated), kind]
         heard = np.minimum([0.5 * (east + north), up], CLIP)
@@ -89,8 +85,8 @@ class ReceiverNoise:
             if moving:
                 self._quiet += LATELY * (heard - self._quiet)
             estimated = (noise < 0.0) | (self._quiet < QUIET)
-        least = np.where(estimated & (moving | (not stated)), math.log(least_noise),
-                         np.minimum(noise, 0.0))
+        least = np.where(estimated & (moving | (not stated)),
+                         math.log(LEAST_NOISE * (alike if kind else 1.0)), np.minimum(noise, 0.0))
         noise += FOLLOW * (heard - np.where(estimated, 1.0, LOUD))
         np.maximum(noise, least, out=noise)
         self._heard += 1
@@ -98,8 +94,9 @@ class ReceiverNoise:
         self.misfit += share * (min(square, CLIP) - self.misfit)
         # Of large ones the direction counts: they are outliers, or the heading is being found.
         mean = self._mean[kind]
-        mean += LASTING * (normalised / max(1.0, math.sqrt(square / CLIP)) - mean)
-        long_run = float(mean @ mean) / 3 * (2 - LASTING) / LASTING
+        newest = min(LASTING, 1 / alike)
+        mean += newest * (normalised / max(1.0, math.sqrt(square / CLIP)) - mean)
+        long_run = float(mean @ mean) / 3 * (2 - newest) / newest
         self._lasting += share * (long_run - self._lasting)
 
     @property

@@ -227,6 +227,8 @@ SPOTS = tuple(case._replace(simulate={'duration': DURATION, **case.simulate}) fo
     # Noise of GNSS
     *(Case(f'velocity errors that last {time:g} s', MIXED, partial(_lasting, time_s=time),
            EXACT) for time in (1.0, 2.0)),
+    Case('velocity errors that last 1 s, at 20 Hz', MIXED, partial(_lasting, time_s=1.0),
+         {**EXACT, 'gnss_rate': 20.0}),
     Case('multipath: 0.5 m/s for 5 to 15 s, every 20 to 100 s', CAR,
          partial(_multipath, size=0.5), HOURS, part=4),
     Case('velocities of 0.03, 0.1, 0.5 m/s in turn, stated 0.1', CAR, _stepping,
