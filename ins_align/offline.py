@@ -26,7 +26,7 @@ from ins_align.config import Config, config_from_mapping, ConfigError, STANDARD_
 from ins_align.geometry.rotation import Array, Index, Transform
 from ins_align.gnss import messages
 from ins_align.gnss.messages import Fix, usable, Velocity
-from ins_align.gnss.motion import series_of
+from ins_align.gnss.motion import Series, series_of
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings.motion_fit import fit_motion, MAX_DELAY_STD
 from ins_align.results import Epoch, in_order_of_time, Reference, Result, State
@@ -88,8 +88,9 @@ class _Run:
     def other_delay(self, stamps_ns: Index, samples: Array) -> str:
         """Say that the motion, with samples of shape (N, 6), shows another delay; or ''."""
         good = np.isfinite(samples).all(axis=1)
-        found = fit_motion(series_of(stamps_ns[good] * 1e-9, samples[good]),
-                           self._checks.velocities(), STANDARD_GRAVITY)
+        motion, start = self._checks.velocities(), stamps_ns.min()
+        found = fit_motion(series_of((stamps_ns[good] - start) * 1e-9, samples[good]),
+                           Series(motion.times - start * 1e-9, motion.vectors), STANDARD_GRAVITY)
         if found.get('gnss_delay_std', MAX_DELAY_STD) >= MAX_DELAY_STD:
             return ''
         delay, config = found['gnss_delay'], self._config
@@ -223,7 +224,7 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     run = _Run(settings)
     run.add(stamps_ns, rates, forces, list(zip(before.tolist(), gnss)))
     result = run.result()
-    if result.status.state not in (State.ALIGNED, State.FAULT) and (
+    if result.status.state in (State.ALIGNING, State.LEVELLED) and (
             delay := run.other_delay(stamps_ns, np.hstack([rates, forces]))):
         result = replace(result, status=replace(
             result.status, reason=f'{result.status.reason}; {delay}'))
