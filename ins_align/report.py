@@ -20,6 +20,7 @@ import itertools
 import math
 from operator import attrgetter
 from pathlib import Path
+import shlex
 import shutil
 import textwrap
 from typing import Any, TYPE_CHECKING
@@ -107,7 +108,11 @@ def summary(result: Result) -> str:
                   '  declared: at t0, as the node published it; initial: at t0, as known in the '
                   'end; final: in the end', '', _nuisance_table(result)]
     counts = ', '.join(f'{name} {count}' for name, count in sorted(status.counts.items()) if count)
-    return '\n'.join([*lines, '', f'  counts: {counts or "nothing read"}'])
+    lines += ['', f'  counts: {counts or "nothing read"}']
+    if result.bag and not result.aligned:
+        lines += ['', '  to find what is wrong with units, frames, clocks: '
+                      f'ins_align info {shlex.quote(result.bag)}']
+    return '\n'.join(lines)
 
 
 def _list_of_changes(result: Result) -> list[str]:

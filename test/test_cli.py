@@ -120,6 +120,7 @@ def test_not_aligned(standing, tmp_path, capsys):
     assert result['aligned'] is False
     assert result['state'] != 'ALIGNED' and result['reason']
     assert result['time_to_align_s'] is None
+    assert capsys.readouterr().out.rstrip().endswith(f'ins_align info {standing}')
 
 
 @pytest.mark.parametrize('part, where', [
