@@ -36,8 +36,9 @@ FIT_WINDOW, MIN_EPOCHS = 10.0, 20  # s and GNSS epochs in a window
 MIN_WINDOWS = 3
 DELAYS = np.arange(-0.5, 1.25, 0.1)  # s
 MAX_DELAY_STD = 0.05  # s: what is known less well is not told
-# Clocks are wrong by whole seconds, or by those between UTC, GPS and TAI (s). These are tried in
-# the first minutes, up to a share of them, unless a delay is surely below `USUAL_DELAY` (s).
+# Clocks are wrong by whole seconds, or by those between UTC, GPS and TAI (s). Delays around these
+# are tried unless one is surely below `USUAL_DELAY` (s): in the first minutes (s), and up to this
+# share of the recording, for what has no counterpart then is lost.
 WRONG_CLOCKS = (-37.0, -19.0, -18.0, -4.5, -3.0, -1.5, 1.5, 3.0, 4.5, 18.0, 19.0, 37.0)
 USUAL_DELAY, FIRST_MINUTES, SHARE = 0.3, 600.0, 0.25
 # 1 sigma before the fit: gyro bias, rad/s, lever arm, m, accelerometer bias, m/s^2, for a
