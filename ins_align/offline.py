@@ -227,7 +227,7 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     if result.status.state in (State.ALIGNING, State.LEVELLED) and (
             delay := run.other_delay(stamps_ns, np.hstack([rates, forces]))):
         result = replace(result, status=replace(
-            result.status, reason=f'{result.status.reason}; {delay}'))
+            result.status, reason=f'{delay}; {result.status.reason}'))
     return result
 
 
