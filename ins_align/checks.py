@@ -117,11 +117,9 @@ def beyond_the_poles(latitude_deg: float, longitude_deg: float) -> bool:
 def lateness_advice(lateness: float) -> tuple[str, str]:
     """Say that GNSS messages come so late, s, behind newer IMU samples; with the gnss_lateness."""
     value = f'{min(math.ceil(2.0 * lateness) / 2.0 + 0.5, MAX_LATENESS):g}'
-    clock = (f'set gnss_delay={-lateness:.1f} instead' if lateness <= MAX_DELAY
-             else 'set that right')
     return (f'GNSS messages come up to {lateness:.1f} s later than newer IMU samples: set '
             f'gnss_lateness to {value}; if it is their clock that is behind, and not the '
-            f'messages, {clock}'), value
+            f'messages, set gnss_delay={-lateness:.1f} instead'), value
 
 
 class InputChecks:
