@@ -605,7 +605,7 @@ def test_errors_that_last_a_second_inflate_sigmas_at_any_rate(rate):
     innovation, inflations = random.standard_normal(3), []
     for k in range(20_000):
         innovation = r * innovation + math.sqrt(1 - r ** 2) * random.standard_normal(3)
-        receiver.hear(0, True, True, float(innovation @ innovation) / 3, innovation, k / rate)
+        receiver.follow(0, True, True, float(innovation @ innovation) / 3, innovation, k / rate)
         inflations.append(receiver.inflation)
     assert 0.35 < np.mean(inflations[1000:]) / ((1 + r) / (1 - r)) < 0.65
 
@@ -615,7 +615,7 @@ def test_white_errors_leave_sigmas_at_any_rate(rate):
     receiver, random = ReceiverNoise(), np.random.default_rng(3)
     inflations = []
     for k, innovation in enumerate(random.standard_normal((20_000, 3))):
-        receiver.hear(0, True, True, float(innovation @ innovation) / 3, innovation, k / rate)
+        receiver.follow(0, True, True, float(innovation @ innovation) / 3, innovation, k / rate)
         inflations.append(receiver.inflation)
     assert np.mean(inflations[1000:]) < 1.05
 

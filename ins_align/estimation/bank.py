@@ -12,10 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-The bank: filters for every heading and every rival, side by side on the same data.
+The bank: filters for every heading and every rival hypothesis, side by side on the same data.
 
-It starts from the note's own pair of vectors, weighs means and rivals by their likelihood, and
-gives the attitude as a mixture (docs, "Theory").
+It starts from the note's pair of vectors, weighs means and rivals by their likelihood, and reports
+the attitude as a Gaussian mixture (docs, "Theory").
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,7 +30,7 @@ from ins_align.estimation.linearised import EARLIEST, LATEST, linearised
 from ins_align.estimation.receiver import MOVING, ReceiverNoise
 from ins_align.estimation.rivals import level_in_words, Parameters, Rivals, SHARE
 from ins_align.estimation.start import (
-    draw_anew, HEADINGS, OPEN_POSITION, RoughAttitude, Start, STEADY_VELOCITY)
+    HEADINGS, OPEN_POSITION, redraw_headings, RoughAttitude, Start, STEADY_VELOCITY)
 from ins_align.estimation.states import (
     biases, DELAY, FIRST, GYRO, Linearised, Measured, OF_VEHICLE, triads)
 from ins_align.estimation.track import InertialTrack
@@ -41,54 +41,59 @@ from ins_align.imu.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
 import numpy as np
 
-# Parameters are linearised anew when the likeliest mean has gone so far from the point: lever arm
+# The model is linearised again when parameters of a likeliest mean have moved this far: lever arm
 # (m), delay (s), bias and matrix of the gyros (rad/s, 1) and of the accelerometers (m/s^2, 1).
 REACH = np.array([0.2] * 3 + [0.01] + [3e-3] * 3 + [0.02] * 9 + [0.1] * 3 + [0.02] * 9)
-MAX_SPAN = 64
-# Beside velocities positions gain little and hurt when their errors wander: where the bank may
-# choose, it takes them when no velocity came for this long (ns), and leaves them out again when
-# velocities have come for the second.
+MAX_SPAN = 64       # epochs with one n0
+# Positions add little to velocities, and do harm when their errors wander. With use_position auto
+# the bank uses them after this long without a velocity (ns), and stops when velocities have come
+# for the second time (ns).
 VELOCITY_STOPPED_NS, VELOCITY_BACK_NS = 10_000_000_000, 2_000_000_000
-# So many epochs in a row that do not fit show that the bank has gone astray.
+# After so many epochs in a row that no rival accepts the bank starts again.
 ASTRAY = 10
-# A heading that is known to this (rad) is resolved.
+# A heading with a smaller sigma (rad) is resolved.
 RESOLVED_STD = 0.35
-NOTHING_NEW = np.full(3, math.nan)
+NO_INNOVATION = np.full(3, math.nan)
 
 
 class Learnt(NamedTuple):
-    """What an alignment that is over has learnt of the body, shapes (m,) and (m, m), and when."""
+    """What an earlier alignment found of the body: a prior for the next one."""
 
-    x: Array
-    P: Array
-    stamp_ns: int
+    x: Array  #: (m,), parameters
+    P: Array  #: (m, m), their covariance
+    stamp_ns: int  #: of its last epoch
 
 
 class Bank:
     """
-    Estimates from t0 on.
+    The estimator of the method `bank`.
 
     Parameters
     ----------
     config : Config
     epoch : AntennaEpoch
-        t0.
+        The first epoch, t0.
     imu : Intervals
-        Of no length, at t0.
+        The interval at t0, whose duration is zero.
     use_position : bool
+        Whether positions are used from the start.
+    prior : Learnt, optional
+        What an earlier alignment found.
+    base : Transform, optional
+        From the vehicle's base to the IMU; needed where `vehicle` is configured.
 
     """
 
-    _inertial: InertialTrack                        # up to the last epoch, since n0 is frozen
+    _inertial: InertialTrack        # from the epoch at which n0 was frozen to the last epoch
 
     def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals, use_position: bool,
                  prior: Learnt | None = None, base: Transform | None = None) -> None:
-        """Start at t0."""
+        """Take the first epoch."""
         self._base = base or Transform(np.eye(3), np.zeros(3))
         self._not_used = ''
         self._config = config
         self._use_position = use_position
-        self._velocity_ns = epoch.stamp_ns          # the last one
+        self._velocity_ns = epoch.stamp_ns          # stamp of the last velocity
         self._velocities_since_ns: int | None = None
         self.moved = 0
         self._offered = 0
@@ -97,7 +102,7 @@ class Bank:
         self._wait(epoch, imu)
 
     def _begin(self, epoch: AntennaEpoch, imu: Intervals, prior: Learnt | None = None) -> None:
-        """Wait for a start, with nothing known but what was learnt before."""
+        """Start again at an epoch, with nothing known but the prior."""
         self.t0_ns = epoch.stamp_ns
         force = imu.gained[0, -1]
         force = STANDARD_GRAVITY * force / max(float(np.linalg.norm(force)), 1e-3)
@@ -108,10 +113,11 @@ class Bank:
             std = np.sqrt(self._known[0].P.diagonal()[-OF_VEHICLE:])
             self._vehicle = Vehicle(self._config, self._base, rivals.along, std)
         if prior is not None:
-            self._remember(prior)
+            self._apply_prior(prior)
         gyro, accel = triads(self._known[0].x.size)
         errors = gyro.stop - gyro.start
-        self._reach = np.full(self._known[0].x.size, np.inf)      # of a vehicle: linear
+        # Measurements are linear in the parameters of a vehicle.
+        self._reach = np.full(self._known[0].x.size, np.inf)
         self._reach[:accel.stop] = np.concatenate([REACH[:gyro.stop], REACH[16:16 + errors]])
         self._filters: Filters | None = None
         self._mixture: tuple[Array, Array] | None = None
@@ -119,22 +125,22 @@ class Bank:
         self._start = Start(self._config)
         self._last = epoch                          # the last epoch that was processed
         self._C_nn0 = np.eye(3)
-        self._innovation = NOTHING_NEW
+        self._innovation = NO_INNOVATION
         self._receiver = ReceiverNoise()
         self._seconds = 0.0                         # since the first epoch that was processed
-        self._in_a_row = 0                          # epochs that were rejected
+        self._in_a_row = 0                          # epochs that no rival accepted
         self._vertical_measured = True              # at the last epoch
-        # n0 and the point of linearisation hold for so many epochs, of which so many are left.
+        # n0 and the point of linearisation are kept for `_span` epochs, of which `_left` are left.
         self._point: Array | None = None
         self._span = self._left = 1
 
-    def _remember(self, learnt: Learnt) -> None:
-        """Start with what was learnt before, as old as it is."""
+    def _apply_prior(self, learnt: Learnt) -> None:
+        """Use what an earlier alignment found, with a variance that has grown with its age."""
         age = (self.t0_ns - learnt.stamp_ns) * 1e-9
         for rival, known in zip(self._rivals.table, self._known):
             if rival.wrong:
                 continue
-            body = slice(learnt.x.size)             # it may be without what is of the vehicle
+            body = slice(learnt.x.size)             # parameters of a vehicle may be missing
             known.x[body] = learnt.x
             walk, most = known.walk[FIRST:][body], known.P.diagonal()[body]
             grown = np.minimum(learnt.P.diagonal() + age * walk, most)
@@ -144,7 +150,11 @@ class Bank:
     # Input
 
     def advance(self, epochs: Sequence[AntennaEpoch], imu: Intervals) -> Iterator[AntennaEpoch]:
-        """Take epochs and the IMU intervals before each; yield each when the results are its."""
+        """
+        Process epochs and the IMU intervals before each.
+
+        Yields each epoch once it is processed, when results are those at this epoch.
+        """
         done = 0
         while done < len(epochs):
             part = slice(done, done + (1 if self._filters is None else self._left))
@@ -155,10 +165,10 @@ class Bank:
 
     def _take(self, epochs: Sequence[AntennaEpoch], imu: Intervals) -> Iterator[AntennaEpoch]:
         """
-        Take epochs as long as they are linearised close enough.
+        Process epochs until the model has to be linearised again.
 
-        n0 and the point of linearisation are kept from call to call: results must not depend on
-        how many epochs come at a time.
+        n0 and the point of linearisation are kept between calls, so results do not depend on how
+        many epochs come at a time.
         """
         filters = self._filters
         if filters is None:
@@ -194,7 +204,7 @@ class Bank:
             yield epoch
 
     def _choose(self, epoch: AntennaEpoch) -> bool:
-        """Use positions where velocities have stopped, until they are back; whether it changes."""
+        """Decide whether positions are used, see `VELOCITY_STOPPED_NS`; return if it changes."""
         before = self._use_position
         stopped = epoch.stamp_ns - self._velocity_ns > VELOCITY_STOPPED_NS
         if epoch.v_n is not None:
@@ -209,26 +219,26 @@ class Bank:
         return self._use_position != before
 
     def _freeze(self, epoch: AntennaEpoch) -> None:
-        """Let n0 be the local level at an epoch; the next one is linearised anew."""
+        """Let n0 be the local level at an epoch; the next epoch is linearised again."""
         self._n0_ns, self._C_nn0 = epoch.stamp_ns, np.eye(3)
         self._inertial = InertialTrack.start(epoch.latitude, epoch.longitude, epoch.altitude)
         self._point = None
         self._left = self._span
 
     def _point_of(self, filters: Filters) -> Array:
-        """Return the parameters of the likeliest mean of each rival, with one delay for all."""
+        """Return the point of linearisation: the likeliest mean of each rival, one delay."""
         point = filters.x[filters.lead]
         point[:, DELAY] = np.clip(point[filters.best, DELAY], EARLIEST, LATEST)
         return point
 
     def _model(self, filters: Filters, point: Array, imu: Intervals) -> Linearised:
-        """Linearise epochs."""
+        """Linearise the epochs that follow the intervals."""
         return linearised(point, imu.mirrored(self._rivals.signs[filters.ids]),
                           (imu.Q + SHARE * imu.Q_excess)[:, None], self._use_position,
                           None if self._vehicle is None else self._vehicle.position)
 
     def _anchor(self, filters: Filters, track: InertialTrack) -> None:
-        """Freeze n0 at the last epoch that was processed; the track is there."""
+        """Freeze n0 at the last epoch that was processed, where the track ends."""
         filters.change_axes(track.C_n0n.T, track.still_v, track.s_p)
         self._freeze(self._last)
 
@@ -238,11 +248,11 @@ class Bank:
         filters.propagate(model, k)
         self._seconds += model.duration[k]
         due = vehicle is not None and vehicle.is_due(model.duration[k])
-        self._innovation = NOTHING_NEW
+        self._innovation = NO_INNOVATION
         kinds = [kind for kind, present in enumerate(measured.present[k]) if present]
         if not kinds:
             return
-        # A vehicle's velocity upwards in its own axes says something of the vertical one.
+        # A vehicle that moves along its own axis tells something of the vertical velocity.
         vertical = vehicle is not None or measured.vertical[k]
         if vertical and not self._vertical_measured:
             filters.reset_vertical(measured.still[k, 2], STEADY_VELOCITY, OPEN_POSITION)
@@ -251,7 +261,7 @@ class Bank:
         for kind in kinds:
             stated = measured.stated[k][kind]
             new = filters.update(model, k, kind, measured, receiver.factors(kind, stated))
-            receiver.hear(kind, stated, moving, new.square, new.normalised, self._seconds)
+            receiver.follow(kind, stated, moving, new.square, new.normalised, self._seconds)
             self._rejected[kind] += not new.taken
             news.append(new)
         self._offered += 1
@@ -262,12 +272,12 @@ class Bank:
             filters.reset_vertical(measured.still[k, 2])
         self._vertical_measured = vertical
         if vehicle is not None and due:
-            vehicle.look(filters, model, k, measured)
+            vehicle.update(filters, model, k, measured)
         self._rivals.select(filters)
-        draw_anew(filters)
+        redraw_headings(filters)
 
     def _drop_vehicle(self, filters: Filters) -> bool:
-        """Assume nothing of the vehicle any more where the motion contradicts it."""
+        """Give up the assumption on the vehicle if the motion contradicts it; return whether."""
         if self._vehicle is None or not self._vehicle.contradicted(filters):
             return False
         self._not_used = NOT_USED.format(vehicle=self._config.vehicle)
@@ -275,7 +285,7 @@ class Bank:
         return True
 
     def _conclude(self) -> None:
-        """Mix the attitudes of an epoch, and hear the rivals."""
+        """Mix the attitudes at an epoch, and ask the rivals."""
         filters = self._filters
         if filters is None:
             return
@@ -288,7 +298,7 @@ class Bank:
     # Start
 
     def _wait(self, epoch: AntennaEpoch, imu: Intervals) -> None:
-        """Take an epoch that comes before the start, and start if it suffices."""
+        """Add an epoch to those from which the filters start, and start them if they suffice."""
         start = self._start
         start.add(epoch, imu)
         rough = start.solve(self._use_position)
@@ -305,7 +315,7 @@ class Bank:
             self._begin_with(rough)
 
     def _begin_with(self, rough: RoughAttitude) -> None:
-        """Start filters for all headings and rivals at t0, and feed them what has come since."""
+        """Start filters for all headings and rivals at t0, and process the epochs since."""
         epochs, imu = self._start.epochs, self._start.imu
         x = self._known[0].x
         C, P = zip(*(self._start.means(rough, x, known.P, sign) for known, sign in zip(
@@ -343,7 +353,7 @@ class Bank:
         return self._C_nn0 @ C[1], self._receiver.inflation * self._C_nn0 @ P[1] @ self._C_nn0.T
 
     def fit(self) -> Fit:
-        """Return how well the data fit, and what the rivals say."""
+        """Return how well the data fit, and what speaks against a declaration."""
         filters, receiver = self._filters, self._receiver
         if filters is None:
             return Fit(self._offered, delay=self._config.gnss_delay, doubt=self._start.lacks)
@@ -393,13 +403,13 @@ class Bank:
         return SensorErrors.of(full.ravel())
 
     def learnt(self) -> Learnt | None:
-        """Return what a fresh start may keep; None where the bank has gone astray."""
+        """Return the prior for another start; None while epochs do not fit."""
         if self._mixture is None or self._in_a_row:
             return None
         x, P = (array.copy() for array in self._body())
         if self._mixture[1][1, 2, 2] > RESOLVED_STD ** 2:
-            # Without a change of speed nothing shows lever arm and delay but the noise of the
-            # IMU, which feigns a swing that the GNSS does not see.
+            # Without a change of velocity lever arm and delay are estimated from nothing but the
+            # noise of the IMU, which looks like a swing that the GNSS does not see.
             antenna = slice(0, GYRO)
             P[antenna] = P[:, antenna] = 0.0
             x[antenna], P[antenna, antenna] = (self._known[0].x[antenna],

@@ -14,8 +14,8 @@
 """
 When an alignment is declared, held back or withdrawn, and why, in words with numbers.
 
-A declared attitude must be right: the stated sigma, inflated by how badly the data fit, must be
-under its threshold; the residuals must pass; both must have held for a while.
+An attitude is declared when its sigma, inflated where the data fit badly, has been below its
+threshold and the residuals have been within limits for the hold time.
 """
 
 from dataclasses import dataclass, field
@@ -36,9 +36,9 @@ WITHDRAWN_AT = 2.0
 MIN_ROWS = 12
 # A delay is to be expected within so many of its sigmas.
 DELAY_SIGMAS = 3.0
-# Conditions that have to hold are seen to hold at epochs that are no further apart than this (s).
+# The hold time begins again after a longer time without GNSS (s).
 MAX_SILENCE = 30.0
-# A sigma that after so many seconds is within so many times its threshold may be good enough.
+# After so many seconds a reason says that a sigma within so many times its threshold may do.
 PATIENCE, ACCEPTABLE = 60.0, 4.0
 
 
@@ -51,17 +51,17 @@ class Fit:
     misfit: float = math.nan  #: mean square of normalised residuals
     #: (3,), of the velocity (of the position where only that is used) over its sigma.
     innovation: Array = field(default_factory=lambda: np.full(3, math.nan))
-    rejected_velocity: int = 0  #: measurements that were refused as outliers
+    rejected_velocity: int = 0  #: measurements that were rejected as outliers
     rejected_position: int = 0
     rejected: int = 0  #: epochs with any of them
     delay: float = 0.0  #: of the GNSS, s; the configured one where none is estimated
     objection: str = ''  #: what the data say against the configuration, in words
     doubt: str = ''  #: what speaks against declaring a heading, in words
-    remarks: str = ''  #: how the sensors are others than configured, as the end of a sentence
+    remarks: str = ''  #: how the sensors differ from the configuration, as the end of a sentence
 
 
 class Declaration:
-    """Decides from epoch to epoch, by two thresholds and the hold time of the configuration."""
+    """Decides at each epoch, by the two thresholds and the hold time of the configuration."""
 
     def __init__(self, config: Config) -> None:
         """Start with nothing declared."""
@@ -70,20 +70,19 @@ class Declaration:
         self._heading_since_s: float | None = None
         self.levelled = False               # what is declared
         self.aligned = False
-        self.move_t0 = False                # whether t0 had better move
-        self._against = ''                  # what spoke against it when it was judged last
-        self._contradiction = ''            # when there was redundancy last
-        self._offered = 0                   # epochs until then
+        self.move_t0 = False                # whether t0 should move to now
+        self._against = ''                  # what spoke against a declaration at the last epoch
+        self._contradiction = ''            # at the last epoch with redundancy
+        self._offered = 0                   # number of epochs then
         self._rejected = 0
         self._time_s = 0.0
 
     def update(self, time_s: float, initial: Array, current: Array, fit: Fit) -> Verdict:
         """
-        Judge an epoch, so many seconds after the first t0.
+        Judge an epoch, `time_s` seconds after the first t0.
 
-        `initial` and `current`, (3, 3), are covariances of the attitude at t0 and of the one now,
-        in ENU. Both must be good enough; where only the present one is, `move_t0` says that t0 had
-        better move.
+        `initial` and `current`, (3, 3), are covariances of the attitude at t0 and of that now, in
+        ENU. Both must be good enough; where only that now is, `move_t0` is set.
         """
         self._time_s = time_s
         contradiction = self._contradicted_by(fit)
@@ -117,7 +116,7 @@ class Declaration:
     def update_without_gnss(self, silent_s: float, initial: Array, current: Array,
                             fit: Fit) -> Verdict:
         """
-        Judge an epoch without a measurement: nothing is declared, and what gets lost withdrawn.
+        Judge an epoch without a measurement: nothing is declared, but it may be withdrawn.
 
         `silent_s` are the seconds since the last measurement, the others are as for `update`.
         """
@@ -137,12 +136,12 @@ class Declaration:
                        + (_silence(silent_s) if silent_s else ''))
 
     def withdraw(self) -> None:
-        """Withdraw all that is declared; what was good until now counts no more."""
+        """Withdraw all that is declared; the hold time begins again."""
         self.levelled = self.aligned = False
         self._level_since_s = self._heading_since_s = None
 
     def _withdraw_lost(self, tilt: float, heading: float) -> None:
-        """Keep what was declared until its sigma has clearly grown."""
+        """Withdraw what is declared when its sigma has grown to a multiple of the threshold."""
         max_tilt = WITHDRAWN_AT * self.config.tilt_std_threshold
         self.levelled = self.levelled and tilt <= max_tilt
         self.aligned = (self.aligned and tilt <= max_tilt
@@ -166,7 +165,7 @@ class Declaration:
                               f'for {config.hold_time:g} s')
 
     def _too_large(self, name: str, sigma_deg: float, advice: str) -> str:
-        """Return what leads on; after a while also that the sigma may be good enough as it is."""
+        """Return advice; after a while also that the sigma may be good enough as it is."""
         parameter = f'{name}_std_threshold'
         threshold_deg = getattr(self.config, parameter)
         words = f'{name} sigma {_above(sigma_deg, threshold_deg)}: {advice}'
@@ -175,7 +174,7 @@ class Declaration:
         return words
 
     def _too_few(self, fit: Fit) -> str:
-        """Return what is missing where there is no redundancy, at a start or a later one."""
+        """Return how many epochs there are where there is no redundancy yet."""
         if self._contradiction:
             return f'{self._contradiction}; it has started over'
         return f'{fit.offered - self._offered} GNSS epochs so far: more are needed'
@@ -210,7 +209,7 @@ def _silence(silent_s: float) -> str:
 
 
 def _above(sigma_deg: float, threshold_deg: float) -> str:
-    """Return a sigma and the threshold that it is above, so that this shows."""
+    """Return a sigma, with enough digits to be above its threshold, and the threshold."""
     text = _deg(sigma_deg)
     if float(text.split()[0]) <= threshold_deg:
         text = f'{sigma_deg:.4g} deg'
@@ -230,7 +229,7 @@ def _sigmas_deg(P: Array) -> tuple[float, float]:
 
 
 def _since(since_s: float | None, time_s: float, good: bool) -> float | None:
-    """Return since when something has been good."""
+    """Return the time since which something has been good, or None."""
     if not good:
         return None
     return time_s if since_s is None else since_s

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Error-state Kalman filters whose errors are the body's: many means, one covariance.
+Error-state Kalman filters with errors in the body frame: many means share one covariance.
 
 A mean is the attitude ``C = C_n0b``, the velocity u and the position w of the IMU in n0, the
 attitude C0 at t0 and the parameters x of the body (lever arm, delay, errors of gyros and
@@ -39,39 +39,40 @@ from ins_align.geometry.rotation import (
     apply, Array, exp_so3, Index, log_so3, nearest_rotation, skew)
 import numpy as np
 
-# Normalised innovation squared of three rows above which a measurement is an outlier, as it is
-# beyond 5 sigma in any direction: one good one in 60 000 is (chi-square with three degrees of
-# freedom). To the weights an outlier counts as this much.
+# A measurement of three rows is an outlier above this normalised innovation squared: beyond 5
+# sigma in some direction, as one good measurement in 60 000 is (chi-square with three degrees of
+# freedom). In the weights an outlier counts as this much.
 GATE = 25.0
-# Log likelihood ratio of a motion that fits a vehicle, to one whose slips are so much larger that
-# a normalised innovation squared of twice this, of two rows, is as likely.
+# Log likelihood that motion along x of a vehicle gains over any motion where it fits exactly; with
+# a normalised innovation squared of twice this both are as likely.
 FITS = 3.0
-# A rival that is less likely than the best by this (log) is no part of a mixture.
+# Rivals that are less likely than the best by this (log) are left out of a mixture.
 NEGLIGIBLE = 12.0
-# Corrections so small (rad) leave the axes of the errors as they are.
+# Corrections of the attitude below this (rad) leave the covariance as it is.
 NO_TURN = 1e-3
-# A rate that is not known turns biases of the accelerometers against the tilt that they look like.
-# What is known of them is lost at the rate's variance times this (s).
+# An unknown rate turns biases of the accelerometers against the tilt that they look like: their
+# variance returns to its first value at this (s) times the variance of the rate.
 TURNING = 30.0
-# Information on the heading (1/rad^2) that is less than the first is none; what epochs say less
-# than chance, the next ones may say more, at most the second.
-NO_NEWS, MOST_OWED = 1e-9, 2.0
-# What an unknown lever arm does together with an unknown attitude, or rate, lasts so long (s).
+# Information on the heading (1/rad^2): the least that an epoch is taken to give, and the most
+# spurious information that is carried over to later epochs.
+MIN_INFORMATION, MAX_SPURIOUS = 1e-9, 2.0
+# The product of the errors of lever arm and attitude lasts so long (s), and that of lever arm and
+# rate.
 PRODUCT_TIME, RATE_TIME = 0.5, 10.0
 _EYE = np.eye(3)
 
 
 class Innovation(NamedTuple):
-    """What was new in a measurement to the likeliest mean."""
+    """The innovation of a measurement to the likeliest mean."""
 
-    square: float           # normalised, per row
+    square: float           # normalised innovation squared, per row
     normalised: Array       # over its sigmas, in n0, shape (3,)
-    taken: bool             # by this mean's rival
-    fits_none: bool         # not even the likeliest rival of all took it
+    taken: bool             # whether the rival of this mean accepts the measurement
+    fits_none: bool         # whether even the likeliest of all rivals rejects it
 
 
 class _Test(NamedTuple):
-    """An innovation of r rows against what B means of M rivals expect."""
+    """The innovations of r rows of B means of M rivals, and their covariances."""
 
     HP: Array               # (B, r, n)
     S: Array                # (B, r, r), its covariance
@@ -82,58 +83,60 @@ class _Test(NamedTuple):
 
 class Filters:
     """
-    B means under M rivals: hypotheses of how the sensors are, each with one covariance.
+    B means under M rivals, which are hypotheses about the sensors with a covariance each.
 
     Parameters
     ----------
     C : ndarray, shape (B, 3, 3)
         Attitudes.
     u : ndarray, shape (3,)
-        Velocity of all.
+        Velocity of all means.
     x : ndarray, shape (m,)
-        Parameters of all.
+        Parameters of all means.
     rival : ndarray of int, shape (B,)
-        To which each belongs, increasing.
+        The rival that each mean belongs to, increasing.
     P : ndarray, shape (M, n, n)
+        Covariances.
     walk : ndarray, shape (M, n)
-        What a second adds to the diagonal of P.
+        Random walk: what P gains on its diagonal in a second.
     prior : ndarray, shape (M,)
-        Log of how likely each rival is before the data.
+        Log probability of each rival before the data.
     counts : ndarray of bool, shape (M,)
-        Which of the rivals are part of a result; the others may only speak against it.
+        Whether a rival is part of results; the others may only speak against them.
 
     Attributes
     ----------
     weight : ndarray, shape (B,)
         Log weight among the means of the same rival.
     evidence : ndarray, shape (M,)
-        Log of how likely each rival is after the data, but for a constant.
+        Log probability of each rival after the data, but for a constant.
     ids : ndarray of int, shape (M,)
         The rivals that are left.
-    owed : ndarray, shape (M,)
-        Information on the heading, 1/rad^2, that epochs to come may give by chance besides.
+    spurious : ndarray, shape (M,)
+        Information on the heading that noise may have feigned and that is not removed yet,
+        1/rad^2.
     accel_expected, accel_variance : ndarray, shapes (3,) and (M, 3)
         Biases of the accelerometers before the data, m/s^2, and their variances, (m/s^2)^2.
     place : ndarray of int, shape (B,), or slice
-        The place in `ids` of each mean's rival; all of them where each rival has one mean.
-    lead : ndarray of int, shape (M,)
-        The likeliest mean of each.
+        The index in `ids` of each mean's rival; a slice of all where each rival has one mean.
+    first, lead : ndarray of int, shape (M,)
+        The first and the likeliest mean of each rival.
 
     """
 
     _OF_MEANS = 'C', 'u', 'w', 'x', 'C0', 'rival', 'weight'
-    _OF_RIVALS = 'P', 'walk', 'owed', 'accel_variance', 'evidence', 'counts', 'ids'
+    _OF_RIVALS = 'P', 'walk', 'spurious', 'accel_variance', 'evidence', 'counts', 'ids'
 
     def __init__(self, C: Array, u: Array, x: Array, rival: Index, P: Array, walk: Array,
                  prior: Array, counts: np.ndarray) -> None:
-        """Start at t0."""
+        """Put all means at the same velocity and parameters."""
         B, M = len(C), len(P)
         self.C, self.C0 = C, C.copy()
         self.u, self.w, self.x = np.tile(u, (B, 1)), np.zeros((B, 3)), np.tile(x, (B, 1))
         self.rival, self.ids = rival, np.arange(M)
         self.weight = -np.log(np.bincount(rival))[rival]
         self.evidence, self.counts = prior, counts
-        self.P, self.walk, self.owed = P, walk, np.zeros(M)
+        self.P, self.walk, self.spurious = P, walk, np.zeros(M)
         accel = biases(x.size)[1]
         self.accel_expected = x[accel]
         self.accel_variance = np.diagonal(P, axis1=1, axis2=2)[:, FIRST:][:, accel].copy()
@@ -141,7 +144,7 @@ class Filters:
         self._transported = np.r_[:FIRST, FIRST + np.r_[accel]]
         self._find_places()
 
-    # Which mean is whose, and how likely
+    # Means, their rivals and weights
 
     @property
     def single(self) -> bool:
@@ -150,7 +153,7 @@ class Filters:
 
     @property
     def best(self) -> int:
-        """Return the place of the likeliest rival that counts."""
+        """Return the index in `ids` of the likeliest rival that counts."""
         return int(np.where(self.counts, self.evidence, -np.inf).argmax())
 
     def _find_places(self) -> None:
@@ -165,7 +168,7 @@ class Filters:
             self.lead = np.lexsort((-self.weight, self.rival))[self.first]
 
     def keep(self, means: np.ndarray) -> None:
-        """Keep means, by a mask or by places that may repeat, and the rivals that have any."""
+        """Keep means, by a mask or by indices that may repeat, and the rivals that have any."""
         for name in self._OF_MEANS:
             setattr(self, name, getattr(self, name)[means])
         left = np.isin(self.ids, self.rival)
@@ -177,7 +180,7 @@ class Filters:
         """
         Weigh means by a log likelihood, shape (B,); return that of the rivals, shape (M,).
 
-        Of the former the share `real` counts within rivals.
+        The weights of the means of a rival change by the share `real` of it.
         """
         if self.single:
             return self.weight + log_likelihood
@@ -195,16 +198,16 @@ class Filters:
         return total
 
     def _by_most(self, good: np.ndarray) -> np.ndarray:
-        """Return whether more than half of each rival's weight is on means that are good."""
+        """Return whether the means that are good have more than half of their rival's weight."""
         if self.single:
             return good
         most: np.ndarray = np.add.reduceat(np.exp(self.weight) * good, self.first) > 0.5
         return most
 
-    # An epoch
+    # Filtering
 
     def propagate(self, model: Linearised, k: int) -> None:
-        """Go over the interval before epoch k of K; the model has those rivals that are left."""
+        """Propagate over the interval before epoch k of a model of the rivals that are left."""
         q, duration = self.place, model.duration[k]
         change = apply(model.J[k][q], self.x - model.point[q])
         moved = (model.moved[k][q] + change[:, 3:]).reshape(-1, 2, 3) @ self.C.swapaxes(1, 2)
@@ -231,13 +234,13 @@ class Filters:
     def update(self, model: Linearised, k: int, kind: int, measured: Measured,
                noise: Array) -> Innovation:
         """
-        Take the velocity (kind 0) or the position (1) of epoch k of a model's K epochs.
+        Update with the velocity (kind 0) or the position (1) of epoch k of a model.
 
         `noise`, shape (3,), has factors on the sigmas that the receiver states, east, north, up.
         """
         q, lead, C = self.place, self.lead, self.C
         H = model.H[k, kind]
-        # What the receiver states is about axes of n0, which the means see in different ways.
+        # The receiver states a covariance in the axes of n0; innovations are in the body's.
         stated = C.swapaxes(1, 2) @ (measured.covariance[k, kind] * noise * noise[:, None]) @ C
         arm_noise = self._arm_noise(H[..., FIRST:][..., LEVER_ARM], model.duration[k], kind == 0)
         stated = stated + arm_noise[q, None, None] * _EYE
@@ -246,9 +249,9 @@ class Filters:
                       - apply(H[q][..., FIRST:], self.x - model.point[q]))
         test = self._test(H, stated, innovation)
         good = test.nis < GATE
-        # By the means before the measurement, which an outlier must not choose.
+        # Weights are those before the measurement, for an outlier must not choose who accepts it.
         taken = self._by_most(good)
-        feigned, back = self._learn(test, stated, taken)
+        feigned, back = self._update_covariance(test, stated, taken)
         self.evidence = self.evidence + self._weigh(
             -0.5 * (np.minimum(test.nis, GATE) + np.log(np.linalg.det(test.S))), 1 - feigned[q])
         self._move(test, good & taken[q], lead, back)
@@ -260,11 +263,11 @@ class Filters:
 
     def _arm_noise(self, arm: Array, duration: float, swings: bool) -> Array:
         """
-        Return the variance, (M,), of what unknown turns and rates make of an unknown lever arm.
+        Return the variance, (M,), of errors of the lever arm times those of attitude and rate.
 
-        `arm`, (M, 3, 3), has a measurement's derivatives to the lever arm. The product of two
-        errors is in no derivative, and lasts from epoch to epoch, which are `duration` (s) apart.
-        An arm that a velocity sees swing does so at the error of the rate, too.
+        Products of two errors are in no derivative. They last from epoch to epoch, which are
+        `duration` (s) apart. `arm`, (M, 3, 3), has the derivatives of the measurement to the lever
+        arm; a velocity (`swings`) has a product with the error of the rate too.
         """
         parameters = self.P[:, FIRST:, FIRST:]
         lever = parameters[:, LEVER_ARM, LEVER_ARM]
@@ -278,11 +281,11 @@ class Filters:
     def hold(self, held: np.ndarray, H: Array, variance: Array, innovation: Array,
              backwards: Array, tumbled: np.ndarray) -> None:
         """
-        Hold some of the rivals, shape (M,), to motion along x of a vehicle's base; see `vehicle`.
+        Update some of the rivals with motion along x of a vehicle's base; see `vehicle`.
 
-        The innovation, (B, 2), m/s, is sideways and upwards, with derivatives H, (M, 2, n), and
-        noise, (M,), (m/s)^2. For each mean, (B,), the speed the wrong way, m/s, and whether z of
-        the base points down.
+        `held`, (M,), says which rivals. The innovation, (B, 2), m/s, is sideways and upwards, with
+        derivatives H, (M, 2, n), and variance (M,), (m/s)^2. `backwards` and `tumbled`, (B,), are
+        the speed in the wrong direction, m/s, and whether z of the base points down.
         """
         q, lead = self.place, self.lead
         test = self._test(H, variance[q][:, None, None] * np.eye(2), innovation)
@@ -290,7 +293,8 @@ class Filters:
         nis = held[q] * np.where(tumbled, GATE, np.minimum(nis, GATE))
         if not self.single:
             self._weigh(-0.5 * nis)
-        # How headings were spread before says nothing about the assumption.
+        # The likeliest mean alone counts: that headings were spread before says nothing about
+        # the assumption.
         self.evidence = self.evidence + held * (FITS - 0.5 * nis[self.lead])
         good = nis < GATE
         taken = held & self._by_most(good)
@@ -298,7 +302,7 @@ class Filters:
         self._move(test, good & taken[q], lead)
 
     def _test(self, H: Array, noise: Array, innovation: Array) -> _Test:
-        """Test an innovation, (B, r), with the derivatives of the rivals, (M, r, n)."""
+        """Compare an innovation, (B, r), with its covariance; H are derivatives, (M, r, n)."""
         HP = H @ self.P
         S = (HP @ H.swapaxes(1, 2))[self.place] + noise
         inverse = np.asarray(np.linalg.inv(S), float)
@@ -307,41 +311,49 @@ class Filters:
                      np.einsum('ij,ij->i', innovation, weighted))
 
     def _reduce(self, test: _Test, taken: np.ndarray, lead: Index) -> None:
-        """Take off the covariances what was measured of the means that lead."""
+        """Reduce covariances by a measurement, with the gains of the likeliest means."""
         HP, inverse = test.HP[lead], test.inverse[lead]
         P = self.P - HP.swapaxes(1, 2) @ (inverse * taken[:, None, None]) @ HP
         self.P = 0.5 * (P + P.swapaxes(1, 2))       # or rounding grows
 
-    def _learn(self, test: _Test, noise: Array, taken: np.ndarray) -> tuple[Array, Array]:
+    def _update_covariance(self, test: _Test, noise: Array,
+                           taken: np.ndarray) -> tuple[Array, Array]:
         """
-        Reduce the covariances, but not by what noise may have said of the heading.
+        Reduce the covariances, but not by information on the heading that noise may feign.
 
-        Noise looks like motion, and motion that the GNSS does not see in this direction speaks
-        against the heading (errors in variables). By chance epochs say ``tr(W - W^2)`` in the
-        mean, or less, W being the receiver's share of an innovation (docs, "Theory").
+        Noise of the IMU looks like motion, and motion that the GNSS does not see in this direction
+        speaks against the heading (errors in variables). An epoch gives at most ``tr(W - W^2)`` of
+        such information in the mean, W being the receiver's share of an innovation (docs,
+        "Theory").
 
-        Returns the share of what was said of the heading that may be chance, shape (M,), and what
-        of a correction goes back for each radian that it turns the heading, (M, n).
+        Returns the spurious share of the information on the heading, shape (M,), and what has to
+        be taken back of a correction for each radian that it turns the heading, (M, n).
         """
         lead, before = self.lead, self.P
         up = self.C[lead, 2]
         self._reduce(test, taken, lead)
         column, variance = of_heading(self.P, up)
         W = test.inverse[lead] @ noise[lead]
-        chance = self.owed + np.trace(W - W @ W, axis1=1, axis2=2)
-        said = np.maximum(1 / variance - 1 / of_heading(before, up)[1], NO_NEWS)
-        gone = taken * np.clip(chance, 0.0, said)
-        self.owed = np.where(taken, np.minimum(chance - gone, MOST_OWED), self.owed)
-        self.P += (gone / (1 - gone * variance))[:, None, None] * (
+        spurious = self.spurious + np.trace(W - W @ W, axis1=1, axis2=2)
+        information = np.maximum(1 / variance - 1 / of_heading(before, up)[1], MIN_INFORMATION)
+        removed = taken * np.clip(spurious, 0.0, information)
+        self.spurious = np.where(taken, np.minimum(spurious - removed, MAX_SPURIOUS),
+                                 self.spurious)
+        self.P += (removed / (1 - removed * variance))[:, None, None] * (
             column[:, :, None] * column[:, None])
-        feigned = gone / said
+        feigned = removed / information
         return feigned, (feigned / variance)[:, None] * column
 
     def _force_at_rest(self) -> Array:
-        """Return the force at rest, (B, 3), as far as a bias that turns with a tilt is in it."""
+        """
+        Return the force at rest in the body, (B, 3), m/s^2, times a share.
+
+        It is the share of the biases' variance in that of the force: so far biases of the
+        accelerometers turn with a tilt.
+        """
         across = skew(self.C[self.lead, 2])
         felt = np.concatenate([across, np.broadcast_to(_EYE / STANDARD_GRAVITY, across.shape)], 2)
-        tilt = across @ felt        # that the accelerometers show
+        tilt = across @ felt        # as it looks to the accelerometers
         P = self.P[:, self._tilt_and_bias[:, None], self._tilt_and_bias]
         apparent = np.einsum('mij,mij->m', tilt @ P, tilt)
         bias = self.P[:, self._tilt_and_bias[3:], self._tilt_and_bias[3:]].sum(axis=1)
@@ -351,9 +363,9 @@ class Filters:
     def _move(self, test: _Test, use: np.ndarray, lead: Index,
               back: Array | None = None) -> None:
         """
-        Correct the means, and take the covariances to where those that lead have gone.
+        Correct the means that `use` a measurement, and move the covariances with the likeliest.
 
-        `back` is as `_learn` returns it.
+        `back` is as `_update_covariance` returns it.
         """
         d = ((test.weighted * use[:, None])[:, None] @ test.HP)[:, 0]
         if back is not None:
@@ -386,19 +398,19 @@ class Filters:
     # Without a measurement
 
     def change_axes(self, C_nn0: Array, s_v: Array, s_p: Array) -> None:
-        """Go on in another n0; its axes, and what an antenna that rests has there of s."""
+        """Change to another n0, with its axes and the s_v and s_p of an antenna at rest there."""
         self.C = C_nn0 @ self.C
         self.u, self.w = (self.u - s_v) @ C_nn0.T, (self.w - s_p) @ C_nn0.T
 
     def clone(self, C_n0n: Array) -> None:
-        """Let t0 be now: the attitude at t0 is in the axes of n then, without an error."""
+        """Let t0 be now: clone the attitude, which `C0` keeps in the axes of n."""
         self.C0 = C_n0n.T @ self.C
         self.P[:, PHI0] = self.P[:, PHI]
         self.P[:, :, PHI0] = self.P[:, :, PHI]
 
     def reset_vertical(self, s_z: float, v_std: float = 0.0, p_std: float = 0.0) -> None:
-        """Let the vertical velocity be `s_z`; of it and of the position only sigmas are known."""
-        up = self.C[self.lead, 2]       # to the likeliest mean of each rival
+        """Set the vertical velocity to `s_z`, and sigmas of it and of the vertical position."""
+        up = self.C[self.lead, 2]       # of the likeliest mean of each rival
         along = up[:, :, None] * up[:, None]
         for rows, std in (XI, v_std), (RHO, p_std):
             self.P[:, rows] -= along @ self.P[:, rows]
@@ -465,7 +477,7 @@ class Filters:
 
 
 def of_heading(P: Array, up: Array) -> tuple[Array, Array]:
-    """Return its covariance with all errors, shape (M, n), and its variance, (M,)."""
+    """Return the heading's covariance with all errors, shape (M, n), and its variance, (M,)."""
     column = apply(P[:, :, PHI], up)
     return column, np.einsum('ij,ij->i', up, column[:, PHI])
 
@@ -474,8 +486,8 @@ def _product(A: Array, B: Array, epochs: float) -> Array:
     """
     Return the variance, (M,), of the vector product of vectors of covariances A, B, (M, 3, 3).
 
-    They are independent, and taken as alike in all directions. An error that lasts for some epochs
-    counts as a noise with as many times the variance.
+    They are independent, and taken as isotropic. A product that lasts for some epochs counts as
+    white noise with as many times the variance.
     """
     variance: Array = 2 / 9 * np.trace(A, axis1=1, axis2=2) * np.trace(B, axis1=1, axis2=2)
     return max(1.0, epochs) * variance

@@ -32,7 +32,7 @@ from ins_align.imu.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
 import numpy as np
 
-# Sigma of an angle that may be any, radians.
+# Sigma of an angle that is uniformly distributed, radians.
 UNIFORM_STD = math.pi / math.sqrt(3.0)
 
 
@@ -149,17 +149,17 @@ class NoteMethod:
     """
     The note's velocity (``vif``) or position (``pif``) integration formula with lever arm.
 
-    Errors of the IMU are not known to it: its sigma comes from the centred moments, the noise of
-    the receiver and the residuals; those of the gyros count where the GNSS is silent. ``pif``
-    takes positions where no velocity comes; the start velocity is then always free.
+    It does not model errors of the IMU: sigmas come from the centred moments, the noise of the
+    receiver and the residuals, and without GNSS from the noise of the gyros. ``pif`` uses
+    positions where there are no velocities; the start velocity is then always free.
 
     Parameters
     ----------
     config : Config
     epoch : AntennaEpoch
-        t0.
+        The first epoch, t0.
     imu : Intervals
-        Of no length, at t0.
+        The interval at t0, whose duration is zero.
     use_position : bool
         For ``pif``: integrate positions, not velocities.
 
@@ -186,7 +186,7 @@ class NoteMethod:
         self._moments = AttitudeMoments(nuisance)
         self._nuisance = nuisance
         self._offered = 0
-        self._variance = 0.0                # of what the receiver says, summed over pairs
+        self._variance = 0.0                # of the receiver, summed over pairs
         self._start_variance = _mean_variance(epoch.position_covariance if self._from_positions
                                               else epoch.velocity_covariance)
         self._solution: tuple[Array, Array] | None = None
@@ -196,7 +196,7 @@ class NoteMethod:
             self._pair(epoch)
 
     def advance(self, epochs: Sequence[AntennaEpoch], imu: Intervals) -> Iterator[AntennaEpoch]:
-        """Take epochs and the IMU intervals before each; yield each when the results are its."""
+        """Process epochs and the IMU intervals before each; see `Bank.advance`."""
         for k, epoch in enumerate(epochs):
             self._body.advance(imu, k)
             self._track = self._track.along([epoch], self.t0_ns).at(0)
@@ -238,18 +238,18 @@ class NoteMethod:
         self._residual = residual
         self._solved_s = time
         white, common = self._noise()
-        # What is common to all pairs does not average out.
+        # Noise that all pairs have in common does not average out.
         self._solution = C, np.linalg.inv(information / (white + self._moments.count * common)
                                           + np.eye(3) / UNIFORM_STD ** 2)
 
     def _noise(self) -> tuple[float, float]:
-        """Return the variance of a pair that is white, and that which all pairs have together."""
+        """Return the white variance of a pair, and the variance that all pairs have in common."""
         variance = self._variance / self._offered
         start = 0.0 if self._free else self._start_variance
         if not self._position_form or self._from_positions:
             return variance, start
-        # Integrated velocities walk at random; a free start takes out all but 1/15 of it, and what
-        # the first one is off grows with time.
+        # Integrated velocities are a random walk, of which a free start removes all but 1/15; the
+        # error of the first velocity grows with time.
         time = float(self._track.time)
         walk = variance * time / self._offered * time
         return 0.0, walk / 15 if self._free else walk / 2 + start * time ** 2 / 3
@@ -266,7 +266,7 @@ class NoteMethod:
             return None
         C, covariance = self._solution
         C_nn0 = self._track.C_n0n.T
-        # Where no measurement comes, the gyros alone carry it on.
+        # Without measurements the gyros alone carry the attitude.
         noise, silent_s = self._config.imu_noise, float(self._track.time) - self._solved_s
         drift = noise.angle_random_walk ** 2 * silent_s + (noise.gyro_bias_std * silent_s) ** 2
         return (orthonormalized(C_nn0 @ C @ self._body.C_b0b),

@@ -12,9 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Motion and measurements of many epochs, linearised: what a filter of the body's errors needs.
+Linearised motion and measurements of many epochs.
 
-The errors of `filter` are the body's, so what is linearised here holds no attitude and serves all
+Errors are those of `filter`, in the body frame, so derivatives hold no attitude and serve all
 means of a rival (docs, "Theory").
 """
 
@@ -27,7 +27,7 @@ from ins_align.imu.preintegration import Intervals
 from ins_align.imu.recent import AGES, exact, smooth
 import numpy as np
 
-# A delay within these (s) is followed along the recent motion; from there it goes straight on.
+# A delay is followed along the recent motion within these (s), and linearly beyond.
 EARLIEST, LATEST = -0.1, AGES[-1]
 _EYE = np.eye(3)
 
@@ -37,15 +37,24 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool,
     """
     Linearise K epochs.
 
-    It is done at parameters `point`, (M, m), whose delays are alike, and within `EARLIEST` and
-    `LATEST`. Intervals before each epoch are as each of the rivals has them, with leading axes
-    (K, M), and Q, (K, 1, 9, 9), is their covariance of (rotation, velocity, position) in the frame
-    at the start. `base` is the position of the vehicle's base in the frame of the IMU, (3,), m.
+    Parameters
+    ----------
+    point : ndarray, shape (M, m)
+        Parameters of each rival; their delays are equal, and within `EARLIEST` and `LATEST`.
+    interval : Intervals
+        Before each epoch and with the signs of each rival, of leading axes (K, M).
+    Q : ndarray, shape (K, 1, 9, 9)
+        Their covariance of (rotation, velocity, position) in the frame at the start.
+    use_position : bool
+        Whether positions are measured too.
+    base : ndarray, shape (3,), optional
+        Position of the vehicle's base in the frame of the IMU, m.
+
     """
     M, m = point.shape
     K = interval.duration.size
     gyro, accel = triads(m)
-    size = accel.stop - accel.start             # errors of a triad: its bias, or its matrix too
+    size = accel.stop - accel.start             # of a bias, or of a bias and a matrix
     J = np.zeros((K, M, 9, m))
     J[:, :, PHI, gyro], J[:, :, XI, gyro] = interval.J_Rg[..., :size], interval.J_vg[..., :size]
     J[:, :, RHO, gyro], J[:, :, XI, accel] = interval.J_pg[..., :size], interval.J_va[..., :size]
@@ -60,7 +69,7 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool,
     F[..., RHO, XI] = interval.duration[:, None, None, None] * T
     for rows in (PHI, XI, RHO):
         F[..., rows, FIRST:] = T @ J[..., rows, :]
-    # What is gained late is missing in the position, with all its errors.
+    # The position that a late receiver measures lacks what was gained during the delay.
     delay = point[:, DELAY, None, None]
     F[..., RHO, PHI] -= delay * F[..., XI, PHI]
     F[..., RHO, FIRST:] -= delay * F[..., XI, FIRST:]
@@ -79,20 +88,20 @@ def linearised(point: Array, interval: Intervals, Q: Array, use_position: bool,
 
 
 class _Seen:
-    """What a receiver sees whose measurements are late, in the body frame; K epochs, M rivals."""
+    """Measurements of a late receiver, in the body frame; K epochs, M rivals."""
 
     def __init__(self, point: Array, interval: Intervals) -> None:
-        """Lead back from the epochs to the moments that were measured."""
+        """Go back from the epochs to the times of the measurements."""
         self.shape = interval.duration.size, len(point), 3, FIRST + point.shape[1]
         gyro, accel = (point[:, triad] for triad in triads(point.shape[1]))
         self.delay = delay = float(point[0, DELAY])
         force, self.gained, self.gained_p = exact(interval.gained, delay)
         rate, self.turned, _ = exact(interval.turned, delay)
-        # A lever arm swings with the vibration too.
+        # The lever arm swings with the vibration too.
         vibration = interval.omega - exact(interval.turned, 0.0)[0]
 
         def corrected(measured: Array, errors: Array, biases: float) -> Array:
-            """Return what a triad measured without its errors."""
+            """Return the integrals of a triad without its errors."""
             true = measured - biases * errors[:, :3]
             if errors.shape[1] > 3:
                 true = true - apply(errors[:, 3:].reshape(-1, 3, 3), measured)
@@ -106,14 +115,14 @@ class _Seen:
         self.back = exp_so3(-turn)
         self.fallen = corrected(self.gained, accel, delay)
         self.fallen_p = corrected(self.gained_p, accel, delay ** 2 / 2)
-        # Vibration is no use in a derivative. The rate changes with time as it does not with age.
+        # Derivatives use the motion without vibration. Age runs against time.
         self._calm = calm
         self._calm_force = corrected(smooth(interval.gained, delay)[0], accel, 1.0)
         self._change = corrected(smooth(interval.turned, delay)[1], gyro, 0.0)
         self._carry(point[:, LEVER_ARM])
 
     def _carry(self, lever: Array) -> None:
-        """Let the antenna be at the end of a lever arm."""
+        """Set the lever arm, and the velocity and acceleration of its end."""
         self.lever = np.broadcast_to(lever, self.omega.shape)
         swing = cross(self.omega, self.lever)
         self.swing = apply(self.back, swing)
@@ -121,7 +130,7 @@ class _Seen:
         self.acceleration = self._calm_force + apply(self.back, whirled)
 
     def base(self, position: Array) -> tuple[Array, Array, Array]:
-        """See the vehicle's base as an antenna there would; see `Linearised.base`."""
+        """Return `Linearised.base`, which is the velocity of an antenna at the base."""
         other = copy(self)
         other._carry(position)
         H, expected = other.velocity()
@@ -129,7 +138,7 @@ class _Seen:
         return H, expected, self.back
 
     def velocity(self) -> tuple[Array, Array]:
-        """Return its derivatives, shape (K, M, 3, n), and what u lacks of it, (K, M, 3)."""
+        """Return the derivatives, shape (K, M, 3, n), and u minus the velocity, (K, M, 3)."""
         swing = skew(self.swing)
         arm = self.back @ skew(self.lever)
         H = self._derivatives(skew(self.fallen) - swing, self.back @ skew(self.omega),
@@ -139,7 +148,7 @@ class _Seen:
         return H, self.fallen - self.swing
 
     def position(self) -> tuple[Array, Array]:
-        """Return its derivatives, shape (K, M, 3, n), and what w lacks of it, (K, M, 3)."""
+        """Return the derivatives, shape (K, M, 3, n), and w minus the position, (K, M, 3)."""
         arm = apply(self.back, self.lever)
         H = self._derivatives(-skew(self.fallen_p + arm), self.back, self.fallen - self.swing,
                               np.zeros(arm.shape + (3,)), -self.delay * skew(arm), -skew(arm),
@@ -150,7 +159,7 @@ class _Seen:
     def _derivatives(self, to_phi: Array, to_lever: Array, to_delay: Array, to_rate: Array,
                      to_gyro_bias: Array, to_turn: Array, to_accel_bias: float,
                      force: Array) -> Array:
-        """Put derivatives in their places; those to matrices follow from rates and forces."""
+        """Assemble the derivatives; those to matrices follow from rates and forces."""
         H = np.zeros(self.shape)
         x = H[..., FIRST:]
         H[..., PHI], x[..., LEVER_ARM], x[..., DELAY] = to_phi, to_lever, to_delay

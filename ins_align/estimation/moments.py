@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""An attitude from pairs of vectors whose start is not known: moments and the q-method."""
+"""The q-method for pairs of vectors, with an unknown start: an attitude from their moments."""
 
 from ins_align.geometry.rotation import Array, matrix_from_quaternion
 import numpy as np

@@ -11,23 +11,23 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What innovations say of the receiver: how large its noise is, and how long its errors last."""
+"""The noise of the receiver, estimated from innovations: how large it is, how long it lasts."""
 
 import math
 
 from ins_align.geometry.rotation import Array
 import numpy as np
 
-# The noise is taken to be larger than stated when innovations are LOUD times as large in the mean
-# square; that of a receiver that states none, or whose velocities are QUIET, is estimated, from
-# LEAST_NOISE of the variance on. It follows at a rate, the mean square of velocities at another, a
-# single epoch counting up to the last.
+# The noise is taken to be larger than stated when the mean square of normalised innovations is
+# above LOUD. Where a receiver states none, or that mean square is below QUIET for velocities, the
+# noise is estimated, down to LEAST_NOISE of the variance. FOLLOW and LATELY are the gains, per
+# epoch, of the noise and of the mean square of velocities; one epoch counts up to CLIP.
 LOUD, QUIET, LEAST_NOISE, FOLLOW, LATELY, CLIP = 2.0, 0.25, 1e-2, 0.02, 0.05, 5.0
-# Velocities below this (m/s) do not count as quiet: receivers smooth what stands.
+# Velocities below this (m/s) do not count as quiet: receivers smooth them at rest.
 MOVING = 1.0
-# Errors of receivers, which filter, last so long (s). A mean of innovations over that time, which
-# forgets at most this share with each, shows it; so much more than white noise makes of it is
-# chance. Positions that come more often and state no noise say no more.
+# Errors of receivers, which filter, last so long (s). The mean of innovations over that time, with
+# a gain of at most LASTING per epoch, shows it where its square exceeds that of white noise by
+# CHANCE. Positions without a covariance that come more often give no more information.
 ERRORS_LAST, LASTING, CHANCE = 1.0, 0.2, 0.5
 # Factor on variances that is worth a word.
 MENTIONED = 1.5
@@ -37,7 +37,7 @@ MEMORY, BELIEVED = 300, 30
 
 class ReceiverNoise:
     """
-    Follows the noise of a receiver.
+    Estimates the noise of a receiver.
 
     Attributes
     ----------
@@ -47,15 +47,15 @@ class ReceiverNoise:
     """
 
     def __init__(self) -> None:
-        """Believe what is stated."""
-        # Log of factors on variances, those configured and those stated: of velocity and position,
-        # horizontal and vertical.
+        """Start with what the receiver states."""
+        # Log of factors on variances: configured or stated, of velocity or position, horizontal or
+        # vertical.
         self._noise = np.zeros((2, 2, 2))
         self._quiet = np.ones(2)    # mean square of velocities in motion, horizontal and vertical
-        # When velocities and positions were heard last, and their intervals, up to `ERRORS_LAST`.
-        self._heard_at, self._interval = [0.0, 0.0], [ERRORS_LAST, ERRORS_LAST]
+        # Times of the last velocity and position, and mean intervals, up to `ERRORS_LAST`, s.
+        self._last, self._interval = [0.0, 0.0], [ERRORS_LAST, ERRORS_LAST]
         self.misfit = self._lasting = 1.0
-        self._heard, self._mean = BELIEVED, np.zeros((2, 3))
+        self._count, self._mean = BELIEVED, np.zeros((2, 3))
 
     def start(self, kind: int, stated: bool, factor: float) -> None:
         """Begin with a factor on the variances of velocities (kind 0) or positions (1)."""
@@ -65,34 +65,46 @@ class ReceiverNoise:
         """Return factors on the sigmas of velocities or positions, east, north, up."""
         return np.exp(0.5 * self._noise[int(stated), kind, [0, 0, 1]])
 
-    def hear(self, kind: int, stated: bool, moving: bool, square: float,
-             normalised: Array, seconds: float) -> None:
+    def follow(self, kind: int, stated: bool, moving: bool, square: float,
+               normalised: Array, seconds: float) -> None:
         """
-        Follow an innovation.
+        Adapt the noise to an innovation.
 
-        It is of a velocity (kind 0) or a position (1), whose noise is stated or configured, while
-        the antenna moves or not; normalised and squared, per row, and over its sigmas, east,
-        north, up, (3,); so many seconds after the start.
+        Parameters
+        ----------
+        kind : int
+            0: of a velocity, 1: of a position.
+        stated : bool
+            Whether the receiver states its noise, or it is configured.
+        moving : bool
+            Whether the antenna moves.
+        square : float
+            Normalised innovation squared, per row.
+        normalised : ndarray, shape (3,)
+            Innovation over its sigmas, east, north, up.
+        seconds : float
+            Since the start.
+
         """
-        interval, self._heard_at[kind] = seconds - self._heard_at[kind], seconds
+        interval, self._last[kind] = seconds - self._last[kind], seconds
         self._interval[kind] += LATELY * (min(interval, ERRORS_LAST) - self._interval[kind])
-        alike = ERRORS_LAST / self._interval[kind]      # epochs whose errors may be the same
+        alike = ERRORS_LAST / self._interval[kind]      # epochs with the same error
         east, north, up = np.square(normalised).tolist()
         noise = self._noise[int(stated), kind]
-        heard = np.minimum([0.5 * (east + north), up], CLIP)
+        squares = np.minimum([0.5 * (east + north), up], CLIP)
         estimated = np.full(2, not stated)
         if stated and kind == 0:
             if moving:
-                self._quiet += LATELY * (heard - self._quiet)
+                self._quiet += LATELY * (squares - self._quiet)
             estimated = (noise < 0.0) | (self._quiet < QUIET)
         least = np.where(estimated & (moving | (not stated)),
                          math.log(LEAST_NOISE * (alike if kind else 1.0)), np.minimum(noise, 0.0))
-        noise += FOLLOW * (heard - np.where(estimated, 1.0, LOUD))
+        noise += FOLLOW * (squares - np.where(estimated, 1.0, LOUD))
         np.maximum(noise, least, out=noise)
-        self._heard += 1
-        share = 1 / min(self._heard, MEMORY)
+        self._count += 1
+        share = 1 / min(self._count, MEMORY)
         self.misfit += share * (min(square, CLIP) - self.misfit)
-        # Of large ones the direction counts: they are outliers, or the heading is being found.
+        # Large innovations are clipped: they are outliers, or the heading is not known yet.
         mean = self._mean[kind]
         newest = min(LASTING, 1 / alike)
         mean += newest * (normalised / max(1.0, math.sqrt(square / CLIP)) - mean)
@@ -101,7 +113,7 @@ class ReceiverNoise:
 
     @property
     def inflation(self) -> float:
-        """Factor on variances of results: innovations are larger than they should be, or last."""
+        """Factor on variances of results, for innovations that are too large or that last."""
         return max(1.0, self.misfit, self._lasting - CHANCE)
 
     def in_words(self) -> str:

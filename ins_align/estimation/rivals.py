@@ -12,11 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-What else may be true: a table of rivals, each a change to the filter, a likelihood and a sentence.
+The rivals: hypotheses about the sensors beside the configuration.
 
-A rival is a bank of its own on the same data. One that is `wrong` must not be aligned with: while
-it is as likely as the configuration and would give another attitude, no heading is declared. The
-others are levels of the same configuration: what they say counts by their likelihood.
+Each is a change to the filter, a prior probability and a sentence, and is a bank of its own on the
+same data. While a rival that is `wrong` is as likely as the configuration and gives another
+attitude, no heading is declared. The others are levels of the IMU's errors, which count in results
+by their likelihood.
 """
 
 from dataclasses import dataclass, replace
@@ -29,40 +30,41 @@ from ins_align.estimation.states import (
 from ins_align.geometry.rotation import Array, log_so3
 import numpy as np
 
-# Over the error of the gyros' scale factors: their misalignment; scale factors and misalignment of
-# the accelerometers.
+# Sigmas over that of the gyros' scale factors: of the gyros' misalignment, and of scale factors
+# and misalignment of the accelerometers.
 GYRO_MISALIGNMENT, ACCEL_ERRORS = 0.3, 0.3
-# In this time (s) the biases of the accelerometers change by the first share of their sigma, as
-# temperatures do, and the delay by the second: clocks of IMU and GNSS that nothing keeps together.
+# In this time (s) the biases of the accelerometers change by the first share of their sigma, with
+# temperature, and the delay by the second, where nothing synchronises the clocks of IMU and GNSS.
 WANDER_TIME, ACCEL_WANDER, DELAY_WANDER = 100.0, 0.1, 0.2
-# Means whose log weight is so much below the likeliest's are dropped, and so are rivals that are
-# wrong; levels stay, for what they assume may become true, but have no part in a mixture. A level
-# stays lower where its accelerometers' biases are less likely than STRAINED (log): it has gone
-# astray, which its evidence, held so long, has forgotten.
+# Means are dropped when their log weight is UNLIKELY below that of the likeliest, and wrong rivals
+# when they are HOPELESS below. Levels are never dropped, for they may become true: their evidence
+# is held at LEAST below the best, which no mixture includes. A level whose accelerometer biases
+# are more improbable than STRAINED (log) has gone astray, which the held evidence does not show:
+# it is held lower by the excess.
 UNLIKELY, HOPELESS, LEAST, STRAINED = 14.0, 25.0, NEGLIGIBLE + 1.0, 8.0
 # Means of a rival that agree to so many sigmas are merged.
 ALIKE = 2.0
-# A wrong rival that is likely has to give the same attitude, to so many sigmas: on a flat floor
-# nothing ever shows the signs of two gyros.
+# A wrong rival whose attitude agrees to so many sigmas does no harm: on a flat floor nothing ever
+# shows the signs of two gyros.
 HARMLESS = 1.0
-# A setting is named for a bias that is so many times what is configured, without so many of its
-# own sigmas. One beyond 4 sigmas of the worst level is none: something else is wrong.
+# A setting is named for a bias that is so many times its configured sigma, less so many of its
+# own sigmas, and not beyond the last, 4 sigmas of the worst level: then something else is wrong.
 LARGE_BIAS, SURELY, NO_BIAS = 2.0, 2.0, 40.0
-# Velocity of a vehicle sideways and upwards that lasts (m/s: tyres' slip, leeway and current,
-# wind); it changes by its sigma in this time (s), as the wind does where an aeroplane turns.
+# Sigma of the velocity of a vehicle sideways and upwards that lasts (m/s: slip of tyres, leeway
+# and current, wind); it changes by its sigma in this time (s), as the wind does for an aeroplane
+# that turns.
 DRIFTS = {'car': 0.1, 'boat': 1.0, 'aeroplane': 10.0}
 DRIFT_TIME = 30.0
-# Share of the IMU's measured noise beyond the stated one that is believed at first: vibration
-# looks white from sample to sample and is less than that over seconds.
+# Share of the IMU's measured noise beyond the stated one that counts: vibration looks white
+# from sample to sample and is less than that over seconds.
 SHARE = 1 / 27
 
 
 @dataclass(frozen=True)
 class Rival:
-    """Another assumption about the body."""
+    """Another hypothesis about the sensors."""
 
-    #: What the data fit better with, in words, where the body's parameters can be put in; empty: a
-    #: level of the configuration.
+    #: What it assumes, in words with places for parameters; empty for a level.
     better: str = ''
     advice: str = 'check the IMU axes'  #: what to do then
     #: Of the gyros x, y, z and of the accelerometers.
@@ -79,13 +81,12 @@ class Rival:
 
     @property
     def wrong(self) -> bool:
-        """Whether it must not be aligned with."""
+        """Whether it contradicts the configuration, so that nothing is aligned with it."""
         return bool(self.better)
 
 
-# The biases of an IMU's gyros and of its accelerometers may be so many times larger than
-# configured, at such a log prior; the first level is the configuration. Scale factors and
-# misalignment are at most so many times larger.
+# Levels: factors on the biases of gyros and accelerometers, and log prior; the first level is the
+# configuration. Scale factors and misalignment are at most so many times larger.
 WORSE = ((1, 1, 0), (1, 3, -3), (1, 10, -5), (3, 1, -5.5), (10, 1, -11), (10, 10, -16))
 WORSE_SCALE = 3.0
 LEVELS = tuple(Rival(gyro=gyro, accel=accel, prior=prior) for gyro, accel, prior in WORSE)
@@ -97,8 +98,7 @@ SIGNS = (
     Rival('the angular rate about x reversed', signs=(-1.0, 1.0, 1.0, 1.0)),
     Rival('the angular rate about y reversed', signs=(1.0, -1.0, 1.0, 1.0)),
     Rival('the angular rate about z reversed', signs=(1.0, 1.0, -1.0, 1.0)))
-# What is configured as known better than a sigma is doubted: the parameter, the sigma (SI), and
-# what else it may be.
+# A parameter that is configured with a smaller sigma (SI) has a rival.
 TOLD = (
     ('lever_arm_std', 0.3, Rival(
         'a lever arm of [{lever}] m',
@@ -128,14 +128,22 @@ def rivals_of(config: Config) -> tuple[Rival, ...]:
 
 class Rivals:
     """
-    The table of a configuration, its columns as arrays, and what becomes of its lines.
+    The table of a configuration's rivals, its columns as arrays, and how they are judged.
 
-    `counts`, (R,), says whether a line is a part of results: those that are wrong are not, nor
-    those without a vehicle where there is one, which are there to contradict it.
+    Attributes
+    ----------
+    table : tuple of Rival
+        R rivals, of which the first is the configuration.
+    signs, prior, along : ndarray, shapes (R, 4), (R,), (R,)
+        Their fields.
+    counts : ndarray of bool, shape (R,)
+        Whether a rival is part of results. Wrong rivals are not, nor those without the assumption
+        on a vehicle where one is configured, which are there to contradict it.
+
     """
 
     def __init__(self, config: Config) -> None:
-        """Know nothing of the data."""
+        """Make the table."""
         self._gnss_delay = config.gnss_delay
         self.table = rivals_of(config)
         self.signs = np.array([rival.signs for rival in self.table])
@@ -158,7 +166,7 @@ class Rivals:
             return
         keep = filters.weight > filters.weight[filters.lead][filters.place] - UNLIKELY
         keep &= (~wrong | (filters.evidence - self.prior[ids] > -HOPELESS))[filters.place]
-        # A direction in which the vehicle did not set out is none for good.
+        # The direction in which a vehicle did not set out is dropped for good.
         for direction in {1, -1} & set(along.tolist()):
             there = along == direction
             if np.max(level[there]) < best - LEAST:
@@ -169,15 +177,15 @@ class Rivals:
 
     def doubt(self, filters: Filters, mean: Array, P: Array) -> tuple[str, bool]:
         """
-        Hear the rivals that are wrong, in filters of the same table with their mixture.
+        Ask the wrong rivals whether they speak against a mean attitude with its covariance.
 
-        Returns why a heading is not to be declared, or '', and whether the data fit better with
-        one of them.
+        Both are as `Filters.mixture` returns them. Returns why a heading is not to be declared, or
+        '', and whether the data fit better with one of the rivals.
         """
         wrong = self._wrong[filters.ids]
         if not wrong.any():
             return '', False
-        # How much likelier each of them is than all levels.
+        # How much likelier each wrong rival is than all levels together.
         level = filters.evidence
         ahead = np.where(wrong, level - log_sum(level[filters.counts]), -np.inf)
         if not np.any(ahead > -MARGIN):
@@ -188,8 +196,8 @@ class Rivals:
         worst = int(np.argmax(ahead))
         if ahead[worst] <= -MARGIN:
             return '', False
-        # A sensor worse than configured is unlikely before the data, and no error of the user's:
-        # who accuses has to fit better than any level does.
+        # The prior of a bad IMU must not make a wrong configuration likely: before it is called
+        # wrong, the rival has to fit better than each level does without its prior.
         fits = np.max((level - self.prior[filters.ids])[filters.counts])
         if level[worst] - fits > MARGIN:
             return in_words(self.table[filters.ids[worst]], filters.x[filters.lead[worst]],
@@ -204,23 +212,23 @@ class Rivals:
 
 @dataclass
 class Parameters:
-    """What is known of the body's parameters before the data, under a rival."""
+    """The prior of the body's parameters under a rival."""
 
     x: Array  #: (m,)
-    P: Array  #: (m, m)
-    walk: Array  #: (m,), what a second adds to the diagonal of P
+    P: Array  #: (m, m), covariance
+    walk: Array  #: (n,), random walk of all errors: what P gains on its diagonal in a second
 
     @staticmethod
     def of(config: Config, rival: Rival, force: Array) -> 'Parameters':
         """
-        Return those of a configuration.
+        Return the prior of a configuration.
 
         Parameters
         ----------
         config : Config
-            What is stated.
+            What is configured.
         rival : Rival
-            What is assumed beside it.
+            What is assumed instead.
         force : ndarray, shape (3,)
             Specific force, m/s^2, at which all errors of the accelerometers together are as large
             as their biases are said to be.
@@ -248,7 +256,7 @@ class Parameters:
         if matrices:
             P[GYRO + 3:accel, GYRO + 3:accel] = np.diag(
                 gyro_matrix_std(min(rival.gyro, WORSE_SCALE) * noise.gyro_scale_std).ravel() ** 2)
-            # A force f makes b + M f of bias and matrix, which has the sigma of the bias.
+            # At the force f the error b + M f of bias b and matrix M has the sigma of the bias.
             scale = ACCEL_ERRORS * min(rival.accel, WORSE_SCALE) * noise.gyro_scale_std
             told = np.eye(12)
             told[:3, 3:] = -np.kron(np.eye(3), force)
@@ -258,7 +266,7 @@ class Parameters:
 
 
 def in_words(rival: Rival, x: Array, gnss_delay: float) -> str:
-    """Return a sentence on a rival that the data fit better, with its parameters x."""
+    """Return the sentence of a rival that the data fit better, with its parameters x, (m,)."""
     gyro, accel = biases(x.size)
 
     def listed(vector: Array, digits: str) -> str:
@@ -273,10 +281,11 @@ def in_words(rival: Rival, x: Array, gnss_delay: float) -> str:
 
 def level_in_words(level: Rival, noise: ImuNoise, x: Array, P: Array) -> str:
     """
-    Return how a level with parameters x and their covariance is worse than configured, or ''.
+    Return how the IMU is worse than configured, as the end of a sentence, or ''.
 
-    It is the end of a sentence. A setting is named where a bias is surely far larger than
-    configured: what looks worse for other reasons gets no better with a setting, and takes longer.
+    `x`, (m,), and `P`, (m, m), are the parameters of the level and their covariance. A setting is
+    named where a bias is surely far larger than configured: an IMU that looks worse for other
+    reasons gets no better with a setting, and takes longer.
     """
     if level.gyro == level.accel == 1:
         return ''

@@ -14,8 +14,8 @@
 """
 The start of a bank: the note's formula over the first epochs, then every heading.
 
-A change of velocity, or the gravity that is taken off it, gives a vector in n0 and in the body;
-what one vector leaves open is the rotation about it, so the bank starts with all of them.
+The specific force, integrated, gives one vector in n0 and in the body. It leaves the rotation
+about it open, so the bank starts with means all round.
 """
 
 from dataclasses import replace
@@ -35,60 +35,61 @@ from ins_align.gnss.messages import (
 from ins_align.imu.preintegration import Intervals
 import numpy as np
 
-# A start takes so many epochs, fewer leave the formula no redundancy, and waits for no more. What
-# positions with a noise of some metres say grows with the square of the time that they span.
+# A start takes at least so many epochs, for the formula needs redundancy, and keeps at most so
+# many: the information of positions with a noise of metres grows with the square of their time.
 FIRST_EPOCHS, MAX_WAITING = 4, 256
-# The vector from which a bank starts is so many times its noise.
+# The bank starts when the length of the vector is so many times its noise.
 START_RATIO = 40.0
-# Epochs whose sigma is so many times that of the best say nothing to a start.
+# Epochs whose sigma is so many times the best are left out of a start.
 UNCERTAIN = 10.0
-# Epochs over so many seconds may tell less noise than is stated or configured: errors that last
-# are not in the residuals of fewer.
+# Noise below what is stated or configured is believed only of residuals over so many seconds:
+# those of a shorter time do not show errors that last.
 LONG_ENOUGH = 1.0
-# One epoch is an outlier if it is so unlike the others: F statistic of its residuals over theirs.
+# F statistic of an epoch's residuals over those of the others above which it is an outlier.
 OUTLYING = 20.0
-# Among so many it is looked for before they are enough, which they hardly are with it.
+# Among so many epochs an outlier is searched for even before they suffice, for with one they may
+# never suffice.
 FEW = 64
 TOO_NOISY = ('{epochs} GNSS epochs in {seconds:.0f} s are too noisy to start with: fewer epochs a '
              'second, which are waited for longer, would do')
-# Headings, every five degrees, and their sigma (rad): wide enough for the sum of their densities
-# to be flat to a tenth, and narrow, for errors of a heading are linearised.
+# Number of headings, one every five degrees, and their sigma (rad): wide enough for the sum of
+# their densities to be flat to a tenth, and narrow, for errors of a heading are linearised.
 HEADINGS = 72
 STEP_STD = 0.4 * 2 * math.pi / HEADINGS
-# The tilt of the start is used with so many times its sigma, for the epochs that it is from are
-# used again, and with another one (rad), for what the formula does not know, as the lever arm.
+# Factor on the sigma of the start's tilt, for the filters use its epochs again; and a sigma (rad)
+# for what the formula does not model, as the lever arm.
 REUSED, TILT_STD = 3.5, math.radians(3.0)
-# Headings are drawn anew when each has become as uncertain as this (rad).
+# Headings are drawn again when the sigma of each has grown to this (rad).
 BLURRED = 0.2
 _EVEN = 2 * math.pi / HEADINGS * np.arange(HEADINGS)[:, None]
-# What is not known of velocity and position at first (m/s, m); of a velocity whose horizontal
-# part is measured, the vertical is known better.
+# Sigmas of velocity and position at first (m/s, m), and of the velocity where it is measured, if
+# only horizontally.
 OPEN_VELOCITY, OPEN_POSITION, STEADY_VELOCITY = 1e3, 1e4, 10.0
 
 
 class RoughAttitude(NamedTuple):
-    """Attitude from the note's formula."""
+    """The attitude of the note's formula, whose rotation about an axis is not known."""
 
-    C: Array  #: (3, 3), at t0, but for a rotation about the axis
+    C: Array  #: (3, 3), at t0
     axis: Array  #: (3,), in the body at t0
-    kind: int  #: 0 from velocities, 1 from positions
+    kind: int  #: 0: from velocities, 1: from positions
     stated: bool  #: whether the receiver states variances
     noise: float  #: factor on the receiver's variances
-    std: float  #: of the direction of the axis in n0, rad
+    std: float  #: sigma of the direction of the axis in n0, rad
 
 
 class Start:
-    """Epochs that wait until there are enough to start with; the first one is t0."""
+    """Collects epochs until they suffice for an attitude; the first one is t0."""
 
     def __init__(self, config: Config) -> None:
-        """Wait for the first epoch."""
+        """Start without an epoch."""
         self._lever = np.array(config.lever_arm)
         self.epochs: list[AntennaEpoch] = []
         self._imu: list[Intervals] = []
         self.rejected = [0, 0]      # velocities and positions that were left out as outliers
 
     def add(self, epoch: AntennaEpoch, imu: Intervals) -> None:
-        """Take an epoch and the interval before it."""
+        """Add an epoch and the interval before it."""
         if self.epochs or _measured(epoch):
             self._imu.append(imu if self.epochs else imu.end())
             self.epochs.append(epoch)
@@ -97,12 +98,12 @@ class Start:
 
     @property
     def imu(self) -> Intervals:
-        """Return the intervals before all epochs; the first is of no length."""
+        """Return the intervals before all epochs; the duration of the first is zero."""
         return Intervals(**{name: np.concatenate([getattr(imu, name) for imu in self._imu])
                             for name in vars(self._imu[0])})
 
     def _drop_first(self) -> None:
-        """Let t0 be the next epoch with a measurement."""
+        """Drop the first epochs: t0 is the next one with a measurement."""
         later = [k for k, epoch in enumerate(self.epochs) if k and _measured(epoch)]
         if later:
             imu = self._imu[later[0]].end()
@@ -110,7 +111,7 @@ class Start:
             self._imu[0] = imu
 
     def solve(self, use_position: bool) -> RoughAttitude | None:
-        """Return an attitude; None where the epochs say too little, or contradict each other."""
+        """Return an attitude; None if the epochs do not suffice or contradict each other."""
         epochs = self.epochs
         kind = 0 if sum(epoch.v_n is not None for epoch in epochs) >= FIRST_EPOCHS else 1
         use = np.array([epoch.position_measured if kind else epoch.v_n is not None
@@ -129,7 +130,7 @@ class Start:
             values, vectors = np.linalg.eigh(moments)
             states = [epochs[k].stated[kind] for k in places]
             stated = any(states)
-            chance = math.sqrt(2 / rows)            # it may be so much more
+            chance = math.sqrt(2 / rows)            # relative sigma of `noise`
             quiet = (kind == 0 and all(states) and noise * (1 + 3 * chance) < QUIET
                      and np.any(np.linalg.norm(velocities_of(epochs)[places], axis=1) > MOVING))
             noise = (max(noise * (1 + chance), LEAST_NOISE) if quiet or not stated
@@ -141,7 +142,7 @@ class Start:
             if noise < LOUD or not (enough or len(places) <= FEW):
                 break
             if len(places) <= FIRST_EPOCHS + kind:
-                if noise > OUTLYING:                # and they do not tell which is the outlier
+                if noise > OUTLYING:                # they do not show which is the outlier
                     return None
                 break
             left = [_solved(s, a, time, np.delete(places, i), kind)[1]
@@ -164,7 +165,7 @@ class Start:
 
     @property
     def lacks(self) -> str:
-        """Return in words what these epochs do not have and a start needs, or ''."""
+        """Return in words what the epochs lack for a start, or ''."""
         epochs = self.epochs
         if epochs and not any(
                 epoch.v_n is not None
@@ -177,7 +178,7 @@ class Start:
         return TOO_NOISY.format(seconds=seconds, epochs=len(epochs))
 
     def _pairs(self, kind: int) -> tuple[Array, Array, Array]:
-        """Return the times and the vectors of the formula, free start, for all epochs."""
+        """Return times, s and a of the formula with a free start, for all epochs."""
         epochs, imu, first = self.epochs, self.imu, self.epochs[0]
         track = InertialTrack.start(first.latitude, first.longitude, first.altitude).along(
             epochs, first.stamp_ns)
@@ -192,10 +193,10 @@ class Start:
 
     def _variance(self, kind: int) -> Array:
         """
-        Return what the receiver states.
+        Return the variance that the receiver states at each epoch, mean of three axes.
 
-        A vertical velocity that is not measured is taken as steady. Without an altitude nothing is
-        known of the vertical, and positions alone say nothing.
+        A vertical velocity that is not measured is taken as steady, with the variance of the
+        horizontal ones. Positions without an altitude have a huge variance.
         """
         if kind:
             return np.array([np.trace(epoch.position_covariance) / 3 for epoch in self.epochs])
@@ -206,10 +207,10 @@ class Start:
     def means(self, rough: RoughAttitude, x: Array, known: Array,
               accel_sign: float) -> tuple[Array, Array]:
         """
-        Return the attitudes of a rival, all round the axis, and the covariance of errors at t0.
+        Return the attitudes of a rival all round the axis, and the covariance of errors at t0.
 
-        What accelerometers measure wrongly of gravity, ``b + M f``, is in the rough attitude: a
-        tilt of ``f x (b + M f) / f^2``.
+        The error of the accelerometers, ``b + M f``, is in the rough attitude as a tilt of
+        ``f x (b + M f) / f^2``.
 
         Parameters
         ----------
@@ -227,7 +228,7 @@ class Start:
         """
         C, axis = rough.C, rough.axis
         if accel_sign < 0:
-            # With the accelerations reversed it is half a turn about any axis across.
+            # With reversed accelerations the attitude is half a turn away, about any axis across.
             across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
             C = C @ exp_so3(math.pi * across / np.linalg.norm(across))
         gained = np.sum([imu.v[0] for imu in self._imu], axis=0)
@@ -251,13 +252,13 @@ class Start:
         return C @ exp_so3(_EVEN * axis) @ exp_so3(tilt @ x[accel]), P
 
 
-def draw_anew(filters: Filters) -> None:
+def redraw_headings(filters: Filters) -> None:
     """
-    Draw headings all round anew for the rivals whose headings have become blurred.
+    Draw headings again, all round, for the rivals whose headings have become blurred.
 
-    Where the vehicle turns to is not known, each mean becomes blurred, and errors of a heading are
-    linearised. The new ones are sharp and evenly spaced. What was known of the heading, which the
-    gyros have not kept, is given up, and says nothing of the rest.
+    While rates are unknown the heading of each mean becomes uncertain, and its errors are
+    linearised. The new headings are sharp and evenly spaced. What was known of the heading is
+    given up, which the gyros have not kept, and so is its correlation with the rest.
     """
     if filters.single:
         return
@@ -273,7 +274,7 @@ def draw_anew(filters: Filters) -> None:
     P += blurred[:, None, None] * (
         (variance + STEP_STD ** 2)[:, None, None] * (turn[:, :, None] * turn[:, None])
         - shared - shared.swapaxes(1, 2))
-    # Each comes from the old one that is likeliest to be turned to it.
+    # The state of each comes from the old mean that is likeliest to have its heading.
     source = np.split(np.arange(len(filters.C)), filters.first[1:])
     angle = [np.zeros(old.size) for old in source]
     for m in np.flatnonzero(blurred):

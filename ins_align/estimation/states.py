@@ -12,9 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-The error state of a filter, and what filters take of epochs: motion and measurements.
+The error state of a filter, and linearised motion and measurements of epochs.
 
-A leaf of the imports: places, shapes and names that the modules of the estimation share.
+These are the indices, shapes and names that the modules of the estimation share.
 """
 
 from dataclasses import dataclass
@@ -27,10 +27,10 @@ import numpy as np
 # gyros (bias, then matrix), errors of the accelerometers.
 PHI, XI, RHO, PHI0, FIRST = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12
 LEVER_ARM, DELAY, GYRO = slice(0, 3), 3, 4          # in the parameters
-# At their end, where a vehicle is known: mounting and drift, each sideways and upwards.
+# At their end, with a vehicle: mounting and drift, each sideways and upwards.
 MOUNT, DRIFT, OF_VEHICLE = slice(-4, -2), slice(-2, None), 4
 
-# One hypothesis has to be likelier than another by this (log likelihood), to be believed.
+# One hypothesis is believed against another when it is likelier by this (log likelihood).
 MARGIN = 6.0
 
 
@@ -48,13 +48,13 @@ def biases(m: int) -> tuple[slice, slice]:
 
 def turned_parameters(d: Array, half: Array, rest: Array) -> Array:
     """
-    Return by how much errors d, (B, n), change the parameters, (B, m).
+    Return the change of the parameters, (B, m), by errors d, (B, n).
 
     `half` is half of the turn by phi, (B, 3, 3). Biases of the accelerometers turn with it,
 
         a_true = a + g - exp(-phi) (g - da + phi x g)
 
-    with g the force at rest, `rest`, (B, 3): what a mean makes of that force is then linear in the
+    with g the force at rest, `rest`, (B, 3): the force that a mean then feels is linear in the
     errors.
     """
     x = d[:, FIRST:].copy()
@@ -64,7 +64,7 @@ def turned_parameters(d: Array, half: Array, rest: Array) -> Array:
 
 
 def _felt(phi: Array, d_accel: Array, back: Array, rest: Array) -> Array:
-    """Return what is felt at rest when the mean has been corrected, (B, 3)."""
+    """Return the force that the corrected mean feels at rest, (B, 3)."""
     return apply(back @ back, rest - d_accel + cross(phi, rest))
 
 
@@ -72,8 +72,8 @@ def transport(d: Array, half: Array, rest: Array) -> Array:
     """
     Return G, (B, 15, 15): errors d + e of a mean are about G e where d has corrected it.
 
-    What the group adds to velocity and position, the product of their correction and an error of
-    the attitude, is left out: a measurement takes it off again (docs, "Theory").
+    The product of a correction of velocity or position and an error of the attitude, which the
+    group has too, is left out: a measurement takes it off again (docs, "Theory").
 
     d and e, (B, 15), are errors of attitude, velocity, position, attitude at t0, and biases of the
     accelerometers. `half` has half of the turns by phi and phi0, (2, B, 3, 3); `rest` is as in
@@ -101,26 +101,27 @@ class Linearised:
 
     point: Array  #: (M, m), the parameters x
     duration: list[float]  #: s
-    #: (K, M, 3, 3), rotation over the interval before each, the errors at the point taken off.
+    #: (K, M, 3, 3), rotation over the interval before each epoch, corrected for `point`.
     R: Array
-    moved: Array  #: (K, M, 6), velocity and position gained in it
+    moved: Array  #: (K, M, 6), velocity and position gained in the interval
     J: Array  #: (K, M, 9, m), derivatives of rotation, velocity and position to x
     F: Array  #: (K, M, 9, n), transition of phi, xi, rho
-    Q: Array  #: (K, M, 9, 9), what the noise of the IMU adds to their covariance
+    Q: Array  #: (K, M, 9, 9), process noise of phi, xi, rho from the noise of the IMU
     H: Array  #: (K, 2, M, 3, n), derivatives of velocity and position, in the body, to the errors
-    expected: Array  #: (K, 2, M, 3), what C u and C w lack, in the body, of the measurements
-    #: Of the velocity of the vehicle's base: derivatives, (K, M, 3, n); what C u lacks of it,
-    #: (K, M, 3); rotation to the body frame from that when it was measured, (K, M, 3, 3).
+    #: (K, 2, M, 3), velocity and position of the IMU minus the measured ones, in the body
+    expected: Array
+    #: Of the velocity of the vehicle's base: derivatives, (K, M, 3, n); `expected`, (K, M, 3); and
+    #: the rotation from the body frame at the time of the measurement to that now, (K, M, 3, 3).
     base: tuple[Array, Array, Array] | None = None
 
 
 @dataclass
 class Measured:
-    """What the GNSS measures of K epochs, in n0; see `track.InertialTrack`."""
+    """The GNSS measurements of K epochs in n0; see `track.InertialTrack`."""
 
     s: Array  #: (K, 2, 3), s_v and s_p
     covariance: Array  #: (K, 2, 3, 3)
     present: list[tuple[bool, bool]]  #: whether there is a velocity, a position
-    vertical: list[bool]  #: whether what is vertical is measured, of either
+    vertical: list[bool]  #: whether the vertical velocity or position is measured
     stated: list[tuple[bool, bool]]  #: whether the receiver states its noise
-    still: Array  #: (K, 3), s_v of what rests
+    still: Array  #: (K, 3), s_v of an antenna at rest

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The antenna's way in a frame that does not rotate."""
+"""The track of the antenna in a frame that does not rotate."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -30,12 +30,12 @@ UNMEASURED = 100.0
 @dataclass(frozen=True)
 class InertialTrack:
     """
-    The navigation side in the non-rotating frame n0, from positions and velocities as they come.
+    The navigation side of the formulas in the non-rotating frame n0.
 
     ``s_p = C_n0e Rz(W t) r_e(t) - int int gravitation`` and its derivative ``s_v`` are the
     integrals of the note: ``s_v - v_n(0)`` is its left side (9), ``s_p - t v_n(0)`` that of the
-    position form. Nothing between epochs has to be interpolated but gravitation, so gaps do no
-    harm. Both are kept relative to a point that is fixed in the Earth at t0, against rounding.
+    position form. Only gravitation is interpolated between epochs, so gaps do no harm. Both are
+    relative to the position at t0, against rounding.
     """
 
     n0: LocalLevel
@@ -124,7 +124,7 @@ class InertialTrack:
         present = np.array([(epoch.v_n is not None, epoch.position_measured and use_position)
                             for epoch in epochs])
         vertical = np.any(present & (covariance[..., 2, 2] < UNMEASURED ** 2), axis=1)
-        if use_position:            # what comes between positions is no reason to forget them
+        if use_position:            # epochs between positions must not reset the vertical
             vertical |= ~present[:, 1]
         return Measured(
             np.stack([self.s_v(velocities_of(epochs)), self.s_p], axis=1),

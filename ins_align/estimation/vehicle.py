@@ -12,16 +12,16 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-What a vehicle knows of its motion: its base moves along its x axis.
+The motion constraint of a vehicle: its base moves along its x axis.
 
 In the axes B of the base, the velocity of its origin is, with the speed s along x,
 
     v = (s, s m_y + d_y, s m_z + d_z) + noise
 
-where the angles m are how the base is mounted and the velocities d slip, leeway and wind, which
-last. Both are parameters of the filters, and this is one more measurement of them (docs,
-"Theory"). Some rivals assume that the vehicle goes forwards, some backwards, and some, which are
-there to contradict the others, nothing.
+where the angles m are the mounting of the base, and the velocities d are slip, leeway and wind,
+which last. Both are parameters of the filters, and this equation is one more measurement (docs,
+"Theory"). Some rivals assume that the vehicle goes forwards, some backwards, and some assume
+nothing and are there to contradict the others.
 """
 
 import math
@@ -33,18 +33,18 @@ from ins_align.estimation.states import (
 from ins_align.geometry.rotation import apply, Array, Index, skew, Transform
 import numpy as np
 
-# How far the motion is off x without lasting (rad: bends, yawing in waves, gusts).
+# Sigma of the angle between motion and x that does not last (rad: bends, yawing in waves, gusts).
 SLIPS = {'car': math.radians(1.0), 'boat': math.radians(10.0), 'aeroplane': math.radians(5.0)}
-# Looks are so far apart (s) that what does not last is another; its least sigma (m/s).
+# Updates are so far apart (s) that what does not last is independent; least sigma (m/s).
 INTERVAL, NOISE = 1.0, 0.05
-# Backwards a vehicle goes as fast as this (m/s, 1 sigma).
+# Sigma of the speed at which a vehicle reverses (m/s).
 BACKWARDS_SPEED = 2.0
-# A speed of so many of its sigmas has a direction; that of a vehicle at rest would be noise, which
-# feigns a heading.
+# The speed of a vehicle that moves is so many of its sigmas: the direction of noise would feign a
+# heading.
 MOVES = 5.0
-# Mounting and drift that are so many of their sigmas are none.
+# Mounting or drift beyond so many of their sigmas contradict the assumption.
 MOST = 4.0
-# What is assumed of a vehicle must be likelier by this than nothing: some seconds of motion.
+# Log likelihood by which the assumption must exceed none: some seconds of motion.
 CONFIRMED = 9.0
 NOT_USED = ('; the motion contradicts vehicle: {vehicle}, which is not used (a drift, a tow, a '
             'ferry, or x of base_frame does not point forward: raise mount_yaw_std or '
@@ -55,31 +55,43 @@ AMBIGUOUS = '; forwards and backwards are both possible: change speed'
 
 class Vehicle:
     """
-    Looks at the motion of a vehicle, once a second.
+    Applies the constraint once a second.
 
-    `base` leads from the base to the IMU, where the base is at `position`, (3,), m. `along`, (R,),
-    says where each rival sets out: 1 forwards, -1 backwards, 0 anywhere; `std`, (4,), are sigmas
-    of mounting and drift.
+    Parameters
+    ----------
+    config : Config
+    base : Transform
+        From the base to the IMU.
+    along : ndarray of int, shape (R,)
+        Direction in which each rival sets out: 1 forwards, -1 backwards, 0 any.
+    std : ndarray, shape (4,)
+        Sigmas of mounting (rad) and drift (m/s).
+
+    Attributes
+    ----------
+    position : ndarray, shape (3,)
+        Of the base in the frame of the IMU, m.
+
     """
 
     def __init__(self, config: Config, base: Transform, along: Index, std: Array) -> None:
-        """Have seen nothing yet."""
+        """Start without an update."""
         self._axes, self.position = base.rotation, base.translation
         self._std, self._slip = std, SLIPS[config.vehicle]
         self._waited, self._along = INTERVAL, along
-        # By how much the log likelihood of each is less, for the speed at which it went backwards.
+        # By how much each is less likely for the highest speed at which it has reversed (log).
         self._against = np.zeros(len(along))
 
     def is_due(self, duration: float) -> bool:
-        """Return whether to look again, when so many seconds have gone by."""
+        """Count seconds; return whether an update is due."""
         self._waited += duration
         if self._waited < INTERVAL:
             return False
         self._waited = 0.0
         return True
 
-    def look(self, filters: Filters, model: Linearised, k: int, measured: Measured) -> None:
-        """Hold filters to the motion along x of the base at epoch k."""
+    def update(self, filters: Filters, model: Linearised, k: int, measured: Measured) -> None:
+        """Update filters with motion along x of the base at epoch k."""
         assert model.base is not None
         q, lead, ids = filters.place, filters.lead, filters.ids
         along = self._along[ids]
@@ -88,8 +100,8 @@ class Vehicle:
                + apply(H_v[q][..., FIRST:], filters.x - model.point[q]))
         to_base = self._axes.T @ back.swapaxes(1, 2)
         v = apply(to_base[q], v_b)
-        # A rival whose heading is open sets out in its direction; later it may turn back. The
-        # derivatives are those at motion along x.
+        # While its heading is open a rival goes in the direction in which it sets out; later it
+        # may turn back. The derivatives are those at motion along x.
         open_ = np.bincount(filters.rival)[ids] > 1
         fast = np.linalg.norm(v_b[lead], axis=1)
         moves = fast > MOVES * np.sqrt(np.einsum('mij,mjk,mik->m', H_v, filters.P, H_v) / 3)
@@ -115,13 +127,13 @@ class Vehicle:
                     >= log_sum(filters.evidence[~free]) + MARGIN)
 
     def doubt(self, filters: Filters) -> str:
-        """Return that the motion does not confirm yet what is assumed of the vehicle, or ''."""
+        """Return in words that the motion does not confirm the assumption yet, or ''."""
         free = self._along[filters.ids] == 0
         ahead = filters.evidence[filters.best] - np.max(filters.evidence[free])
         return UNCONFIRMED if ahead < CONFIRMED else ''
 
     def in_words(self, filters: Filters) -> str:
-        """Return what is not known of the vehicle's motion, as the end of a sentence, or ''."""
+        """Return that the direction is not known, as the end of a sentence, or ''."""
         level = filters.evidence
         likely = filters.lead[filters.counts & (level > level[filters.best] - MARGIN)]
         x_n0 = apply(filters.C[likely], self._axes[:, 0])
