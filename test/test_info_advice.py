@@ -108,6 +108,22 @@ def test_accelerometers_that_are_off_gravity_at_rest(tmp_path, error):
     assert settings == {}
 
 
+def test_accelerometers_in_another_unit(tmp_path):
+    """In feet; means up to 60 m/s^2 are possible in loops, but not at rest."""
+    truth = drive(accel_bias_std=0.0, duration=40.0)
+    info = inspected(truth, tmp_path / 'a', accel=truth.accel / 0.3048)
+    assert info.command is None
+    assert 'the specific force at rest is 32.2 m/s^2, gravity is 9.81: check the unit' in (
+        describe(info))
+
+
+def test_a_setting_beyond_its_limits_is_a_fault(tmp_path):
+    truth = drive(duration=240.0)
+    info = inspected(truth, tmp_path / 'a', gnss_stamps_ns=truth.gnss_stamps_ns + 60_100_000_000,
+                     gnss_arrival_ns=truth.gnss_arrival_ns + 300_000_000)
+    assert info.command is None and 'gnss_delay must be' in describe(info)
+
+
 def test_what_is_carried_at_rest_for_the_receiver_is_not_at_rest(tmp_path):
     truth = drive(duration=40.0)
     time = (truth.imu_stamps_ns - truth.imu_stamps_ns[0]) * 1e-9

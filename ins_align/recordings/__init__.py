@@ -14,9 +14,9 @@
 """
 Recordings: rosbag2 (mcap, sqlite3, compressed) and ROS 1, from file to arrays.
 
-`bag` opens and lists them with rosbags, `salvage` reads an mcap that rosbags cannot open, `reader`
-chooses the topics that an alignment reads, `decode` makes arrays of them. The limits here bound it
-all, so that a damaged or hostile recording takes little memory.
+`bag` opens recordings with rosbags, `salvage` reads an mcap file that rosbags cannot open,
+`reader` chooses the topics that an alignment reads, `decode` turns messages into arrays. The
+limits here keep a damaged or hostile recording from taking much memory.
 """
 
 from collections.abc import Iterable
@@ -24,14 +24,14 @@ import importlib
 import sys
 from typing import Any, NamedTuple
 
-MAX_CHUNK_BYTES = 1 << 28  # of a chunk, unpacked
-MAX_HELD_BYTES = 1 << 30  # of chunks, unpacked, that have messages of the same time
+MAX_CHUNK_BYTES = 1 << 28  # of one chunk, unpacked
+MAX_HELD_BYTES = 1 << 30  # of all chunks, unpacked, whose times overlap
 MAX_MESSAGE_BYTES = 1 << 16  # of an IMU or GNSS message, which has some hundred bytes
-MAX_DEFINITION_BYTES = 1 << 24  # of the description of a topic
+MAX_DEFINITION_BYTES = 1 << 24  # of a schema or channel record of an mcap file
 MAX_TOPICS = 10_000
-LISTED = 20  # names in a sentence
+MAX_LISTED = 20  # names in a sentence
 MAX_METADATA_BYTES = 1 << 24  # of metadata.yaml
-# A file may unpack to this much, or to more at no more than this ratio.
+# A file may unpack to the larger of this size and this multiple of its own size.
 UNPACKED_BYTES_FREE = 1 << 30
 MAX_UNPACK_RATIO = 200
 
@@ -42,20 +42,20 @@ DECOMPRESSORS = {'bz2': ('bz2', 'BZ2Decompressor'), 'lz4': ('lz4.frame', 'LZ4Fra
 
 
 def printable(line: str) -> str:
-    """Make a line that may quote a recording fit for a terminal."""
+    """Replace characters that a terminal should not get; the line may quote a recording."""
     return ''.join(letter if letter.isprintable() else '?' for letter in line)
 
 
 def one_line(text: str) -> str:
-    """Make a text that may quote a recording a line that is not too long."""
+    """Turn a text that may quote a recording into one printable line of bounded length."""
     return printable(text[:1000])
 
 
 def listed(names: Iterable[str]) -> str:
-    """List names in the order of the alphabet, of many the first."""
+    """List names in alphabetical order; of many, only the first ones and how many follow."""
     found = sorted(names)
-    more = len(found) - LISTED
-    return ', '.join(found[:LISTED]) + (f' and {more} more' if more > 0 else '')
+    more = len(found) - MAX_LISTED
+    return ', '.join(found[:MAX_LISTED]) + (f' and {more} more' if more > 0 else '')
 
 
 class BagError(ValueError):
@@ -75,16 +75,17 @@ class Topic(NamedTuple):
 
 
 def max_unpacked_bytes(size: int) -> int:
-    """Return to how much a file of a size, bytes, may unpack."""
+    """Return how many bytes a file of `size` bytes may unpack to."""
     return max(UNPACKED_BYTES_FREE, MAX_UNPACK_RATIO * size)
 
 
 def unpack(data: bytes, compression: str, limit: int, damaged: bytes | None = None) -> bytes:
     """
-    Unpack data; of those that were cut off the front, of those that are damaged what is given.
+    Unpack data; if they were cut off, return what is left of them.
 
-    A BagError says that there are more than `limit` bytes or the compression is not known. Damaged
-    data raise errors of many kinds, if nothing is given for them.
+    Raises a BagError if they unpack to more than `limit` bytes or the compression is not
+    supported. For damaged data it returns `damaged`; if that is None, the error of the library is
+    raised, of whatever type it is.
     """
     if compression in ('', 'none'):
         return data

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Recordings of every format, opened with rosbags: their topics, and messages as recorded."""
+"""Opens recordings of every format with rosbags: their topics and serialised messages."""
 
 from __future__ import annotations
 
@@ -39,35 +39,36 @@ from rosbags import rosbag1, rosbag2
 from rosbags.rosbag2 import storage_mcap
 
 SQLITE_MAGIC, ROSBAG1_MAGIC = b'SQLite format 3\x00', b'#ROSBAG V'
-STORAGE_NAME = re.compile(r'\.(mcap|db3|bag)(\.zstd)?$')  # of the files of a recording
-LISTED_NAME = re.compile(  # of such a file, in a line of metadata.yaml
+STORAGE_NAME = re.compile(r'\.(mcap|db3|bag)(\.zstd)?$')  # the end of a storage file's name
+LISTED_NAME = re.compile(  # a line of metadata.yaml that names a storage file
     rb'(?m)^[ \t]*-[ \t]+["\']?([^\s:][^:\n]*?\.(?:mcap|db3)(?:\.zstd)?)["\']?[ \t]*\r?$')
-# Of a database that rosbags can open: it is put into a URI as it is.
+# A path that rosbags can open: it puts the path into a URI without quoting it.
 DATABASE_PATH = re.compile(r'[\w/. ~+=@,-]*\.db3', re.ASCII)
-# What may mend a file that rosbags cannot open.
+# Commands that may mend a file that rosbags cannot open, by suffix.
 COMMANDS = {'.bag': 'rosbag reindex {0}', '.mcap': 'mcap recover {0} -o mended.mcap',
-            # Not .recover: the sqlite3 of Debian and Ubuntu has no tables of pages.
+            # Not .recover: the sqlite3 of Debian and Ubuntu is built without what it needs.
             '.db3': "sqlite3 {0} .dump | sed 's/^ROLLBACK.*/COMMIT;/' | sqlite3 mended.db3"}
-BLOCK = 4096  # messages yielded at a time
-PIECE_BYTES = 1 << 20  # of a file, unpacked at a time
-INDEX_ENTRY_BYTES = 12  # of a message in the index of a ROS 1 file
-MAX_PASSES = 20  # over a ROS 1 file, parts of which are read again where its chunks overlap
+BLOCK = 4096  # messages in a block
+PIECE_BYTES = 1 << 20  # unpacked from a file at a time
+INDEX_ENTRY_BYTES = 12  # for each message in the index of a ROS 1 file
+MAX_PASSES = 20  # times a ROS 1 file may be unpacked: chunks that overlap are unpacked repeatedly
 SQLITE_LIMIT_LENGTH = 0  # sqlite.org/c3ref/c_limit_attached.html
 
 
 class Block(NamedTuple):
-    """Consecutive messages."""
+    """Consecutive messages of some topics."""
 
-    times_ns: np.ndarray  # (N,) int64, recorded time
-    topics: np.ndarray  # (N,) int64, index into the topics that were asked for
-    messages: Sequence[Sequence[bytes]]  # of each of these topics
+    times_ns: np.ndarray  # (N,) int64, when they were recorded
+    topics: np.ndarray  # (N,) int64, index into the requested topics
+    messages: Sequence[Sequence[bytes]]  # for each requested topic, serialised
 
 
 class Bag:
     """
     A recording: a rosbag2 directory, one of its files, a ROS 1 bag or a directory of its parts.
 
-    A BagError says that it cannot be read at all. What can be read in part is, with `warnings`.
+    Opening it raises a BagError if nothing can be read. If only a part can be read, `warnings`
+    says so.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -75,15 +76,15 @@ class Bag:
         self.warnings: list[str] = []  # sentences on what could not be read or used
         self._topics: dict[int, Topic] = {}  # by id() of a connection
         with ExitStack() as stack:
-            self._readers = self._opened(stack)
+            self._readers = self._open_files(stack)
             with _bag_errors(self.path):
                 filled = [reader for reader in self._readers if reader.end_time]
-                # When the first and the last message were recorded; 0 where there is none. Of
-                # whatever type and size they are in a file, here they fit into 64 bits.
+                # When the first and the last message were recorded; 0 if there is no message.
+                # int64 refuses what a damaged file may state instead of a time.
                 self.start_ns, self.end_ns = (int(np.int64(time_ns)) for time_ns in (
                     min((reader.start_time for reader in filled), default=0),
                     max((reader.end_time - 1 for reader in filled), default=0)))
-                self.topics = self._listed_topics()  # whose messages can be decoded
+                self.topics = self._find_topics()  # those whose encoding is supported
             self._stack = stack.pop_all()
 
     def __enter__(self) -> Bag:
@@ -93,51 +94,52 @@ class Bag:
         self._stack.close()
 
     def warn(self, text: str) -> None:
-        """Add a warning once."""
+        """Add a warning unless it is there already."""
         if one_line(text) not in self.warnings:
             self.warnings.append(one_line(text))
 
     def blocks(self, topics: Sequence[Topic], start_ns: int | None = None,
-               stop_ns: int | None = None, size: int = BLOCK) -> Iterator[Block]:
+               stop_ns: int | None = None, size: int | None = None) -> Iterator[Block]:
         """
-        Yield the messages of some topics in recorded order, so many at a time.
+        Yield the messages of some topics in recorded order, `size` (or `BLOCK`) at a time.
 
-        They are recorded from one time on, to before another one.
+        `start_ns` and `stop_ns` bound the recorded time; the stop is exclusive.
         """
         numbers = {key: topics.index(topic) for key, topic in self._topics.items()
                    if topic in topics}
         with _bag_errors(self.path):
             records = self._records(numbers, start_ns, stop_ns)
-            while group := list(itertools.islice(records, size)):
+            while group := list(itertools.islice(records, size or BLOCK)):
                 messages: list[list[bytes]] = [[] for _ in topics]
                 for number, _, data in group:
                     messages[number].append(data)
                 yield Block(np.array([time_ns for _, time_ns, _ in group], np.int64),
                             np.array([number for number, _, _ in group]),
-                            [*map(_without_compression, messages)])
+                            [*map(_unpack_messages, messages)])
 
     def first_message(self, topic: Topic) -> bytes | None:
-        """Return the first message of a topic, where there is one."""
+        """Return the first message of a topic; None if there is none."""
         for block in self.blocks([topic], size=1):
             return block.messages[0][0]
         return None
 
     def _records(self, numbers: Mapping[int, int], start_ns: int | None, stop_ns: int | None,
                  ) -> Iterator[tuple[int, int, bytes]]:
-        """Yield number of the topic, time and message in the order of time; long ones end it."""
+        """Yield topic number, recorded time and message in recorded order; refuse long ones."""
         sources = [reader.messages(chosen, start_ns, stop_ns) for reader in self._readers
                    if (chosen := [connection for connection in reader.connections
                                   if id(connection) in numbers])]
         for connection, time_ns, data in (
                 sources[0] if len(sources) == 1 else heapq.merge(*sources, key=itemgetter(1))):
-            if type(data) is not bytes:  # a database may hold what is no message
+            if type(data) is not bytes:  # a database may hold text, numbers or NULL instead
                 data = b''
             elif len(data) > MAX_MESSAGE_BYTES:
                 raise BagError(f'has a message of {len(data)} bytes or more on '
                                f'{connection.topic}, where {MAX_MESSAGE_BYTES} are allowed')
             yield numbers[id(connection)], time_ns, data
 
-    def _listed_topics(self) -> tuple[Topic, ...]:
+    def _find_topics(self) -> tuple[Topic, ...]:
+        """Return the topics of all files, each once, and note whose each connection is."""
         known: dict[tuple[str, str, str], Topic] = {}
         for connection in itertools.chain(*(reader.connections for reader in self._readers)):
             encoding = getattr(connection.ext, 'serialization_format', 'ros1')
@@ -150,8 +152,8 @@ class Bag:
         _check_topics(len(known))
         return tuple(known.values())
 
-    def _opened(self, stack: ExitStack) -> list[Any]:
-        """Open those files that can be; an error only if there is none."""
+    def _open_files(self, stack: ExitStack) -> list[Any]:
+        """Open the files; warn of those that fail, raise the first error if all of them do."""
         readers, errors = [], []
         with _bag_errors(self.path):
             files = self._storage_files()
@@ -177,9 +179,9 @@ class Bag:
         if not path.is_dir():
             raise BagError(f'{path} is a pipe or a device, from which no recording can be read: '
                            'give a file')
-        own = []  # files that the recording says it has
+        own = []  # file names that metadata.yaml lists
         with suppress(OSError), open(path / 'metadata.yaml', 'rb') as file:
-            # The last part only: a recording names its own files, not others on this machine.
+            # Folders are dropped: metadata must not lead to other files on this machine.
             own = [PurePath(os.fsdecode(name)).name
                    for name in LISTED_NAME.findall(file.read(MAX_METADATA_BYTES))]
         files = sorted(file for file in path.iterdir() if STORAGE_NAME.search(file.name))
@@ -198,10 +200,10 @@ class Bag:
         return files
 
     def _open_file(self, path: Path, stack: ExitStack) -> Any:
-        """Open one storage file, its format told by its first bytes."""
-        if _magic(path).startswith(ZSTD_MAGIC):
-            path = self._unpacked(path, stack)
-        magic = _magic(path)
+        """Open one storage file; its first bytes tell its format."""
+        if _first_bytes(path).startswith(ZSTD_MAGIC):
+            path = self._unpack_file(path, stack)
+        magic = _first_bytes(path)
         if magic.startswith(MCAP_MAGIC):
             return self._open_mcap(path)
         if magic.startswith(SQLITE_MAGIC):
@@ -213,8 +215,8 @@ class Bag:
         raise BagError('is no recording: neither mcap, sqlite3 nor ROS 1 bag' if magic else
                        'is empty')
 
-    def _unpacked(self, path: Path, stack: ExitStack) -> Path:
-        """Unpack a file that is compressed as a whole."""
+    def _unpack_file(self, path: Path, stack: ExitStack) -> Path:
+        """Unpack a file that is compressed as a whole, into a temporary folder."""
         folder = stack.enter_context(TemporaryDirectory(prefix='ins_align_'))
         target = Path(folder, path.name.removesuffix('.zstd'))
         zstd = importlib.import_module(ZSTD_MODULE)
@@ -232,12 +234,12 @@ class Bag:
         return target
 
     def _open_mcap(self, path: Path) -> Any:
-        """Open an mcap file with rosbags, or as far as it goes."""
+        """Open an mcap file with rosbags, or if that fails, read it as far as it goes."""
         try:
             return _open_whole_mcap(path)
         except BagError:
             raise
-        except Exception:  # rosbags runs into whatever damaged bytes lead it to
+        except Exception:  # damaged bytes cause errors of every kind in rosbags
             reader = SalvagedMcap(path)
         if not reader.complete:
             self.warn(f'{path.name} was cut off or is damaged: it is read as far as it goes')
@@ -254,20 +256,21 @@ class Bag:
             link.symlink_to(path.resolve())
             path = link
         with closing(sqlite3.connect(f'file:{path}?immutable=1', uri=True)) as database:
-            for table in ('topics', 'message_definitions'):  # rosbags compares all with all
-                with suppress(sqlite3.OperationalError):  # there is none
+            # Checked before rosbags reads them: it compares each row with all others.
+            for table in ('topics', 'message_definitions'):
+                with suppress(sqlite3.OperationalError):  # there is no such table
                     _check_topics(*database.execute(f'SELECT count(*) FROM {table}').fetchone())
         reader: Any = rosbag2.Reader(path)
         reader.open()
-        with suppress(AttributeError):  # before rosbags had apsw: messages are checked anyway
+        with suppress(AttributeError):  # rosbags without apsw; `_records` checks lengths anyway
             reader.storage.dbconn.limit(SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
         return reader
 
 
 def _open_whole_mcap(path: Path) -> Any:
-    """Open an mcap file with rosbags, whose decompression is bounded here."""
+    """Open an mcap file with rosbags, which is made to unpack within limits."""
     for name in ('lz4', 'zstd'):
-        storage_mcap.DECOMPRESSORS[name] = partial(_unpacked_chunk, name)
+        storage_mcap.DECOMPRESSORS[name] = partial(_unpack_chunk, name)
     reader: Any = rosbag2.Reader(path)
     reader.open()
     try:
@@ -278,16 +281,16 @@ def _open_whole_mcap(path: Path) -> Any:
     return reader
 
 
-def _unpacked_chunk(compression: str, data: bytes, size: int = MAX_CHUNK_BYTES) -> bytes:
+def _unpack_chunk(compression: str, data: bytes, size: int = MAX_CHUNK_BYTES) -> bytes:
     return unpack(data, compression, min(size, MAX_CHUNK_BYTES))
 
 
 def _check_chunks(chunks: Sequence[Any], limit: int) -> None:
-    """Refuse chunks that take more memory or time than a limit to all of them lets expect."""
+    """Raise an error if chunks lack an index or unpack to too much; `limit`: of all, bytes."""
     if not chunks or not all(chunk.message_index_offsets for chunk in chunks):
         raise ValueError('rosbags leaves out chunks without an index')
     sizes = [chunk.uncompressed_size for chunk in chunks]
-    changes = []  # of what is held in memory, since chunks of the same time are
+    changes = []  # of the bytes in memory: rosbags holds chunks whose times overlap
     for chunk, size in zip(chunks, sizes):
         end_ns = max(chunk.message_start_time, chunk.message_end_time) + 1
         changes += [(chunk.message_start_time, size), (end_ns, -size)]
@@ -303,7 +306,7 @@ def _check_topics(count: int) -> None:
 
 
 class _Rosbag1Reader(rosbag1.Reader):
-    """A reader of ROS 1 files that takes bounded memory and time."""
+    """A reader of ROS 1 files with bounded memory and time."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -311,12 +314,12 @@ class _Rosbag1Reader(rosbag1.Reader):
         self._left = MAX_PASSES * max_unpacked_bytes(self._size)
 
     def read_chunk(self) -> Any:
-        """Bound the size to which a chunk unpacks, and all of them together."""
+        """Read a chunk whose decompressor is bounded, alone and with all others."""
         chunk = super().read_chunk()
         names = {function: name for name, function in rosbag1.reader.decompressors.items()}
-        return chunk._replace(decompressor=partial(self._unpacked, names[chunk.decompressor]))
+        return chunk._replace(decompressor=partial(self._unpack, names[chunk.decompressor]))
 
-    def _unpacked(self, compression: str, data: bytes) -> bytes:
+    def _unpack(self, compression: str, data: bytes) -> bytes:
         unpacked = unpack(data, compression, MAX_CHUNK_BYTES)
         self._left -= len(unpacked)
         if self._left < 0:
@@ -325,35 +328,35 @@ class _Rosbag1Reader(rosbag1.Reader):
         return unpacked
 
     def read_index_data(self, pos: int, indexes: dict[int, list[Any]]) -> None:
-        """Stop where more messages are listed than the file has room for."""
+        """Read an index; raise an error if it lists more messages than fit into the file."""
         super().read_index_data(pos, indexes)
         if INDEX_ENTRY_BYTES * sum(map(len, indexes.values())) > self._size:
             raise ValueError('index larger than the file')
 
 
-def _without_compression(messages: list[bytes]) -> list[bytes]:
-    """Unpack messages where they are compressed: all or none. Of damaged ones nothing is left."""
+def _unpack_messages(messages: list[bytes]) -> list[bytes]:
+    """Unpack messages if the first is compressed; damaged ones become empty."""
     if not messages or not messages[0].startswith(ZSTD_MAGIC):
         return messages
     return [unpack(message, 'zstd', MAX_MESSAGE_BYTES, damaged=b'') for message in messages]
 
 
-def _magic(path: Path) -> bytes:
+def _first_bytes(path: Path) -> bytes:
     with open(path, 'rb') as file:
         return file.read(16)
 
 
 def begins_like_a_recording(path: Path) -> bool:
-    """Whether there is a file that a recording may lie in, whole or damaged."""
+    """Tell whether a file begins as a recording does; false if it cannot be read."""
     try:
-        return _magic(path).startswith((MCAP_MAGIC, SQLITE_MAGIC, ROSBAG1_MAGIC, ZSTD_MAGIC))
+        return _first_bytes(path).startswith((MCAP_MAGIC, SQLITE_MAGIC, ROSBAG1_MAGIC, ZSTD_MAGIC))
     except OSError:
         return False
 
 
 @contextmanager
 def _bag_errors(path: Path) -> Iterator[None]:
-    """Turn whatever rosbags and its libraries raise into a sentence."""
+    """Turn any error of rosbags and its libraries into a BagError that names the file."""
     try:
         yield
     except ImportError:
@@ -361,7 +364,7 @@ def _bag_errors(path: Path) -> Iterator[None]:
     except BagError as error:
         named = str(error).startswith(str(path))
         raise BagError(str(error) if named else f'{path.name or path} {error}') from None
-    except Exception as error:  # damaged bytes lead the libraries to errors of every kind
+    except Exception as error:  # damaged bytes cause errors of every kind
         if isinstance(error, OSError) and error.strerror:
             raise BagError(f'{path} cannot be read: {error.strerror}') from None
         text = str(error).rstrip('.') or type(error).__name__

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Messages of a recording as numbers: of an IMU many at once, all others with rosbags."""
+"""Decodes messages: of sensor_msgs/Imu many at once with numpy, all others with rosbags."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from contextlib import suppress
 import dataclasses
 from functools import lru_cache
 from itertools import groupby
-from typing import Any, NamedTuple, Union
+from typing import Any, NamedTuple
 
 from ins_align.config import Config
 from ins_align.gnss.drivers import (
@@ -33,15 +33,16 @@ import numpy as np
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 IMU_TYPE, FIX_TYPE = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
-VECTOR_TYPE = 'geometry_msgs/msg/Vector3Stamped'  # of a velocity or of anything else
+VECTOR_TYPE = 'geometry_msgs/msg/Vector3Stamped'  # not always a velocity
 VELOCITY_TYPES = ('geometry_msgs/msg/TwistWithCovarianceStamped', 'geometry_msgs/msg/TwistStamped',
                   'nav_msgs/msg/Odometry', VECTOR_TYPE)
-# What an alignment can read in the messages of a type.
+# Kinds of measurement in the messages of a type.
 KINDS = {IMU_TYPE: ('imu',), **dict.fromkeys(INERTIAL_UNITS, ('imu',)), FIX_TYPE: ('fix',),
          **dict.fromkeys(VELOCITY_TYPES, ('velocity',)),
          **dict.fromkeys(RECEIVERS, ('fix', 'velocity'))}
-# sensor_msgs/Imu is a header (four bytes that differ, seconds, nanoseconds, length of the
-# frame_id, frame_id) and 37 float64: orientation, rate, specific force, each with its covariance.
+# A serialised sensor_msgs/Imu is a header (4 bytes, in cdr the encapsulation and in ROS 1 the
+# sequence number; seconds, nanoseconds, length of the frame_id, frame_id) and 37 float64:
+# orientation, angular rate, specific force, each with its covariance.
 HEADER_BYTES, IMU_NUMBERS = 16, 37
 ORIENTATION, ORIENTATION_COVARIANCE = slice(0, 4), slice(4, 13)
 GYRO, ACCEL = slice(13, 16), slice(25, 28)
@@ -51,8 +52,8 @@ class ImuSamples(NamedTuple):
     """Samples of an IMU in the order of their messages."""
 
     stamps_ns: np.ndarray  # (N,) int64
-    numbers: np.ndarray  # (N, 37), those of sensor_msgs/Imu; 0 where a driver's message has none
-    decoded: np.ndarray  # (M,) bool: which of M messages the N samples come from
+    numbers: np.ndarray  # (N, 37), as in sensor_msgs/Imu; 0 for what a driver's message lacks
+    decoded: np.ndarray  # (M,) bool: which of the M messages could be decoded
 
     @property
     def gyro(self) -> np.ndarray:
@@ -66,39 +67,40 @@ class ImuSamples(NamedTuple):
 
     def orientations(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
-        Return the orientations that are no zeros and whose variance is not negative.
+        Return the orientations that are finite, not zero, and whose variance is not negative.
 
-        Stamps, (K,), quaternions (x, y, z, w), (K, 4), and covariances, (K, 9), rad^2.
+        Stamps, (K,), ns, quaternions (x, y, z, w), (K, 4), and covariances, (K, 9), rad^2.
         """
-        turns = self.numbers[:, ORIENTATION]
+        quaternions = self.numbers[:, ORIENTATION]
         covariances = self.numbers[:, ORIENTATION_COVARIANCE]
-        known = (np.isfinite(turns).all(axis=1)
-                 & (np.abs(turns).max(axis=1, initial=0.0) > 1e-3) & ~(covariances[:, 0] < 0.0))
-        return self.stamps_ns[known], turns[known], covariances[known]
+        known = (np.isfinite(quaternions).all(axis=1)
+                 & (np.abs(quaternions).max(axis=1, initial=0.0) > 1e-3)
+                 & ~(covariances[:, 0] < 0.0))
+        return self.stamps_ns[known], quaternions[known], covariances[known]
 
 
 class Refused(NamedTuple):
-    """A GNSS message that cannot be used: as what it is counted, and why where that helps."""
+    """A GNSS message that cannot be used."""
 
-    counter: str
-    why: str = ''
+    counter: str  # under which it is counted
+    why: str = ''  # in words, if there is more to say
 
 
-Gnss = Union[Fix, Velocity, Refused]
+Gnss = Fix | Velocity | Refused
 
 
 def decode(messages: Sequence[bytes], topic: Topic, config: Config) -> dict[str, Any]:
-    """Decode messages of a topic by kind: `ImuSamples` of an imu, a list of `Gnss` of others."""
+    """Decode messages of a topic; by kind, `ImuSamples` for imu, a list of `Gnss` for others."""
     if KINDS[topic.msgtype] == ('imu',):
         return {'imu': decode_imu(messages, topic)}
     return decode_gnss(messages, topic, config)
 
 
 def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
-    """Decode messages of an IMU, sensor_msgs/Imu or a driver's own; what is none is left out."""
+    """Decode messages of an IMU, sensor_msgs/Imu or a driver's; those that fail are left out."""
     if topic.msgtype == IMU_TYPE and len(set(map(len, messages))) == 1:
         rows = np.frombuffer(b''.join(messages), np.uint8).reshape(len(messages), -1)
-        if (found := _of_one_layout(rows, topic.encoding)) is not None:
+        if (found := _decode_imu_rows(rows, topic.encoding)) is not None:
             return ImuSamples(*found, np.ones(len(messages), bool))
     stamps_ns = np.zeros(len(messages), np.int64)
     numbers = np.zeros((len(messages), IMU_NUMBERS))
@@ -109,8 +111,8 @@ def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
             if topic.msgtype == IMU_TYPE:
                 stamps_ns[place], numbers[place, GYRO], numbers[place, ACCEL] = imu_from_msg(
                     message)
-                turn = message.orientation
-                numbers[place, ORIENTATION] = turn.x, turn.y, turn.z, turn.w
+                q = message.orientation
+                numbers[place, ORIENTATION] = q.x, q.y, q.z, q.w
                 numbers[place, ORIENTATION_COVARIANCE] = message.orientation_covariance
             else:
                 stamps_ns[place], numbers[place, GYRO], numbers[place, ACCEL] = imu_from_driver(
@@ -119,8 +121,8 @@ def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
     return ImuSamples(stamps_ns[decoded], numbers[decoded], decoded)
 
 
-def _of_one_layout(data: np.ndarray, encoding: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return stamps and numbers of sensor_msgs/Imu, a row each; None if they differ in layout."""
+def _decode_imu_rows(data: np.ndarray, encoding: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return stamps and numbers of N serialised sensor_msgs/Imu; None if layouts differ."""
     start = data.shape[1] - 8 * IMU_NUMBERS
     if start < HEADER_BYTES:
         return None
@@ -137,7 +139,7 @@ def _of_one_layout(data: np.ndarray, encoding: str) -> tuple[np.ndarray, np.ndar
 
 
 def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config) -> dict[str, list[Gnss]]:
-    """Decode messages with positions, velocities or both: what each says by kind, or why not."""
+    """Decode messages with positions, velocities or both: by kind, one `Gnss` per message."""
     kinds = KINDS[topic.msgtype]
     found: dict[str, list[Gnss]] = {kind: [] for kind in kinds}
     if topic.msgtype in RECEIVERS:
@@ -155,9 +157,11 @@ def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config) -> dict
         config = dataclasses.replace(config, velocity_type=short_name(topic.msgtype))
 
     def frame_of(message: Any) -> str | None:
-        return (None if message is None else '' if kind == 'fix' else
-                frame_of_velocity(message, config.velocity_type))
+        if message is None:
+            return None
+        return '' if kind == 'fix' else frame_of_velocity(message, config.velocity_type)
 
+    # Consecutive messages with the same frame are converted together.
     for frame, group in groupby((_read(data, topic) for data in messages), frame_of):
         alike = list(group)
         if frame is None:
@@ -186,9 +190,9 @@ def short_name(msgtype: str) -> str:
 
 @lru_cache(maxsize=16)
 def _typestore(encoding: str, msgtype: str, definition: str) -> Any:
-    """Return a store of types that has one, by the definition where it is a driver's."""
+    """Return a store of types, with a driver's type added if its definition is given."""
     store = get_typestore(Stores.ROS1_NOETIC if encoding == 'ros1' else Stores.ROS2_JAZZY)
-    if msgtype in DRIVER_TYPES and definition:
+    if definition:
         store.register({name: content for name, content
                         in get_types_from_msg(definition, msgtype).items()
                         if name not in store.types})
@@ -199,7 +203,7 @@ def deserialize(data: bytes, topic: Topic) -> Any:
     """
     Deserialise one message with rosbags.
 
-    A MessageError says that the bytes are none, or that nothing defines the type.
+    Raises a MessageError if the bytes are no such message or the type is not defined.
     """
     if topic.msgtype in DRIVER_TYPES and not topic.definition:
         raise MessageError(
@@ -212,6 +216,6 @@ def deserialize(data: bytes, topic: Topic) -> Any:
         if topic.encoding == 'ros1':
             return store.deserialize_ros1(data, topic.msgtype)
         return store.deserialize_cdr(data, topic.msgtype)
-    except Exception:  # generated code: damaged bytes end in whatever they run into
+    except Exception:  # damaged bytes cause errors of every kind in generated code
         raise MessageError(f'a message of {len(data)} bytes on {topic.name} is no '
                            f'{topic.msgtype}') from None

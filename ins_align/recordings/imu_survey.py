@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Surveys the samples of an IMU: unit, noise, bias, resolution."""
+"""Surveys the samples of an IMU: units, noise, biases, resolution."""
 
 from __future__ import annotations
 
@@ -28,26 +28,27 @@ from ins_align.imu.noise import force_fault, white_noise
 from ins_align.recordings.topic_survey import rounded, Surveyed
 import numpy as np
 
-WINDOW = 2.0  # s in which noise is measured
-QUIET = 0.1  # of all windows, the quietest: where nothing is at rest motion disturbs least there
-AVERAGING = 0.1  # s: filtered sensors are white only beyond some samples
-NOISE_MARGIN = 1.5  # times a preset's noise still counts as that preset
-BIAS_SIGMAS = 2.5
-REST_SPEED = 0.3  # m/s below which a vehicle may stand
-REST_RATE, REST_FORCE = math.radians(1.0), 0.3  # rad/s, m/s^2: scatter of half seconds at rest
+WINDOW = 2.0  # s, the length of a window in which noise is measured
+QUIET = 0.1  # quantile of the windows' noise that is taken in motion, where motion adds least
+AVERAGING = 0.1  # s: noise of filtered sensors is white only over several samples
+NOISE_MARGIN = 1.5  # times a preset's noise that the preset still covers
+BIAS_SIGMAS = 2.5  # times a preset's sigma of a bias that the preset still covers
+REST_SPEED = 0.3  # m/s by GNSS, below which a vehicle may be at rest
+REST_RATE, REST_FORCE = math.radians(1.0), 0.3  # rad/s, m/s^2: scatter of GRID means at rest
 MIN_REST = 5.0  # s
-ON_LATTICE = 0.1  # of a quantum: how far a value may be off its multiples
-MIN_REPEATS = 3  # samples for each value: with fewer the digits of a text may be the quantum
-MIN_ZEROS, MIN_ZERO_SHARE = 20, 0.01  # samples that are exactly 0 because of a dead band
+MAX_FORCE_ERROR = 3.0  # m/s^2: no accelerometer at rest is so far off gravity
+ON_LATTICE = 0.1  # quanta that a step between values may be off a multiple of the quantum
+MIN_REPEATS = 3  # samples per value: with fewer, the quantum may be that of digits in a text
+MIN_ZEROS, MIN_ZERO_SHARE = 20, 0.01  # least number and share of exact zeros with a dead band
 
 
 class Sensor(NamedTuple):
-    """How the figures of a sensor are printed: units, and their sizes in SI units."""
+    """How to print the figures of gyroscopes or accelerometers."""
 
     name: str
     unit: str
-    size: float
-    walk_unit: str  # of 1 / 60 of that size in SI units
+    size: float  # of the unit, in SI units
+    walk_unit: str  # unit of the random walk; in SI units 1 / 60 of `size`
 
 
 SENSORS = (Sensor('gyroscopes', 'deg/s', math.radians(1.0), 'deg/sqrt(h)'),
@@ -56,10 +57,11 @@ SENSORS = (Sensor('gyroscopes', 'deg/s', math.radians(1.0), 'deg/sqrt(h)'),
 
 def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: float) -> None:
     """
-    Add to an IMU what its samples tell.
+    Add what the samples of an IMU show to its findings.
 
-    Of rates, rad/s, and specific forces, m/s^2, finite, shape (N, 6), and of GNSS velocities, m/s,
-    as from `on_grid`, over the same seconds; the latter may be empty. Gravity is in m/s^2.
+    Samples are finite angular rates, rad/s, and specific forces, m/s^2, shape (N, 6); velocities
+    are those of GNSS, m/s, as from `on_grid`, at times by the same clock, and may be empty.
+    Gravity is in m/s^2.
     """
     times, values = samples
     if times.size < 20:
@@ -80,7 +82,7 @@ def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: floa
     imu.add(f'specific force: {force:.2f} m/s^2 on average, mean direction '
             f'({x:+.2f}, {y:+.2f}, {z:+.2f})', mean_force=force, up=[x, y, z])
     if imu.faults:
-        return  # the rest would be in wrong units
+        return  # the other findings would have wrong units
     if z < 0.5:
         imu.add('on average the specific force does not point along the z axis of the IMU: the '
                 'attitude will be that of the axes as they are, however the IMU is mounted')
@@ -91,26 +93,30 @@ def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: floa
 
 def _add_noise(imu: Surveyed, samples: Series, rest: tuple[float, float] | None, gravity: float,
                ) -> None:
-    """Add resolution, noise, biases and grade, of all or of what is at rest."""
+    """Add resolution, noise, biases and grade; `rest`: begin and end of a time at rest, s."""
     times, values = samples
     part = slice(None) if rest is None else slice(*np.searchsorted(times, rest))
     rate, force = values[part].mean(axis=0).reshape(2, 3)
     off_gravity = float(np.linalg.norm(force) - gravity)
+    if rest and abs(off_gravity) > MAX_FORCE_ERROR:
+        imu.add(f'the specific force at rest is {gravity + off_gravity:.3g} m/s^2, gravity is '
+                f'{gravity:.2f}: check the unit and that gravity is not taken out', fault=True)
+        return
     widths = np.array([_add_resolution(imu, sensor, triad)
                        for sensor, triad in zip(SENSORS, np.split(values, 2, axis=1))])
     walks = _walks(times[part], values[part], 0.5 if rest else QUIET)
     root = math.sqrt(np.median(np.diff(times)))
-    # Noise of half a quantum carries small values over it; less leaves an error that lasts.
+    # With noise of half a quantum or more, rounding errors average out; with less they last.
     hidden = walks < widths * root
-    lost = np.where(hidden, widths / math.sqrt(3.0), 0.0)  # uniform, 1 sigma
+    lost = np.where(hidden, widths / math.sqrt(3.0), 0.0)  # 1 sigma of a uniform error
     walks = np.maximum(walks, lost * root)
-    # What the Earth's rate does not explain is bias, in whatever direction.
+    # The part of the rate that the Earth's rate does not explain is bias.
     bias = abs(float(np.linalg.norm(rate)) - EARTH_RATE) / math.sqrt(3.0)
     measured = ImuNoise(*walks, *map(math.hypot, lost, (bias, off_gravity) if rest else (0, 0)))
     grade, covers = _grade(measured)
     preset = PRESETS[grade if rest else Config.imu_grade]
     settings, biases = {}, {}
-    # Other noise is measured by the alignment itself; what is rounded away does not look noisy.
+    # The alignment itself measures noise, except noise that is rounded away.
     if hidden[0] and measured.angle_random_walk > preset.angle_random_walk:
         settings['angle_random_walk'] = rounded(math.degrees(60.0 * measured.angle_random_walk))
     if measured.gyro_bias_std > preset.gyro_bias_std * (1.0 if hidden[0] else BIAS_SIGMAS):
@@ -118,28 +124,30 @@ def _add_noise(imu: Surveyed, samples: Series, rest: tuple[float, float] | None,
     if measured.accel_bias_std > preset.accel_bias_std * BIAS_SIGMAS:
         biases['accel_bias_std'] = rounded(measured.accel_bias_std)
     shown = [f'{60.0 * walk / sensor.size:.2g} {sensor.walk_unit}'
-             + ' of rounding' * bool(rounding)
+             + (' of rounding' if rounding else '')
              for walk, rounding, sensor in zip(walks, hidden, SENSORS)]
     imu.add(f'noise: {", ".join(shown)}' + ('' if rest else ' at most, measured in motion'),
             settings if rest else settings | biases,
             angle_random_walk=math.degrees(60.0 * walks[0]),
             velocity_random_walk=float(60.0 * walks[1]))
     if rest is None:
+        noise = f'; its noise is no worse than that of {grade}' if covers else ''
         imu.add(f'imu_grade: {Config.imu_grade} is the default; not seen at rest, which would '
-                'show biases' + f'; its noise is no worse than that of {grade}' * covers,
-                imu_grade=grade)
+                f'show biases{noise}', imu_grade=grade)
         return
     degrees_s = np.degrees(rate).tolist()
-    within = [f' +- {width / sensor.size:.2g}' * bool(rounding)
+    within = [f' +- {width / sensor.size:.2g}' if rounding else ''
               for width, rounding, sensor in zip(widths, hidden, SENSORS)]
     imu.add(f'at rest for {rest[1] - rest[0]:.0f} s: rate '
             f'({", ".join(f"{each:+.4f}" for each in degrees_s)}){within[0]} deg/s, specific '
             f'force {off_gravity:+.3f}{within[1]} m/s^2 off gravity', biases,
             rest_s=rest[1] - rest[0], rest_rate_deg_s=degrees_s, rest_force_error=off_gravity)
-    noisy = np.any(~hidden & (walks > NOISE_MARGIN * np.array(preset[:2])))
-    imu.add(f'suits imu_grade {grade}' if covers else f'worse than imu_grade {grade}'
-            + ': more noise is measured while aligning' * bool(noisy),
-            {} if grade == Config.imu_grade else
+    verdict = f'suits imu_grade {grade}'
+    if not covers:
+        verdict = f'worse than imu_grade {grade}'
+        if np.any(~hidden & (walks > NOISE_MARGIN * np.array(preset[:2]))):
+            verdict += ': more noise is measured while aligning'
+    imu.add(verdict, {} if grade == Config.imu_grade else
             {'imu_grade': grade, **(CHIP_THRESHOLDS if grade == 'chip' else {})},
             imu_grade=grade)
 
@@ -148,8 +156,9 @@ def _grade(measured: ImuNoise) -> tuple[str, bool]:
     """
     Return the preset that suits what was measured, and whether it covers all of it.
 
-    One worse than the default suits where both biases ask for it: they are of another kind of
-    sensor. One bias is a parameter, and more noise is measured while aligning.
+    A preset worse than the default is returned only if both biases exceed the default, as those of
+    another kind of sensor do. A single bias is set as a parameter, and the alignment itself
+    measures more noise.
     """
     margins = NOISE_MARGIN, NOISE_MARGIN, BIAS_SIGMAS, BIAS_SIGMAS
     for name, preset in PRESETS.items():
@@ -162,30 +171,31 @@ def _grade(measured: ImuNoise) -> tuple[str, bool]:
 
 def _add_resolution(imu: Surveyed, sensor: Sensor, values: Array) -> float:
     """
-    Add the resolution of a sensor, values of shape (N, 3), of its coarsest axis.
+    Add the resolution of the coarsest axis of a sensor with values of shape (N, 3).
 
-    Returns the largest error of what is rounded to a multiple of the quantum or to 0.
+    Returns the largest error of rounding to a multiple of the quantum or, in a dead band, to 0.
     """
     quantum = dead_band = zeros = 0.0
     for axis in values.T:
         levels = np.unique(axis)
         steps = np.diff(levels)
-        # Across a dead band there is no step of the quantum.
+        # Steps to and from 0 may cross a dead band and are no multiples of the quantum.
         inner = steps[(levels[1:] != 0.0) & (levels[:-1] != 0.0)]
         if inner.size and axis.size > MIN_REPEATS * levels.size:
             q = float(np.median(inner[inner < 1.5 * inner.min()]))
             if np.mean(np.abs(inner / q - np.round(inner / q)) < ON_LATTICE) > 0.99:
                 quantum = max(quantum, q)
         sizes = np.abs(axis[axis != 0.0])
-        count = axis.size - sizes.size
-        zeros = max(zeros, count / axis.size)
-        if sizes.size and count > max(MIN_ZEROS, MIN_ZERO_SHARE * axis.size):
+        zero_count = axis.size - sizes.size
+        zeros = max(zeros, zero_count / axis.size)
+        if sizes.size and zero_count > max(MIN_ZEROS, MIN_ZERO_SHARE * axis.size):
             smallest = float(sizes.min())
-            # Further out there are values as usual: else these zeros are something else.
+            # Many values lie just beyond a dead band; otherwise the zeros mean something else.
             if np.count_nonzero(sizes < 2.0 * smallest) > MIN_ZEROS and smallest > dead_band:
                 dead_band = smallest
-    dead_band *= dead_band > 1.5 * quantum
-    exactly = f': {zeros:.0%} of the samples of an axis are exactly 0' * (zeros > 0.01)
+    if dead_band <= 1.5 * quantum:
+        dead_band = 0.0
+    exactly = f': {zeros:.0%} of the samples of an axis are exactly 0' if zeros > 0.01 else ''
     for figure, text, value in (
             ('quantum', 'round to multiples of', quantum),
             ('dead_band', 'have a dead band: nothing between 0 and', dead_band)):
@@ -195,7 +205,7 @@ def _add_resolution(imu: Surveyed, sensor: Sensor, values: Array) -> float:
 
 
 def _walks(times: Array, values: Array, quiet: float) -> Array:
-    """Return white noise of gyros and accelerometers, per sqrt(Hz), shape (2,), of quiet times."""
+    """Return the random walks of gyros and accelerometers, SI units, (2,), of quiet windows."""
     walks, interval = np.zeros(2), float(np.median(np.diff(times)))
     for average in {1, max(round(AVERAGING / interval), 1)}:
         count = times.size // average
@@ -209,7 +219,7 @@ def _walks(times: Array, values: Array, quiet: float) -> Array:
 
 
 def _cells(times: Array, samples: Array) -> tuple[Array, Array]:
-    """Average over cells of GRID seconds; return their middles and averages."""
+    """Average over cells of GRID s; return their middles, s, (M,), and means, (M, 6)."""
     index = ((times - times[0]) / GRID).astype(np.int64)
     starts = np.flatnonzero(np.concatenate([[True], np.diff(index) > 0]))
     counts = np.diff(np.append(starts, times.size))[:, None]
@@ -217,23 +227,22 @@ def _cells(times: Array, samples: Array) -> tuple[Array, Array]:
 
 
 def _longest_rest(grid: Array, cells: Array, velocities: Series) -> tuple[float, float] | None:
-    """Return when the longest time at rest begins and ends, s; None if there is none."""
+    """Return begin and end of the longest time at rest, s; None if there is none."""
     if velocities.times.size < 2:
         return None
     speed = np.interp(grid, velocities.times, np.hypot(*velocities.vectors[:, :2].T))
     after = np.clip(np.searchsorted(velocities.times, grid), 1, velocities.times.size - 1)
     near = np.abs(grid - velocities.times[after - 1]) < 2.0 * GRID
-    # A vehicle that is carried stands for GNSS; of a long rest that is disturbed the rest counts.
+    # GNSS does not show that a vehicle is handled at rest: jumps of the means interrupt the rest.
     limits = np.repeat([REST_RATE, REST_FORCE], 3)
     calm = np.all(np.abs(np.diff(cells, axis=0)) < 2.0 * limits, axis=1)
     calm = np.append(calm, True) & np.insert(calm, 0, True)
     still = np.concatenate([[False], near & calm & (speed < REST_SPEED), [False]])
     runs = np.flatnonzero(np.diff(still.astype(np.int8))).reshape(-1, 2).tolist()
     for start, end in sorted(runs, key=lambda run: run[0] - run[1]):
-        # The first and the last second may belong to stopping and setting off.
+        # The first and the last second may belong to stopping and starting.
         rest = slice(start + 2, end - 2)
-        if (end - start) * GRID >= MIN_REST and np.all(
-                cells[rest].std(axis=0) < limits):
+        if (end - start) * GRID >= MIN_REST and np.all(cells[rest].std(axis=0) < limits):
             first, last = grid[rest][[0, -1]].tolist()
             return first - 0.5 * GRID, last + 0.5 * GRID
     return None

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What a recording holds before any alignment: topics, faults, motion, the command to align it."""
+"""What a recording holds, found without an alignment, and the command that aligns it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from typing import Any
 
 from ins_align.checks import (
     BEYOND_THE_POLES, beyond_the_poles, exchange_fault, lateness_advice, MAX_DELAY, MAX_LATENESS)
-from ins_align.config import Config, config_from_mapping
+from ins_align.config import Config, config_from_mapping, ConfigError
 from ins_align.estimation.receiver import QUIET
 from ins_align.geometry.earth import normal_gravity
 from ins_align.gnss.messages import enu_from_ned, NO_VERTICAL
@@ -39,14 +39,14 @@ from ins_align.recordings.imu_survey import survey_imu
 from ins_align.recordings.motion_fit import fit_motion
 from ins_align.recordings.reader import choose_topics
 from ins_align.recordings.topic_survey import (
-    in_words, read_candidates, Recorded, rounded, Surveyed)
+    read_candidates, Recorded, rounded, set_arguments, Surveyed)
 from ins_align.report import format_table
 import numpy as np
 
-WEAK_CHANGE = 1.0  # m/s: a smaller change shows no heading with a usual receiver
+WEAK_CHANGE = 1.0  # m/s: smaller changes of velocity show no heading with a usual receiver
 MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
-MIN_AHEAD = 0.3  # s: clocks that differ by less may be jitter
-MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s and so many sigmas beyond it: a delay to be set
+MIN_AHEAD = 0.3  # s: a smaller difference of clocks may be jitter
+MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s, sigmas: a delay beyond the sum of both is set
 FRAMES_THAT_FIT = ('enu', 'ned')
 FRAME_FAULTS = {
     'body': 'its speed fits the change of position and its direction does not: it is given in the '
@@ -54,7 +54,7 @@ FRAME_FAULTS = {
     'turned': 'it is turned by {0.angle_deg:.0f} deg against the change of position: its axes are '
               'not east and north',
     'contradiction': 'it is {0.speed_ratio:.2g} times the change of position: check its unit'}
-# Of the table of topics: title and format by figure.
+# Columns of the table of topics: title and format by figure.
 COLUMNS = {
     'messages': ('messages', ''), 'rate_hz': ('Hz', '.1f'), 'first_s': ('from, s', '.1f'),
     'last_s': ('to, s', '.1f'), 'stamp_age_s': ('stamp age, s', '.3f'),
@@ -67,14 +67,14 @@ NOT_LOOKED_FOR = (
 
 @dataclass
 class Info(Surveyed):
-    """What is known of a recording; its faults say why it cannot be aligned."""
+    """Findings about a recording; the faults say why it cannot be aligned."""
 
     bag: str
     duration_s: float
     start_ns: int
     topics: tuple[Recorded, ...]
-    chosen: dict[str, str | None]  # topic by kind that the command reads
-    command: str | None = None  # to align it, quoted for a shell; None: it cannot be
+    chosen: dict[str, str | None]  # the topics that the command reads, by kind
+    command: str | None = None  # that aligns it, quoted for a shell; None if it cannot be aligned
     warnings: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
@@ -83,7 +83,7 @@ class Info(Surveyed):
 
 
 def inspect(path: str | os.PathLike[str]) -> Info:
-    """Tell what a recording holds; a BagError says that it cannot be read at all."""
+    """Survey a recording; raises a BagError if it cannot be read at all."""
     with Bag(path) as bag:
         candidates = read_candidates(bag)
         imus, fixes, velocities = (
@@ -104,7 +104,7 @@ def inspect(path: str | os.PathLike[str]) -> Info:
                 _survey_imu(data, grid, gravity, alone=len(imus) == 1)
         imu, fix = (_best(of_kind) or next(iter(of_kind), None) for of_kind in (imus, fixes))
         chosen = {'imu': imu, 'fix': fix, 'velocity': velocity}
-        # The end of a file that was cut off is known from what could be read of it.
+        # Messages may be later than the end that a damaged file states.
         end_ns = max([bag.end_ns, *(
             int(data.recorded_ns.max()) for data in candidates if data.recorded_ns.size)])
         info = Info(str(bag.path), (end_ns - bag.start_ns) * 1e-9, bag.start_ns,
@@ -129,7 +129,7 @@ def inspect(path: str | os.PathLike[str]) -> Info:
 
 
 def _survey_fixes(fixes: list[Recorded], velocities: list[Recorded]) -> tuple[Series, float]:
-    """Look at positions; return the track of the best, without spikes, and gravity there."""
+    """Check positions; return the best track, without outliers, and gravity there, m/s^2."""
     for data in fixes:
         if data.stamps_ns.size and not data.usable.any():
             beyond = [beyond_the_poles(*place) for place in data.values[:, :2].tolist()]
@@ -154,7 +154,7 @@ def _survey_fixes(fixes: list[Recorded], velocities: list[Recorded]) -> tuple[Se
 
 
 def _survey_velocity(data: Recorded, positions: Series) -> None:
-    """Find the frame of a velocity and what makes it useless."""
+    """Find the frame of a velocity, and why it cannot be used."""
     if not data.usable.any():
         data.add('no message has numbers that can be used', fault=True)
         return
@@ -177,9 +177,10 @@ def _survey_velocity(data: Recorded, positions: Series) -> None:
 
 
 def _survey_imu(data: Recorded, motion: Series, gravity: float, alone: bool) -> None:
-    """Measure an IMU and find what makes it useless."""
+    """Survey an IMU, and find why it cannot be used; `motion`: GNSS velocities on a grid."""
     if data.doubt:
-        data.add(data.doubt + '; its numbers are used all the same' * alone, fault=not alone)
+        data.add(data.doubt + ('; its numbers are used all the same' if alone else ''),
+                 fault=not alone)
     rate, gap = (data.figures.get(name) for name in ('rate_hz', 'longest_gap_s'))
     if rate is not None and rate < MIN_RATE:
         data.add(f'its rate is {rate:.2g} Hz: an alignment starts over after '
@@ -191,14 +192,14 @@ def _survey_imu(data: Recorded, motion: Series, gravity: float, alone: bool) -> 
 
 
 def _best(topics: list[Recorded]) -> Recorded | None:
-    """Return the topic to read: without faults, its frame known, the most messages."""
+    """Return the topic without faults to read: first by known frame, then by usable messages."""
     good = [data for data in topics if not data.faults]
     return max(good, default=None, key=lambda data: (
         data.figures.get('frame') in FRAMES_THAT_FIT, np.count_nonzero(data.usable)))
 
 
 def _add_manoeuvres(info: Info, velocities: Series) -> None:
-    """Add how the vehicle moves, and whether that shows the heading."""
+    """Add how the vehicle moves and whether its motion shows the heading."""
     if velocities.times.size < 2:
         info.add('heading from the motion: unknown: there is no GNSS to tell the motion from')
         return
@@ -219,7 +220,7 @@ def _add_manoeuvres(info: Info, velocities: Series) -> None:
 
 
 def _add_clocks(info: Info, imu: Recorded, gnss: list[Recorded]) -> None:
-    """Say which stamps are of another clock than those of the IMU."""
+    """Add a fault for each GNSS topic whose clock is not that of the IMU."""
     for data in gnss:
         age = data.age_s - imu.age_s
         if data.stamps_ns.size and abs(age) >= MAX_DELAY:
@@ -230,7 +231,7 @@ def _add_clocks(info: Info, imu: Recorded, gnss: list[Recorded]) -> None:
 
 def _add_timing(info: Info, imu: Recorded, gnss: list[Recorded], motion: Series, gravity: float,
                 ) -> None:
-    """Add how stamps and arrival of GNSS messages compare with the IMU, and their noise."""
+    """Add delay and lateness of GNSS messages against the IMU, and the noise of velocities."""
     source = gnss[-1]
     apart = imu.age_s - source.age_s
     lateness = _lateness(imu, gnss)
@@ -245,7 +246,7 @@ def _add_timing(info: Info, imu: Recorded, gnss: list[Recorded], motion: Series,
                  'as the motion of the IMU shows',
                  {'gnss_delay': round(delay, 2)} if abs(delay) > least else {})
         if delay < -least:
-            lateness += delay  # a delay above 0 adds to gnss_lateness by itself
+            lateness += delay  # the alignment itself adds a delay above 0 to gnss_lateness
     elif ahead >= MIN_AHEAD:
         info.add(f'the stamps of GNSS messages are {ahead:.1f} s ahead of those of the IMU: their '
                  'clocks differ, which gnss_delay corrects as far as messages were recorded at '
@@ -258,7 +259,7 @@ def _add_timing(info: Info, imu: Recorded, gnss: list[Recorded], motion: Series,
 
 
 def _add_velocity_noise(info: Info, velocity: Recorded) -> None:
-    """Word the noise of velocities, which is set where most come without a covariance."""
+    """Add the noise of velocities; set it if most of them state no covariance."""
     noise = [info.figures['velocity_noise'], info.figures['velocity_noise_vertical']]
     names = ['velocity_std', 'velocity_std_vertical']
     if 'velocity_vertical' in velocity.settings:
@@ -267,12 +268,12 @@ def _add_velocity_noise(info: Info, velocity: Recorded) -> None:
     stated = velocity.figures['covariance_share'] >= 0.5
     quiet = stated and noise[0] < math.sqrt(QUIET) * velocity.figures['sigma'][0]
     info.add(f'noise of the GNSS velocity: {noise[0]:.2g} m/s horizontally, {noise[1]:.2g} m/s '
-             'vertically' + ', much less than stated: this counts in motion' * quiet,
+             'vertically' + (', much less than stated: this counts in motion' if quiet else ''),
              {} if stated else settings)
 
 
 def _lateness(imu: Recorded, gnss: list[Recorded]) -> float:
-    """Return how late GNSS messages come after newer IMU samples, 99 percent of them, s."""
+    """Return by how much GNSS stamps lag the newest IMU stamp on arrival, 99th percentile, s."""
     newest = np.maximum.accumulate(imu.stamps_ns[imu.usable])
     late = [np.zeros(1)]
     for data in gnss:
@@ -282,7 +283,7 @@ def _lateness(imu: Recorded, gnss: list[Recorded]) -> float:
 
 
 def _propose(info: Info, bag: Bag, chosen: dict[str, Recorded | None]) -> None:
-    """Set the command, tried as far as its choice of topics goes, or why there is none."""
+    """Set the command and try its choice of topics; add a fault if there can be none."""
     arguments = ['ins_align', 'replay', info.bag if info.bag[0] != '-' else f'./{info.bag}']
     names: dict[str, str] = {}
     settings: dict[str, Any] = {}
@@ -294,11 +295,11 @@ def _propose(info: Info, bag: Bag, chosen: dict[str, Recorded | None]) -> None:
             names[kind] = data.name
             arguments += [f'--{kind}-topic', data.name]
     settings |= info.settings
-    for setting in in_words(settings):
+    for setting in set_arguments(settings):
         arguments += ['--set', setting]
     try:
         choose_topics(bag, config_from_mapping(settings), **names)
-    except BagError as error:
+    except (BagError, ConfigError) as error:    # no such topic; a setting beyond its limits
         info.add(str(error), fault=True)
     info.warnings = tuple(bag.warnings)
     info.command = None if info.faults else shlex.join(arguments)

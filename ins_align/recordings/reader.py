@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What an alignment reads of a recording: its topics, chosen, and their messages, decoded."""
+"""Chooses the topics of a recording that an alignment reads, and reads their messages."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ TF_TYPE = 'tf2_msgs/msg/TFMessage'
 UNSTAMPED_TYPES = ['geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistWithCovariance',
                    'geometry_msgs/msg/Vector3']
 REFERENCE_NAMESPACE = '/reference/'
-REFERENCE_TOPIC = '/reference/imu'  # truth or the best that is known: to compare with, never input
+REFERENCE_TOPIC = '/reference/imu'  # the best known attitude: to compare with, never input
 OPTIONS = {'IMU': '--imu-topic', 'position': '--fix-topic', 'velocity': '--velocity-topic'}
 
 
 class Topics(NamedTuple):
-    """The topics that an alignment reads, and the one that it is compared with."""
+    """The topics that an alignment reads, and the one that its result is compared with."""
 
     imu: Topic
     fix: Topic
@@ -57,25 +57,25 @@ class Topics(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Consecutive messages of a recording, decoded."""
+    """Consecutive decoded messages of a recording."""
 
     topics: Topics
-    config: Config  # as requested, for the type of velocity that was found
+    config: Config  # as requested, with the type of velocity and lever arm of this recording
     imu: ImuSamples
-    gnss: tuple[tuple[int, Gnss], ...]  # each after how many of the IMU samples
-    reference: ImuSamples  # whose orientations are those to compare with
-    done: float  # how much of the recording this ends at, 0 to 1
-    warnings: tuple[str, ...]  # so far
+    gnss: tuple[tuple[int, Gnss], ...]  # each with the number of IMU samples in `imu` before it
+    reference: ImuSamples  # whose orientations are the reference
+    done: float  # share of the recording that has been read at its end, 0 to 1
+    warnings: tuple[str, ...]  # all until now
 
 
 def read(path: str | os.PathLike[str], config: Config = Config(), imu_topic: str | None = None,
          fix_topic: str | None = None, velocity_topic: str | None = None,
          start: float | None = None, duration: float | None = None) -> Iterator[Part]:
     """
-    Read a recording as `replay` does; the last part has no messages and all warnings.
+    Read a recording from `start` on for `duration`, s; `replay` describes the parameters.
 
-    A BagError says that the recording cannot be read or lacks a topic, or that a part was asked
-    for that holds no message of these topics.
+    The last part has no messages but all warnings. Raises a BagError if the recording cannot be
+    read, lacks a topic or has no message of these topics in the time that was asked for.
     """
     with Bag(path) as bag:
         try:
@@ -107,7 +107,7 @@ def read(path: str | os.PathLike[str], config: Config = Config(), imu_topic: str
 
 
 def _mounting(bag: Bag, topics: Topics, config: Config) -> Mounting:
-    """Look up in /tf_static where antenna and base are."""
+    """Look up where antenna and base are in /tf_static."""
     frames = FixedFrames()
     static = [topic for topic in bag.topics
               if topic.msgtype == TF_TYPE and topic.name.endswith('/tf_static')]
@@ -129,7 +129,7 @@ def _mounting(bag: Bag, topics: Topics, config: Config) -> Mounting:
 
 
 def _frame_id(bag: Bag, topic: Topic) -> str:
-    """Return the frame_id of the first message of a topic, empty where it has none."""
+    """Return the frame_id of the first message of a topic; empty if there is none."""
     data = bag.first_message(topic)
     with suppress(MessageError, AttributeError):
         return str(deserialize(data or b'', topic).header.frame_id)
@@ -138,7 +138,7 @@ def _frame_id(bag: Bag, topic: Topic) -> str:
 
 def _decoded(block: Block, wanted: list[Topic], topics: Topics, config: Config, done: float,
              warnings: tuple[str, ...]) -> Part:
-    """Decode a block, the messages of a topic all at once."""
+    """Decode the messages of a block, those of each topic at once."""
     decoded = {topic: decode(messages, topic, config)
                for topic, messages in zip(wanted, block.messages)}
     samples = decoded[topics.imu]['imu']
@@ -161,11 +161,11 @@ def _decoded(block: Block, wanted: list[Topic], topics: Topics, config: Config, 
 def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | None = None,
                   velocity: str | None = None) -> Topics:
     """
-    Find the topics by message type, or by name where one is given.
+    Choose the topics by message type, or by name if one is given.
 
-    Velocities that cannot be used, or that are left out for one of another type, are among the
-    warnings of `bag` afterwards. Where a topic is missing, or there is more than one candidate, a
-    BagError lists what there is and names the option that chooses.
+    Warnings of velocities that cannot be used or are not chosen are added to `bag`. If a topic is
+    missing or there is more than one candidate, a BagError lists the topics and names the option
+    that chooses one.
     """
     imu_topic = _required(bag, 'IMU', ([IMU_TYPE], [*INERTIAL_UNITS]), imu)
     fix_topic = _required(bag, 'position', (
@@ -177,7 +177,7 @@ def choose_topics(bag: Bag, config: Config, imu: str | None = None, fix: str | N
 
 
 def _velocity(bag: Bag, config: Config, fix: Topic, name: str | None) -> Topic | None:
-    """Choose a velocity, if there is one, and warn of those that are left out."""
+    """Choose the topic of the velocity, if there is one; warn of those that are left out."""
     if name is None and config.use_velocity is False:
         return None
     if name is None and fix.msgtype in RECEIVERS:
@@ -192,7 +192,7 @@ def _velocity(bag: Bag, config: Config, fix: Topic, name: str | None) -> Topic |
             bag.warn(f'{other.name} cannot be used: {type_in_words(other.msgtype)} has no '
                      f'stamp; a velocity needs {_in_words(VELOCITY_TYPES)}')
     elif name is not None:
-        _can_be_used(bag, topic, config)  # for the warning: it is read as the user wishes
+        _can_be_used(bag, topic, config)  # only to warn: it is read because the user wants it
     elif topic.msgtype in preferred:
         if names := sorted(f'{other.name} ({short_name(other.msgtype)})'
                            for other in candidates(bag, others)
@@ -203,6 +203,7 @@ def _velocity(bag: Bag, config: Config, fix: Topic, name: str | None) -> Topic |
 
 
 def _required(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None) -> Topic:
+    """Choose a topic as `_choose` does; raise a BagError if there is none."""
     if topic := _choose(bag, what, groups, name):
         return topic
     raise BagError(f'{bag.path} has no {what} topic ({_in_words(groups[0])}); {_listing(bag)}')
@@ -210,12 +211,16 @@ def _required(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None
 
 def _choose(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None,
             config: Config = Config()) -> Topic | None:
-    """Return the topic of a name, or the one that measures of the first types that there are."""
+    """
+    Return the topic with a name, or the only usable one of the first group of types that has any.
+
+    `what` is a key of OPTIONS. Returns None if no topic has one of these types.
+    """
     if name is not None:
         return _named(bag, what, list(dict.fromkeys(itertools.chain(*groups))), name)
     for types in groups:
         found = candidates(bag, types)
-        # The only one of a standard type is read whatever it says of itself.
+        # A single topic of a standard type is read even if its first message raises doubts.
         if what == 'velocity' or len(found) > 1 or types[0] in DRIVER_TYPES:
             found = [topic for topic in found if _can_be_used(bag, topic, config)]
         if len(found) > 1:
@@ -228,6 +233,7 @@ def _choose(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None,
 
 
 def _named(bag: Bag, what: str, types: list[str], name: str) -> Topic:
+    """Return the topic that the user named; raise a BagError if it cannot be read."""
     full_name = '/' + name.strip('/')
     if REFERENCE_NAMESPACE in full_name:
         raise BagError(f'{OPTIONS[what]} {full_name} is a reference to compare with: '
@@ -242,13 +248,13 @@ def _named(bag: Bag, what: str, types: list[str], name: str) -> Topic:
 
 
 def candidates(bag: Bag, types: Collection[str]) -> list[Topic]:
-    """Return the topics of some types, without what is no measurement by its name."""
+    """Return the topics of some types, except those that are no measurement by their name."""
     found = []
     for topic in bag.topics:
         name = topic.name.lower()
         reference = REFERENCE_NAMESPACE in topic.name
-        command = 'cmd' in topic.name.rsplit('/', 1)[-1]  # a wish: /cmd_vel
-        # A vector may be a field, an angular rate or a force as well.
+        command = 'cmd' in topic.name.rsplit('/', 1)[-1]  # /cmd_vel: not a measurement
+        # A vector may also be a magnetic field, an angular rate or a force.
         other = topic.msgtype == VECTOR_TYPE and ('vel' not in name or 'ang' in name)
         if topic.msgtype in types and not (reference or command or other):
             found.append(topic)
@@ -256,7 +262,7 @@ def candidates(bag: Bag, types: Collection[str]) -> list[Topic]:
 
 
 def doubt(first: bytes | None, topic: Topic, config: Config = Config()) -> str:
-    """Say why the first message of a topic is not what its type promises; '' where it is."""
+    """Return why the first message of a topic is not what its type promises; '' if it is."""
     if first is None:
         return 'it has no messages'
     try:
@@ -281,7 +287,7 @@ def doubt(first: bytes | None, topic: Topic, config: Config = Config()) -> str:
 
 
 def _can_be_used(bag: Bag, topic: Topic, config: Config) -> bool:
-    """Whether the first message of a topic is what its type promises; a warning says why not."""
+    """Tell whether the first message of a topic is what its type promises; warn if not."""
     if why := doubt(bag.first_message(topic), topic, config):
         bag.warn(f'{topic.name} cannot be used: {why}')
     return not why

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Results as a recording (mcap) with the topics of the node, to play beside the original."""
+"""Writes results as a recording (mcap) with the topics of the node, to play with the input."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ STATUS, VECTOR = 'diagnostic_msgs/msg/DiagnosticArray', 'geometry_msgs/msg/Vecto
 XYZ = 'geometry_msgs/msg/Vector3'
 TOPICS = {'imu': IMU, 'initial_attitude': ATTITUDE, 'status': STATUS,
           **dict.fromkeys(FOR_PLOTS, VECTOR)}
-STATUS_PERIOD_NS = 1_000_000_000  # and whenever the state is another one
-# Without GNSS there is an epoch every 2 s: what is older is not carried on with the gyros.
+STATUS_PERIOD_NS = 1_000_000_000  # a change of the state is written at once
+# Without GNSS there is an epoch every 2 s; the gyros carry no older attitude forward.
 MAX_AGE_NS = 2_500_000_000
 
 Record = tuple[str, int, Any]  # topic without its namespace, recorded time, message
@@ -51,9 +51,9 @@ def write_results(result: Result, path: str | os.PathLike[str]) -> None:
     """
     Write the results of a recording as a rosbag2 (mcap) with the topics of the node.
 
-    It makes a directory, whole or not at all, and reads the recording once more for its IMU
-    messages. Stamps are those of the input; the recorded time is that of the IMU message which
-    follows. A BagError says that the path exists or the recording cannot be read any more.
+    It makes a complete directory or none, and reads the IMU messages of the recording again.
+    Stamps are those of the input; the recorded time is that of the next IMU message. Raises a
+    BagError if the path exists or the recording can no longer be read.
     """
     path = Path(path)
     if path.exists():
@@ -72,7 +72,7 @@ def write_results(result: Result, path: str | os.PathLike[str]) -> None:
 
 
 class _Results:
-    """Makes the messages of a result."""
+    """Makes the ROS messages of a result."""
 
     def __init__(self, result: Result, types: Any) -> None:
         assert result.topics is not None
@@ -81,17 +81,18 @@ class _Results:
         self._imu_frame: str | None = None  # known from the first message on
         self._state: State | None = None  # of the epoch before
         self._status_ns = -STATUS_PERIOD_NS
-        nan = np.full(3, math.nan)  # of what an epoch does not tell
+        nan = np.full(3, math.nan)
+        # An Epoch does not hold these values of a Status.
         self._unknown = dataclasses.replace(
             result.status, gyro_bias_std=nan, accel_bias_std=nan, lever_arm=nan,
             lever_arm_std=nan, gnss_delay=math.nan, gnss_delay_std=math.nan, counts={},
             time_to_align_s=None)
 
     def records(self) -> Iterator[Record]:
-        """Go through the recording's IMU messages, epochs between them."""
+        """Yield IMU messages with the attitude, and between them the messages of the epochs."""
         epochs = deque(self._result.epochs)
         prediction: Prediction | None = None
-        before_ns, before = 0, np.zeros(3)
+        last_ns, last_gyro = 0, np.zeros(3)
         time_ns = epoch_ns = 0
         for time_ns, data, stamp_ns, gyro, accel in self._samples():
             if self._imu_frame is None:
@@ -100,12 +101,12 @@ class _Results:
             while epochs and epochs[0].stamp_ns <= stamp_ns:
                 epoch = epochs.popleft()
                 yield from self._of_epoch(epoch, time_ns)
-                part = ((epoch.stamp_ns - before_ns) / (stamp_ns - before_ns)
-                        if before_ns < stamp_ns else 1.0)
-                prediction = self._prediction(epoch, before + max(part, 0.0) * (gyro - before),
-                                              1e-9 * (stamp_ns - before_ns))
+                share = ((epoch.stamp_ns - last_ns) / (stamp_ns - last_ns)
+                         if last_ns < stamp_ns else 1.0)
+                rate = last_gyro + max(share, 0.0) * (gyro - last_gyro)
+                prediction = self._prediction(epoch, rate, 1e-9 * (stamp_ns - last_ns))
                 epoch_ns = epoch.stamp_ns
-            before_ns, before = stamp_ns, gyro
+            last_ns, last_gyro = stamp_ns, gyro
             if prediction is None:
                 if not epochs:
                     break
@@ -128,7 +129,7 @@ class _Results:
                     yield int(block.times_ns[place]), block.messages[0][place], *numbers
 
     def _prediction(self, epoch: Epoch, rate: Any, interval: float) -> Prediction | None:
-        """Return the attitude to be carried on from an epoch while it is declared."""
+        """Return a prediction from an epoch with this rate, rad/s; None unless it is declared."""
         if epoch.state is not State.ALIGNED or epoch.current is None:
             return None
         noise = self._result.config.imu_noise
@@ -136,6 +137,7 @@ class _Results:
                           noise.gyro_bias_std, noise.angle_random_walk, rate, interval)
 
     def _of_epoch(self, epoch: Epoch, time_ns: int) -> Iterator[Record]:
+        """Yield the messages of an epoch: initial attitude, values for plots, status."""
         first, now = epoch.initial, epoch.current
         declared = epoch.state is State.ALIGNED and self._state is not State.ALIGNED
         if declared and first is not None:
@@ -154,13 +156,13 @@ class _Results:
         self._state = epoch.state
 
     def _imu(self, prediction: Prediction, data: bytes, gyro: Any, accel: Any) -> Any:
-        """Return the input message with the orientation filled in."""
+        """Return the input message with its orientation set."""
         orientation = self._quaternion(prediction.quaternion_xyzw)
         covariance = np.array(prediction.covariance)
         if self._topic.msgtype == IMU:
             return dataclasses.replace(deserialize(data, self._topic), orientation=orientation,
                                        orientation_covariance=covariance)
-        # A driver's own type, which has no header.
+        # A driver's own type has neither a header nor an orientation.
         return self._make(
             IMU, self._header(prediction.stamp_ns), orientation, covariance,
             self._make(XYZ, *gyro.tolist()), np.zeros(9),

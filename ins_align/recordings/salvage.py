@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Reads an mcap file that rosbags cannot open, as far as it goes (https://mcap.dev/spec)."""
+"""Reads an mcap file (https://mcap.dev/spec) that rosbags cannot open, as far as it goes."""
 
 from __future__ import annotations
 
@@ -29,21 +29,23 @@ from rosbags.interfaces import (
 
 MAGIC = b'\x89MCAP0\r\n'
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 2, 3, 4, 5, 6
-_KINDS = {*range(1, 16), *range(128, 256)}  # of records; from 128 on they are private
-_RECORD = struct.Struct('<BQ')  # kind and length
+_KINDS = {*range(1, 16), *range(128, 256)}  # of records; private from 128 on
+_RECORD_HEAD = struct.Struct('<BQ')  # kind and length
 _ID = struct.Struct('<H')
 _MESSAGE_HEAD = struct.Struct('<HIQQ')  # channel, sequence number, recorded and published time
-_CHUNK_HEAD = struct.Struct('<QQQII')  # start, end, unpacked size, crc, length of compression
+# Start, end, unpacked size, CRC of the unpacked data, length of the name of the compression.
+_CHUNK_HEAD = struct.Struct('<QQQII')
 _FORMATS = {'ros2msg': MessageDefinitionFormat.MSG, 'ros2idl': MessageDefinitionFormat.IDL}
-_NOTHING = '', MessageDefinition(MessageDefinitionFormat.NONE, '')
+_NO_SCHEMA = '', MessageDefinition(MessageDefinitionFormat.NONE, '')
 
 
 class SalvagedMcap:
     """
-    An mcap file read record by record, without the index at its end, in the order of its records.
+    An mcap file that is read record by record, without the index at its end.
 
-    It offers what a reader of rosbags does. Topics and times are found by reading all of it once,
-    and with that whether it is `complete`: has an end and no damage before it.
+    It has the attributes and methods of a rosbags reader that `Bag` uses. Opening it reads the
+    whole file once, for the topics, the times and whether it is `complete`: it has an end and no
+    damage before it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -74,7 +76,7 @@ class SalvagedMcap:
             raise
         for channel, (schema, topic, encoding) in channels.items():
             self.connections.append(Connection(
-                channel, topic, *schemas.get(schema, _NOTHING), '', 0,
+                channel, topic, *schemas.get(schema, _NO_SCHEMA), '', 0,
                 ConnectionExtRosbag2(encoding, []), self))
 
     def close(self) -> None:
@@ -83,7 +85,7 @@ class SalvagedMcap:
 
     def messages(self, connections: Collection[Connection], start: int | None = None,
                  stop: int | None = None) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield messages of some topics, recorded from a start to before a stop."""
+        """Yield messages as a rosbags reader does, but in the order of the file."""
         wanted = {connection.id: connection for connection in connections}
         for data, kind, begin, end in self._records():
             if kind == _MESSAGE and end - begin >= _MESSAGE_HEAD.size:
@@ -91,12 +93,12 @@ class SalvagedMcap:
                 if (channel in wanted and (start is None or start <= time_ns)
                         and (stop is None or time_ns < stop)):
                     begin += _MESSAGE_HEAD.size
-                    # A byte more than is allowed is enough to be refused.
+                    # Of a message that is too long, enough is read for `Bag` to refuse it.
                     end = min(end, begin + MAX_MESSAGE_BYTES + 1)
                     yield wanted[channel], time_ns, data[begin:end]
 
     def _records(self) -> Iterator[tuple[Any, int, int, int]]:
-        """Yield records, those in chunks too: where they lie, kind, start and end."""
+        """Yield data, kind, start and end in the data of each record, also of those in chunks."""
         left = max_unpacked_bytes(len(self._file))
         whole = True
         for kind, begin, end in _split(self._file, len(MAGIC)):
@@ -118,10 +120,10 @@ class SalvagedMcap:
 
 
 def _split(data: Any, position: int = 0) -> Iterator[tuple[int, int, int]]:
-    """Yield kind, start and end of each record, the last chunk even if it was cut off."""
-    while position + _RECORD.size <= len(data):
-        kind, length = _RECORD.unpack_from(data, position)
-        begin = position + _RECORD.size
+    """Yield kind, start and end of each record; the last one may be a chunk that was cut off."""
+    while position + _RECORD_HEAD.size <= len(data):
+        kind, length = _RECORD_HEAD.unpack_from(data, position)
+        begin = position + _RECORD_HEAD.size
         position = begin + length
         if kind not in _KINDS or position > len(data) and (
                 kind != _CHUNK or begin + _CHUNK_HEAD.size > len(data)):
@@ -130,7 +132,7 @@ def _split(data: Any, position: int = 0) -> Iterator[tuple[int, int, int]]:
 
 
 def _strings(record: bytes, position: int, count: int) -> list[str]:
-    """Return strings that follow each other."""
+    """Return consecutive strings, each with its length (uint32) before it."""
     found = []
     for _ in range(count):
         length, = struct.unpack_from('<I', record, position)

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The topics of a recording that an alignment could read: all their messages, and their timing."""
+"""Surveys topics that an alignment could read: what their messages hold, and their timing."""
 
 from __future__ import annotations
 
@@ -33,54 +33,54 @@ from ins_align.recordings.decode import decode, Gnss, ImuSamples, KINDS, Refused
 from ins_align.recordings.reader import candidates, doubt
 import numpy as np
 
-MAX_ASTRAY = 60.0  # s: a stamp further off the recorded time than the others is not used
-GAP_INTERVALS = 3.5  # times the usual interval without a message is a gap
+MAX_ASTRAY = 60.0  # s that the age of a usable stamp may differ from the median age
+GAP_INTERVALS = 3.5  # usual intervals without a message that make a gap
 
 
 def rounded(value: float) -> float:
-    """Return a value with two digits, as a parameter is set."""
+    """Round a value to two significant digits, for a parameter."""
     return float(f'{value:.2g}')
 
 
-def in_words(settings: Mapping[str, Any]) -> list[str]:
-    """Return parameters as ``--set`` takes them."""
+def set_arguments(settings: Mapping[str, Any]) -> list[str]:
+    """Return the arguments of ``--set`` for some parameters."""
     return [f'{name}={str(value).lower()}' for name, value in settings.items()]
 
 
 @dataclass(kw_only=True)
 class Surveyed:
-    """What has been found out about a recording or a topic."""
+    """Findings about a recording or a topic."""
 
-    lines: list[str] = field(default_factory=list)  # sentences, which ``ins_align info`` prints
-    # Numbers by name, in SI units where the name has no other.
+    lines: list[str] = field(default_factory=list)  # sentences that ``ins_align info`` prints
+    # Numbers by name, in SI units unless the name ends with another unit.
     figures: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)  # parameters that an alignment needs
-    faults: list[str] = field(default_factory=list)  # why it is useless as it is
+    faults: list[str] = field(default_factory=list)  # sentences on why it cannot be used
 
     def add(self, text: str, settings: Mapping[str, Any] | None = None, *, fault: bool = False,
             **figures: Any) -> None:
-        """Add a finding: a sentence ('': none), parameters that it sets, figures by name."""
+        """Add a finding: a sentence ('' adds none), the parameters that it sets, and figures."""
         if fault:
             self.faults.append(text)
         elif text:
-            sets = ', '.join(in_words(settings or {}))
+            sets = ', '.join(set_arguments(settings or {}))
             self.lines.append(text + (sets and f' (sets {sets})'))
         self.settings |= settings or {}
         self.figures |= figures
 
 
 class Columns(NamedTuple):
-    """What N messages of a topic say."""
+    """The contents of N messages of a topic."""
 
     recorded_ns: np.ndarray  # (N,) int64
     stamps_ns: np.ndarray  # (N,) int64
-    # (N, 6), rate and specific force; or (N, 3), latitude, longitude, degrees, and altitude, m, or
-    # velocity as if it were ENU, m/s.
+    # Imu: (N, 6), angular rate, rad/s, and specific force, m/s^2. Fix: (N, 3), latitude and
+    # longitude, degrees, and altitude, m. Velocity: (N, 3), read as ENU, m/s.
     values: Array
-    usable: np.ndarray  # (N,) bool: finite, and with a fix
+    usable: np.ndarray  # (N,) bool: finite, within bounds, and with a fix
     no_fix: np.ndarray  # (N,) bool
-    sigmas: Array  # (N, 2), horizontal and vertical; nan where no covariance is stated
-    vertical: np.ndarray  # (N,) bool: with an altitude or a vertical velocity that is not nan
+    sigmas: Array  # (N, 2), m or m/s, horizontal and vertical; nan if no covariance is stated
+    vertical: np.ndarray  # (N,) bool: whether altitude or vertical velocity is not nan
 
 
 NOTHING = Columns(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)),
@@ -88,7 +88,7 @@ NOTHING = Columns(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3))
 
 
 def columns_of(times_ns: np.ndarray, decoded: ImuSamples | Sequence[Gnss]) -> Columns:
-    """Return what messages say, recorded at some times; what cannot be decoded is left out."""
+    """Return the columns of messages recorded at some times, without undecodable ones."""
     if isinstance(decoded, ImuSamples):
         values = np.hstack([decoded.gyro, decoded.accel])
         good = (np.abs(values) < np.repeat([MAX_RATE, MAX_ACCELERATION], 3)).all(axis=1)
@@ -99,8 +99,8 @@ def columns_of(times_ns: np.ndarray, decoded: ImuSamples | Sequence[Gnss]) -> Co
         if not isinstance(message, Refused):
             found, fault = usable(message)
             values = numbers_of(found)
-            known = message.covariance is not None
-            east, north, up = message.covariance.diagonal() if known else (math.nan,) * 3
+            covariance = message.covariance
+            east, north, up = (math.nan,) * 3 if covariance is None else covariance.diagonal()
             rows.append((time_ns, message.stamp_ns, values, not fault, fault == 'no_fix',
                          (math.sqrt((east + north) / 2.0), math.sqrt(up)), found.vertical))
     return Columns(*map(np.array, zip(*rows))) if rows else NOTHING
@@ -108,7 +108,7 @@ def columns_of(times_ns: np.ndarray, decoded: ImuSamples | Sequence[Gnss]) -> Co
 
 @dataclass(init=False)
 class Recorded(Surveyed):
-    """A topic that an alignment could read, with all its messages in recorded order."""
+    """Survey of a topic that an alignment could read, with its messages in recorded order."""
 
     name: str
     msgtype: str
@@ -116,14 +116,14 @@ class Recorded(Surveyed):
 
     def __init__(self, topic: Topic, kind: str, start_ns: int, first: bytes | None,
                  messages: int, parts: Sequence[Columns]) -> None:
-        """Put together what so many messages say, of a recording that begins at a time, ns."""
+        """Survey a topic by its first message, the number of messages and their decoded parts."""
         super().__init__()
         self.name, self.msgtype, self.kind = topic.name, type_in_words(topic.msgtype), kind
-        # Why a velocity would be refused for its frame_id, or what an IMU does not measure.
+        # Why the messages may not be what their type promises; '' if there is no doubt.
         self.doubt = doubt(first, topic)
         data = Columns(*map(np.concatenate, zip(*parts))) if parts else NOTHING
         self.recorded_ns, self.stamps_ns, self.values = data[:3]
-        self.usable = data.usable  # with a stamp near the others, besides
+        self.usable = data.usable  # without stamps that are astray, see below
         self._start_ns, self._age_ns = start_ns, 0
         count = self.stamps_ns.size
         self.add('', messages=messages)
@@ -131,19 +131,19 @@ class Recorded(Surveyed):
             self.add(self.doubt or 'its messages cannot be decoded', fault=True)
             return
         ages_ns = self.recorded_ns - self.stamps_ns
-        # The median: one of the ages, no mean of two clocks.
+        # The upper median is one of the ages, never the mean of the ages by two clocks.
         self._age_ns = int(np.sort(ages_ns)[count // 2])
         astray = np.abs(ages_ns - self._age_ns) > MAX_ASTRAY * 1e9
         self.usable = data.usable & ~astray
-        in_order = self.stamps_ns[~astray]
-        self._add_timing(np.unique(in_order), ages_ns[~astray] * 1e-9)
+        stamps_ns = self.stamps_ns[~astray]
+        self._add_timing(np.unique(stamps_ns), ages_ns[~astray] * 1e-9)
         for name, number, text in (
                 ('undecodable', messages - count, 'messages cannot be decoded'),
                 ('astray', int(np.count_nonzero(astray)),
                  f'stamps are more than {MAX_ASTRAY:g} s off the others'),
-                ('out_of_order', int(np.count_nonzero(np.diff(in_order) <= 0)),
+                ('out_of_order', int(np.count_nonzero(np.diff(stamps_ns) <= 0)),
                  'stamps are not later than the one before')):
-            self.add(number and f'{number} {text}' or '', **{name: number})
+            self.add(f'{number} {text}' if number else '', **{name: number})
         self.add('', usable_share=float(np.mean(self.usable)))
         if kind == 'fix':
             share = float(np.mean(data.no_fix))
@@ -153,7 +153,7 @@ class Recorded(Surveyed):
             self._add_sigmas(data.sigmas)
 
     def _add_sigmas(self, sigmas: Array) -> None:
-        """Say what sigmas are stated, and in how many messages."""
+        """Add the median of the stated sigmas, and in how many messages there are any."""
         stated = sigmas[np.isfinite(sigmas[:, 0])]
         share = len(stated) / len(sigmas)
         if not share:
@@ -167,7 +167,7 @@ class Recorded(Surveyed):
                  covariance_share=share, sigma=sigma)
 
     def _add_timing(self, stamps_ns: np.ndarray, ages: Array) -> None:
-        """Add when messages came: stamps in order, and ages in seconds."""
+        """Add rate, gaps and ages of messages with these increasing stamps, ns, and ages, s."""
         intervals = np.diff(stamps_ns) * 1e-9
         usual = float(np.median(intervals)) if intervals.size else math.inf
         gaps = int(np.count_nonzero(intervals > GAP_INTERVALS * usual))
@@ -183,22 +183,22 @@ class Recorded(Surveyed):
 
     @property
     def age_s(self) -> float:
-        """Usual recorded time less stamp; 0 where there is no message."""
+        """Median of recorded time minus stamp, s; 0 if there is no message."""
         return self._age_ns * 1e-9
 
     def series(self) -> Series:
         """
-        Return the usable values over increasing seconds of the recording.
+        Return the usable values over increasing times, s from the start of the recording.
 
-        Stamps are moved by the median age of the messages: clocks that differ do not matter. Of
-        one stamp the first counts.
+        The times are the stamps plus the median age of the messages, which makes different clocks
+        comparable. Of equal stamps the first counts.
         """
         times_ns = self.stamps_ns[self.usable] - self._start_ns + self._age_ns
         return series_of(times_ns.astype(float) * 1e-9, self.values[self.usable])
 
 
 def read_candidates(bag: Bag) -> list[Recorded]:
-    """Read every topic that an alignment could read, sorted by name."""
+    """Read and survey every topic that an alignment could read, sorted by name."""
     topics = sorted(candidates(bag, KINDS))
     first: dict[Topic, bytes] = {}
     counts: Counter[Topic] = Counter()
@@ -210,7 +210,7 @@ def read_candidates(bag: Bag) -> list[Recorded]:
             first.setdefault(topic, messages[0])
             counts[topic] += len(messages)
             times_ns = block.times_ns[block.topics == number]
-            # Frames in their headers may be wrong: the motion will tell.
+            # The frame_id of a velocity is ignored: the motion will show its frame.
             decoded = decode(messages, topic, Config(velocity_frame='enu'))
             for kind, data in decoded.items():
                 parts[topic, kind].append(columns_of(times_ns, data))
