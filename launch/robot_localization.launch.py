@@ -20,8 +20,8 @@ where the vehicle was aligned, on /odometry/filtered and as the transform odom -
 
     ros2 launch ins_align robot_localization.launch.py params_file:=my_robot.yaml
 
-All of it may start at once: before the alignment there is no message on ~/imu, and both nodes of
-robot_localization wait for the first one. navsat_transform_node takes its heading, for good.
+All nodes may start at once: before the alignment there is no message on ~/imu, and both nodes of
+robot_localization wait for the first one. navsat_transform_node keeps the heading of that message.
 """
 
 from launch import LaunchDescription
@@ -30,20 +30,20 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-# Names without a leading slash are those of the namespace that everything is started in.
+# Without a leading slash: relative to the namespace in which everything is started.
 ALIGNED_IMU = 'ins_align/imu'
 
 NAVSAT_TRANSFORM = {
     'frequency': 30.0,
-    # No seconds to wait for a compass to settle: the first heading that arrives is good.
+    # s. There is no compass that has to settle: the first heading that arrives is good.
     'delay': 0.0,
     # The heading of ~/imu is true: it comes from GNSS and from the Earth's axis, not from a
     # magnetometer. There is no declination to add.
     'magnetic_declination_radians': 0.0,
-    # Its yaw is 0 facing east and grows to the left (REP-103), as this node wants it; pi/2, the
-    # value in many examples, is for compasses that read 0 facing north.
+    # The yaw of ~/imu is 0 facing east and grows to the left (REP-103), as this node wants it.
+    # pi/2, the value in many examples, is for compasses that read 0 facing north.
     'yaw_offset': 0.0,
-    # Heading from the IMU message, not from the odometry, which needs this node's output first.
+    # Take the heading from the IMU: the odometry needs the output of this node first.
     'use_odometry_yaw': False,
     'wait_for_datum': False,
     'zero_altitude': False,
@@ -51,7 +51,7 @@ NAVSAT_TRANSFORM = {
     'publish_filtered_gps': False,
 }
 
-# Which of: x y z, roll pitch yaw, their rates (linear, angular), linear acceleration.
+# Order: position, roll pitch yaw, velocity, angular rate, acceleration; three values each.
 POSITION_ONLY = [True, True, True] + [False] * 12
 ATTITUDE_AND_RATE = [False] * 3 + [True] * 3 + [False] * 3 + [True] * 3 + [False] * 3
 
@@ -61,12 +61,12 @@ EKF = {
     'publish_tf': True,
     'odom_frame': 'odom',
     'base_link_frame': 'base_link',
-    # One filter, all of it absolute: it broadcasts odom -> base_link itself. With wheel odometry
-    # take robot_localization's example of two filters; this one is then the map's.
+    # A single filter of absolute measurements broadcasts odom -> base_link itself. With wheel
+    # odometry take robot_localization's example of two filters; this one then has the map frame.
     'world_frame': 'odom',
     'odom0': 'odometry/gps',
     'odom0_config': POSITION_ONLY,
-    # As measured, neither as differences nor relative to the first: both inputs are absolute.
+    # Both inputs are absolute: neither differences nor values relative to the first.
     'odom0_differential': False,
     'odom0_relative': False,
     'imu0': ALIGNED_IMU,
@@ -101,7 +101,8 @@ def generate_launch_description() -> LaunchDescription:
     ekf = Node(
         package='robot_localization', executable='ekf_node', name='ekf_filter_node',
         namespace=given['namespace'], output='screen', parameters=[EKF, sim_time])
-    # Where robot_localization is not installed, launch ends here and would leave others running.
+    # Its nodes come first: where robot_localization is not installed, launch ends there, and
+    # what it has started before would go on running.
     return LaunchDescription([
         *(DeclareLaunchArgument(name, default_value=value) for name, value in arguments.items()),
         navsat_transform, ekf, alignment])

@@ -14,8 +14,8 @@
 """
 What the node reads: IMU messages as bytes, the GNSS topics and their faults, /tf_static.
 
-Turning every IMU sample into a Python message and back costs several times what the alignment
-itself does with it, so the node takes its bytes as they arrive and changes them in place.
+Turning every IMU sample into a Python message and back costs several times as much as the
+alignment itself, so the node reads the serialised message and replaces its orientation in a copy.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ from rclpy.time import Time
 from sensor_msgs.msg import Imu, NavSatFix
 
 FIX_TOPIC, VELOCITY_TOPIC = 'fix', 'fix_velocity'
-# As what is counted a message that cannot be used.
+# Names under which messages that cannot be used are counted, by topic.
 REJECTED_AS = {FIX_TOPIC: 'fix_undecodable', VELOCITY_TOPIC: 'velocity_body_frame'}
-# What the parameter velocity_type can name.
+# Message types by the value of the parameter velocity_type.
 VELOCITY_TYPES = {kind.__name__: kind for kind in (
     TwistWithCovarianceStamped, TwistStamped, Odometry, Vector3Stamped)}
 
-# sensor_msgs/Imu in plain CDR, little endian (OMG DDSI-RTPS 2.3, 10.2): four bytes that say so,
-# the stamp, the frame_id behind its length, and the body: orientation 4 and its covariance 9, rate
-# 3 and 9, specific force 3 and 9, all float64.
+# sensor_msgs/Imu in plain CDR, little endian (OMG DDSI-RTPS 2.3, 10.2): a header of four bytes,
+# stamp, length of the frame_id, frame_id, and the body, all float64: orientation (4) with its
+# covariance (9), angular rate (3 and 9), specific force (3 and 9).
 _LITTLE_ENDIAN = b'\x00\x01'
 _STAMP, _ORIENTATION, _VECTOR = struct.Struct('<iI'), struct.Struct('<13d'), struct.Struct('<3d')
 _STAMP_OFFSET, _FRAME_OFFSET = 4, 16
@@ -58,7 +58,7 @@ _RATE_OFFSET, _FORCE_OFFSET, _BODY_BYTES = 8 * 13, 8 * 25, 8 * 37
 
 
 class ImuSample(NamedTuple):
-    """What the alignment needs of one message."""
+    """The parts of an IMU message that the alignment uses."""
 
     stamp_ns: int
     gyro: tuple[float, float, float]  # rad/s
@@ -67,15 +67,15 @@ class ImuSample(NamedTuple):
 
 
 def body_start(data: bytes) -> int | None:
-    """Return where the numbers of a serialised Imu start; None: this is not the known layout."""
+    """Return the offset of the body of a serialised Imu; None if it has another layout."""
     start = _FRAME_OFFSET + int.from_bytes(data[_FRAME_OFFSET - 4:_FRAME_OFFSET], 'little')
-    start += -(start - 4) % 8  # numbers of eight bytes are aligned behind the encapsulation
+    start += -(start - 4) % 8  # float64 are aligned to 8 bytes from the end of the header
     known = data[:2] == _LITTLE_ENDIAN and len(data) == start + _BODY_BYTES
     return start if known else None
 
 
 def read_imu(data: bytes) -> ImuSample:
-    """Read one serialised sensor_msgs/Imu; its orientation is not looked at."""
+    """Read one serialised sensor_msgs/Imu, without its orientation."""
     start = body_start(data)
     if start is None:  # a middleware with another serialisation
         msg = deserialize_message(data, Imu)
@@ -91,7 +91,7 @@ def read_imu(data: bytes) -> ImuSample:
 
 def with_orientation(data: bytes, quaternion_xyzw: Sequence[float],
                      covariance: Sequence[float]) -> bytes:
-    """Return a serialised sensor_msgs/Imu with another orientation, its covariance by rows."""
+    """Return a serialised sensor_msgs/Imu with another orientation and covariance (row-major)."""
     orientation = (*quaternion_xyzw, *covariance)
     start = body_start(data)
     if start is None:
@@ -107,21 +107,21 @@ def with_orientation(data: bytes, quaternion_xyzw: Sequence[float],
 
 class Gate(ReentrantCallbackGroup):
     """
-    Keeps a subscription from its executor while it is closed.
+    A callback group whose subscription the executor passes over while the gate is closed.
 
-    A turn of the executor takes longer than all that is done with a message. Where nothing has to
-    be done at once, messages wait in the subscription's queue and are taken many in a turn.
+    A turn of the executor takes longer than the work on a message. While no message is urgent,
+    messages wait in the subscription's queue, and one turn takes many.
     """
 
     is_open = False
 
     def can_execute(self, entity: Any) -> bool:
-        """Whether the executor may take messages."""
+        """Return whether the executor may take messages."""
         return self.is_open
 
 
 def queued(subscription: Subscription) -> list[tuple[Any, int]]:
-    """Take the messages that wait, each with the time at which it was received, ns."""
+    """Take the messages that wait in a subscription, each with its time of reception, ns."""
     messages: list[tuple[Any, int]] = []
     with subscription.handle:
         while len(messages) < subscription.qos_profile.depth:
@@ -134,7 +134,7 @@ def queued(subscription: Subscription) -> list[tuple[Any, int]]:
 
 def gnss_topics(config: Config) -> dict[str, type]:
     """
-    Return the message types of the topics to read, by topic.
+    Return the GNSS topics to read, with their message types.
 
     A ConfigError says that the package of the configured type is not installed.
     """
@@ -158,19 +158,19 @@ def inputs_in_words(node: Node, inputs: Mapping[str, type], config: Config) -> s
     """Say what a node reads, and with which parameters."""
     topics = ', '.join(f'{node.resolve_topic_name(topic)} ({type_in_words(type_name(msg_type))})'
                        for topic, msg_type in inputs.items())
-    told = ', '.join(f'{own.name} {getattr(config, own.name)}'
-                     for own in dataclasses.fields(Config)
-                     if own.name == 'lever_arm' or getattr(config, own.name) != own.default)
-    return f'reads {topics}; {told}, other parameters at their defaults'
+    settings = ', '.join(
+        f'{field.name} {getattr(config, field.name)}' for field in dataclasses.fields(Config)
+        if field.name == 'lever_arm' or getattr(config, field.name) != field.default)
+    return f'reads {topics}; {settings}, other parameters at their defaults'
 
 
 def topic_faults(node: Node, inputs: Mapping[str, type], expected: Sequence[str],
                  ) -> Iterator[str]:
     """
-    Look at the publishers of the topics that a node reads, and say what is wrong with them.
+    Yield what is wrong with the publishers of the topics that a node reads, in words.
 
-    `inputs` are message types by topic; topics that are `expected` are worth a word where nobody
-    publishes them.
+    `inputs` are message types by topic. A topic that nobody publishes is a fault only if it is
+    `expected`.
     """
     for topic, msg_type in inputs.items():
         name = node.resolve_topic_name(topic)
@@ -188,7 +188,7 @@ def topic_faults(node: Node, inputs: Mapping[str, type], expected: Sequence[str]
 
 
 def gnss_from_msg(topic: str, msg: Any, config: Config) -> Sequence[Fix | Velocity]:
-    """Return what a message of a topic carries; a MessageError says why it cannot be used."""
+    """Convert a message of a GNSS topic; a MessageError says why it cannot be used."""
     if topic == VELOCITY_TOPIC:
         return velocities_from_msgs([msg], config)
     if config.fix_type == 'NavSatFix':
@@ -197,7 +197,7 @@ def gnss_from_msg(topic: str, msg: Any, config: Config) -> Sequence[Fix | Veloci
 
 
 def open_static_tf(node: Node, config: Config) -> Lookup | None:
-    """Return a lookup in /tf_static; None: it is not wanted, or there is no tf2_ros."""
+    """Return a lookup in /tf_static; None if no parameter needs it or tf2_ros is missing."""
     if config.lever_arm_from_tf is False and not config.base_frame:
         return None
     try:
@@ -205,12 +205,12 @@ def open_static_tf(node: Node, config: Config) -> Lookup | None:
     except ModuleNotFoundError:
         return None
     buffer = tf2_ros.Buffer()
-    buffer.listener = tf2_ros.TransformListener(buffer, node)  # which would otherwise be gone
-    # A lever arm does not move, and /tf is too much for a small computer.
+    buffer.listener = tf2_ros.TransformListener(buffer, node)  # kept alive
+    # Lever arms do not change, and receiving /tf would load a small computer.
     node.destroy_subscription(buffer.listener.tf_sub)
 
     def lookup(target: str, source: str) -> Transform | None:
-        target, source = target.strip('/'), source.strip('/')  # tf2 knows no frame with a slash
+        target, source = target.strip('/'), source.strip('/')  # tf2 takes no leading slash
         if not buffer.can_transform(target, source, Time()):
             return None
         return transform_from_msg(buffer.lookup_transform(target, source, Time()).transform)

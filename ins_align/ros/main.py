@@ -25,7 +25,7 @@ from types import FrameType
 
 from ins_align.processes import keep_to_one
 
-_SOURCE_LINES = re.compile(r', at \S+:\d+')  # where in its sources rcl found an error
+_SOURCE_LINES = re.compile(r', at \S+:\d+')  # rcl's errors name lines of its sources
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -35,10 +35,10 @@ def main(args: Sequence[str] | None = None) -> int:
     Returns the exit status: 0 after an interruption, 2 if an argument or a parameter is wrong, or
     without a ROS installation.
     """
-    keep_to_one()  # several times as cheap
+    keep_to_one()  # more threads would cost several times as much
 
-    # rclpy's own handlers end spin(). Python's would raise KeyboardInterrupt as well, at any line,
-    # that of the clean-up included: ros2 launch passes on a Ctrl-C that has arrived already.
+    # rclpy's handlers end spin(). Python's own would also raise KeyboardInterrupt, at any line,
+    # even in the clean-up: a Ctrl-C arrives twice, from the terminal and from ros2 launch.
     ros_handles_signals = False
 
     def on_signal(number: int, frame: FrameType | None) -> None:
@@ -48,7 +48,7 @@ def main(args: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGINT, on_signal)
     signal.signal(signal.SIGTERM, on_signal)
 
-    # Now that the above holds: importing starts the threads and takes a while.
+    # Only now: importing starts the threads of linear algebra, and a signal may come meanwhile.
     try:
         from ins_align.ros.node import AlignmentNode
     except ModuleNotFoundError as error:
@@ -66,12 +66,12 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         _refuse_other_arguments(remove_ros_args(args)[1:])
         rclpy.init(args=args)
-    except RuntimeError as error:  # all of rcl's
+    except RuntimeError as error:  # every error of rcl is one
         hint = ' (write 0.0, not 0, in a list)' if 'same type' in str(error) else ''
         return _refused(f'the ROS arguments are wrong: {error}{hint}')
     ros_handles_signals = True
-    # The estimator's thread must not keep a callback waiting for the interpreter (s).
-    sys.setswitchinterval(0.001)
+    # The worker's thread must not keep a callback waiting for the interpreter.
+    sys.setswitchinterval(0.001)  # s
     node = None
     try:
         executor = SingleThreadedExecutor()  # a signal while it is made ends in a traceback
@@ -80,7 +80,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except ExternalShutdownException:
         pass
     except (ConfigError, ParameterException, InvalidQosOverridesError, RuntimeError) as error:
-        # Without a context: it was interrupted, and rcl complains of that wherever it was.
+        # If the context is gone, the process was interrupted, and the error only follows from it.
         if rclpy.ok():
             if node is not None:
                 raise
@@ -95,7 +95,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _refuse_other_arguments(arguments: list[str]) -> None:
-    """Exit with a usage message unless there is nothing but what ROS understands."""
+    """Exit with a usage message if there are arguments that ROS does not know."""
     argparse.ArgumentParser(
         prog='ins_align_node', usage='%(prog)s [-h] [--ros-args ...]',
         description='Aligns an IMU with GNSS while moving and publishes its attitude.',
@@ -104,7 +104,7 @@ def _refuse_other_arguments(arguments: list[str]) -> None:
 
 
 def _refused(error: str) -> int:
-    """Say why the node does not start."""
+    """Print why the node does not start, and return the exit status."""
     print(f'ins_align: {_SOURCE_LINES.sub("", " ".join(error.split()))}', file=sys.stderr)
     return 2
 

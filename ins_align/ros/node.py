@@ -12,9 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-The ROS 2 node: subscribes, hands over to the aligner, publishes what it says.
+The ROS 2 node: subscribes to the sensors, feeds the aligner, publishes its results.
 
-Everything that decides anything is in the aligner, which `ins_align replay` runs as well.
+All decisions about the alignment are made in the aligner, which `ins_align replay` runs as well.
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ from std_msgs.msg import Header, UInt8
 from std_srvs.srv import Trigger
 
 IMU_TOPIC = 'imu/data_raw'
-IMU_DEPTH = 2000  # ten seconds at 200 Hz: the machine may be busy, no sample may be lost
+IMU_DEPTH = 2000  # 10 s at 200 Hz, so that no sample is lost while the machine is busy
 GNSS_DEPTH = 200
-PERIOD = 0.2  # s, between two rounds of the worker: many messages at one go cost less
+PERIOD = 0.2  # s, between rounds of the worker: many messages at a time cost less
 STATUS_PERIOD = 1.0  # s
-# Without a sample for so long, by the clock of this machine, the IMU is silent: the status says
-# so, and another one may take its place (s).
+# After so long without a sample, by the clock of this machine, the IMU is silent: the status says
+# so, and another IMU may take its place (s).
 IMU_SILENT = 1.0
-LOG_AGAIN = 10.0  # s after which a reason that has stayed is worth another line
+LOG_AGAIN = 10.0  # s after which a reason that has not changed may be logged again
 _NUMBER = re.compile(r'[-+]?\d[\d.]*(?:e[-+]?\d+)?')
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.5)
 
@@ -77,15 +77,15 @@ class ReasonLog:
 
     def __init__(self) -> None:
         """Start with nothing logged."""
-        self._logged: dict[str, float] = {}  # when texts, without their numbers, were logged last
+        self._logged: dict[str, float] = {}  # text without numbers to when it was logged last, s
         self._present = ''
 
     def due(self, text: str, now: float, again: bool) -> bool:
         """
-        Return whether to log a text, which counts as logged then.
+        Return whether to log a text at time `now`, s; if so, it counts as logged.
 
-        That is when it has become another one, but for its numbers, or, if it is to be logged
-        `again` and again, has stayed; not within `LOG_AGAIN` of the last time.
+        Numbers in the text are ignored. It is logged if it differs from the text of the last call,
+        or if `again` says to repeat it, but not within `LOG_AGAIN` after it was logged.
         """
         kind = _NUMBER.sub('#', text)
         stays, self._present = kind == self._present, kind
@@ -98,7 +98,7 @@ class ReasonLog:
 
 
 def parameter_descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
-    """Describe one field of `Config` to ROS."""
+    """Return the description of a field of `Config` for ROS."""
     line = field.metadata
     unit = f' [{line["unit"]}]' if line['unit'] else ''
     descriptor = ParameterDescriptor(
@@ -115,11 +115,11 @@ class AlignmentNode(Node):
     """
     Feeds an `Aligner` from topics and publishes the attitude that it declares.
 
-    The executor's thread puts messages into an inbox. Each one of the IMU it answers on `~/imu`
-    with the attitude that the worker knew last, carried on with the gyros since: at once while
-    somebody listens, otherwise it takes them several times a second, which costs half. The
-    worker, a thread of its own that no callback waits for, aligns several times a second.
-    A parameter that is wrong is a ConfigError.
+    The executor's thread puts messages into an inbox. While somebody listens to `~/imu`, it takes
+    each IMU message at once and publishes it with the latest attitude of the worker, carried on
+    with the gyros; otherwise it takes IMU messages several times a second, which costs half. The
+    worker, a thread of its own that no callback waits for, aligns several times a second. A
+    parameter that is wrong is a ConfigError.
     """
 
     def __init__(self) -> None:
@@ -135,10 +135,10 @@ class AlignmentNode(Node):
         self.failure: BaseException | None = None  # what ended the worker, and the context with it
         self._config = self._declare_parameters()
         self._search = MountingSearch(self._config, open_static_tf(self, self._config))
-        # From the executor to the worker: when it was received, ns, and a message or a request.
+        # From the executor to the worker: time of reception, ns, and a message or a request.
         self._inbox: deque[tuple[int, Any]] = deque()
-        # From the worker to the executor, replaced as a whole: what ~/imu goes on from, None for
-        # nothing, and the frame_id of the IMU that it is for.
+        # From the worker to the executor, replaced as a whole: the attitude that ~/imu carries on,
+        # None where there is none, and the frame_id of its IMU.
         self._prediction: tuple[Prediction | None, str | None] = None, None
         # The executor's:
         self._follower = Follower()
@@ -148,10 +148,10 @@ class AlignmentNode(Node):
         self._checks = InputChecks(self._config)
         self._declared: Attitude | None = None
         self._imu_frame: str | None = None
-        self._imu_received_ns = 0  # the last sample of that frame
-        self._other_frames: set[str] = set()  # of IMUs that were there before
+        self._imu_received_ns = 0  # when the last sample of that IMU was received
+        self._other_frames: set[str] = set()  # of earlier IMUs
         self._newest_imu_ns: int | None = None
-        self._imu_heard: float | None = None  # when there was a new sample of use
+        self._imu_heard: float | None = None  # when the aligner got a new sample, s
         self._next_status = 0.0
         self._reasons = ReasonLog()
         self._wake, self._stopping = threading.Event(), False
@@ -160,12 +160,12 @@ class AlignmentNode(Node):
         self._open_topics()
         self.get_logger().info(inputs_in_words(self, self._inputs, self._config))
         self.create_service(Trigger, '~/reset', self._on_reset)
-        # A signal between two waits of the executor wakes it from neither: it has to look.
+        # A signal between two waits does not wake the executor: with the timer it looks.
         self.create_timer(PERIOD, self._open_gate, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._worker.start()
 
     def destroy_node(self) -> None:
-        """Let the worker end its round first."""
+        """Stop the worker after its round, then destroy the node."""
         self._stopping = True
         self._wake.set()
         self._worker.join()
@@ -187,7 +187,7 @@ class AlignmentNode(Node):
         for data, received_ns in messages:
             sample = read_imu(data)
             self._inbox.append((received_ns, sample))
-            # What was learnt is about the axes of another IMU when the frame is another one.
+            # The attitude is that of another IMU if the frame_id differs.
             if self._followed[1] not in (None, sample.frame_id):
                 continue
             now = self._follower.follow(sample.stamp_ns, sample.gyro)
@@ -198,7 +198,7 @@ class AlignmentNode(Node):
                     with_orientation(data, now.quaternion_xyzw, now.covariance))
 
     def _on_gnss(self, topic: str, msg: Any, info: dict[str, int]) -> None:
-        self._take_imu(queued(self._imu_subscription))  # what came before it is not to be behind
+        self._take_imu(queued(self._imu_subscription))  # those that came before this message
         if topic == FIX_TOPIC:
             header = getattr(msg, 'header', None)  # NavPVT has none
             self._search.antenna_frame = header.frame_id if header else ''
@@ -217,24 +217,24 @@ class AlignmentNode(Node):
         response.message = 'alignment starts over'
         return response
 
-    # Alignment and what comes of it: in the worker's thread, the aligner's only one
+    # Alignment and its results: in the worker's thread, the only one that uses the aligner
 
     def _run(self) -> None:
         try:
             while not self._stopping:
-                # Only as much as is there now: the executor goes on putting in.
+                # Only the items that are there now, because the executor adds more.
                 self._work([self._inbox.popleft() for _ in range(len(self._inbox))])
                 self._wake.wait(PERIOD)
                 self._wake.clear()
         except BaseException as error:
-            # An interruption in the middle of rcl's work is no failure.
+            # Without a context the process was interrupted, which is no failure.
             if self.context.ok():
                 self.failure = error
                 self.context.try_shutdown()
 
     def _work(self, items: list[tuple[int, Any]]) -> None:
-        """Take in what has come, align and publish what has changed."""
-        # Each topic is a queue by itself: nothing shall be late, or early, for having waited.
+        """Give the aligner what has come, and publish the results."""
+        # Topics wait in separate queues: restore the order of reception.
         items.sort(key=itemgetter(0))
         items, mounting = self._search.take(items, time.monotonic())
         if mounting is not None:
@@ -249,13 +249,12 @@ class AlignmentNode(Node):
         events = self._aligner.take_events()
         for event in events:
             self._log(event.severity, event.text)
-            self._reasons.due(event.text, time.monotonic(), False)
-        # By a clock that goes on when simulated time stands still.
+        # By a clock that does not stop with simulated time.
         if events or time.monotonic() >= self._next_status:
             self._publish_status()
 
     def _use_mounting(self, mounting: Mounting) -> None:
-        """Take over what TF says."""
+        """Log what TF says, and start again with its lever arm and base."""
         for severity, text in mounting.words:
             self._log(severity, text)
         if (mounting.config.lever_arm != self._config.lever_arm
@@ -266,7 +265,7 @@ class AlignmentNode(Node):
             self._imu_frame = None
 
     def _log(self, severity: Severity, text: str) -> None:
-        # rclpy wants one line of code for each severity.
+        # rclpy allows one severity for each line of code.
         if severity is Severity.ERROR:
             self.get_logger().error(text)
         elif severity is Severity.WARNING:
@@ -275,9 +274,9 @@ class AlignmentNode(Node):
             self.get_logger().info(text)
 
     def _feed(self, items: list[tuple[int, Any]]) -> None:
-        """Give messages to the aligner and the checks, and do what is asked for in between."""
+        """Give messages to the aligner and the checks, and do the requests in between."""
         samples: list[ImuSample] = []
-        gnss: list[tuple[int, Fix | Velocity]] = []  # with how many samples come before
+        gnss: list[tuple[int, Fix | Velocity]] = []  # with the number of samples before it
         for received_ns, item in items:
             if isinstance(item, ImuSample):
                 if self._accepts_frame(item.frame_id, received_ns):
@@ -296,7 +295,7 @@ class AlignmentNode(Node):
                          np.array(accel).reshape(-1, 3), gnss)
 
     def _align(self) -> None:
-        """Process what can be processed."""
+        """Process the epochs that are ready, and publish their results."""
         for epoch in self._aligner.update():
             self._publish_declared(epoch.initial if epoch.state is State.ALIGNED else None)
             self._publish_numbers(epoch)
@@ -304,12 +303,17 @@ class AlignmentNode(Node):
             self._publish_declared(None)
 
     def _start_over(self, why: str) -> None:
-        self._align()  # what came before counts, whenever it was taken in
+        self._align()  # messages before the request count, whenever the worker took them
         self._aligner.reset(why)
         self._checks = InputChecks(self._config)
 
     def _accepts_frame(self, frame_id: str, received_ns: int) -> bool:
-        """Whether a sample is of the IMU that is aligned, which one that is new becomes."""
+        """
+        Return whether a sample is of the IMU that is aligned.
+
+        An IMU with a new frame_id takes its place, or an earlier one while it is silent; then the
+        alignment starts over.
+        """
         if frame_id != self._imu_frame:
             silent = received_ns - self._imu_received_ns > IMU_SILENT * 1e9
             if frame_id in self._other_frames and not silent:
@@ -319,7 +323,7 @@ class AlignmentNode(Node):
                     f'{self._imu_frame!r}: the latter is used', once=True)
                 return False
             if self._imu_frame is not None:
-                # What was learnt is about axes that are no longer the IMU's.
+                # The estimates are about the axes of the former IMU.
                 self._aligner.reject('imu_frame_changed')
                 self._search.restart()
                 self._start_over(
@@ -330,7 +334,7 @@ class AlignmentNode(Node):
         return True
 
     def _update_prediction(self) -> None:
-        """Hand over what ~/imu goes on from; None where nobody listens or nothing is declared."""
+        """Hand over the attitude for ~/imu; None if nobody listens or nothing is declared."""
         listened = self._imu_publisher.get_subscription_count() > 0
         prediction = self._aligner.prediction() if listened and self._declared else None
         if prediction is not None or self._prediction[0] is not None:
@@ -342,8 +346,8 @@ class AlignmentNode(Node):
             return
         self._declared = attitude
         if attitude is None:
-            # Whoever joins from now on must not get an attitude that no longer holds; who was
-            # there before shall have got it.
+            # Who subscribes later must not get an attitude that no longer holds, which needs a new
+            # publisher; who has subscribed before must have got it.
             self._attitude_publisher.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
             self.destroy_publisher(self._attitude_publisher)
             self._attitude_publisher = self._open_attitude_topic()
@@ -357,7 +361,7 @@ class AlignmentNode(Node):
                       frame_id=self._config.world_frame_id)
 
     def _publish_numbers(self, epoch: Epoch) -> None:
-        """Publish an epoch for plots."""
+        """Publish angles and sigmas of an epoch, for plots."""
         now = epoch.current
         if now is None:
             return
@@ -369,20 +373,20 @@ class AlignmentNode(Node):
 
     def _publish_status(self) -> None:
         now = time.monotonic()
-        first = self._next_status == 0.0  # nobody is known yet who publishes anything
+        first = self._next_status == 0.0  # no publisher has been discovered yet
         self._next_status = now + STATUS_PERIOD
         status = self._checks.judge(self._aligner.status())
         level = level_of(status.state)
         silent = 0.0 if self._imu_heard is None else now - self._imu_heard
-        more = [] if first else self._input_faults(status, silent > IMU_SILENT)
+        faults = [] if first else self._input_faults(status, silent > IMU_SILENT)
         if silent > IMU_SILENT:
-            # The aligner goes by stamps: it learns of a gap when the next sample comes.
-            more.append(f'no IMU sample for {silent:.0f} s')
+            # The aligner goes by stamps: it notices a gap only when the next sample comes.
+            faults.append(f'no IMU sample for {silent:.0f} s')
         if self._search.waits_for:
-            more.append(f'waits for {self._search.waits_for}')
-        if more:
+            faults.append(f'waits for {self._search.waits_for}')
+        if faults:
             level = max(level, WARN)
-            status = dataclasses.replace(status, reason='; '.join([status.reason, *more]))
+            status = dataclasses.replace(status, reason='; '.join([status.reason, *faults]))
         text = f'{status.state.value}: {status.reason}'
         mounting = self._search.mounting
         values = status_values(status, self._config.base_frame, mounting and mounting.base)
@@ -394,13 +398,13 @@ class AlignmentNode(Node):
         for publisher in self._status_publishers:
             publisher.publish(msg)
         self._state_publisher.publish(UInt8(data=list(State).index(status.state)))
-        again = status.state is not State.ALIGNED or bool(more)
+        again = status.state is not State.ALIGNED or bool(faults)
         if not first and self._reasons.due(text, now, again):
-            severity = Severity.WARNING if more else Severity.INFO
+            severity = Severity.WARNING if faults else Severity.INFO
             self._log(Severity.ERROR if status.state is State.FAULT else severity, text)
 
     def _input_faults(self, status: Status, silent: bool) -> list[str]:
-        """Say what is wrong with topics: nobody is there, or their type is another one."""
+        """Return what is wrong with the input topics, in words."""
         expected = [topic for topic, wanted in (
             (IMU_TOPIC, silent or status.state is State.WAITING_FOR_IMU),
             (FIX_TOPIC, status.state is State.WAITING_FOR_GNSS),
@@ -427,8 +431,8 @@ class AlignmentNode(Node):
             self._subscribe_to(msg_type, topic, partial(self._on_gnss, topic), GNSS_DEPTH)
 
     def _publish_on(self, msg_type: type, topic: str, qos: QoSProfile | int) -> Publisher:
-        # Every event handler is one more thing to wait for at each IMU message. What is offered
-        # here suits every subscriber but those that ask for more, and these warn on their side.
+        # The executor would wait for every event handler at each IMU message. None is needed: a
+        # subscriber whose QoS asks for more than is offered here warns on its own side.
         return self.create_publisher(
             msg_type, topic, qos,
             event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
@@ -440,7 +444,7 @@ class AlignmentNode(Node):
 
     def _subscribe_to(self, msg_type: type, topic: str, callback: Callable[..., None],
                       depth: int, group: Gate | None = None) -> Subscription:
-        # Best effort matches every publisher, so that no event can tell of one that does not.
+        # Best effort matches every publisher: an event of incompatible QoS cannot occur.
         return self.create_subscription(
             msg_type, topic, callback,
             QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT),
@@ -482,6 +486,6 @@ class AlignmentNode(Node):
         self._inbox.append((time.time_ns(), lambda: self._reconfigure(changes)))
 
     def _reconfigure(self, changes: list[Parameter]) -> None:
-        # In the worker's thread, which may have put the lever arm of TF into the configuration.
+        # In the worker's thread, because it may put the lever arm of TF into the configuration.
         self._config = self._changed_config(changes)
         self._aligner.reconfigure(self._config)

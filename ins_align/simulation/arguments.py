@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What a simulation can be asked for: one table, which the command line and the checks share."""
+"""The arguments of `simulate`: one table, which the command line and the checks share."""
 
 from __future__ import annotations
 
@@ -26,31 +26,31 @@ from typing import Any
 
 from ins_align.config import checked, Config, ConfigError, ImuNoise, PRESETS, UsageError
 
-IMU_AXES = {'': (1.0, 1.0, 1.0), 'x': (-1.0, 1.0, 1.0), 'y': (1.0, -1.0, 1.0),
-            'z': (1.0, 1.0, -1.0)}
+# Factors of the three axes of the IMU, by the axis whose sign is wrong.
+AXIS_SIGNS = {'': (1.0, 1.0, 1.0), 'x': (-1.0, 1.0, 1.0), 'y': (1.0, -1.0, 1.0),
+              'z': (1.0, 1.0, -1.0)}
 
-LATENESS_MARGIN = 0.5  # s, of gnss_lateness over the latency
+LATENESS_MARGIN = 0.5  # s by which gnss_lateness has to exceed the latency
 _MAX_SAMPLES = 20_000_000
 
-# As far as the parameters of the aligner go that make up for them.
-_MOST = {field.name: field.metadata['maximum'] for field in dataclasses.fields(Config)
-         if field.metadata['maximum'] is not None}
+# An error can be simulated up to the maximum of the parameter of the aligner for it.
+_MAXIMA = {field.name: field.metadata['maximum'] for field in dataclasses.fields(Config)}
 
 
 def errors_of(noise: ImuNoise) -> dict[str, float]:
     """
     Return the arguments of an IMU that has all errors which the estimator expects of its grade.
 
-    It takes misalignment and the errors of the accelerometers for 3 tenths of the gyros' scale
-    factor errors.
+    As in the estimator, misalignment and the scale factor errors of the accelerometers are 0.3
+    times the scale factor errors of the gyros.
     """
     return {'gyro_scale_std': noise.gyro_scale_std, 'rate_random_walk': noise.rate_random_walk,
             **dict.fromkeys(('gyro_misalignment_std', 'accel_scale_std',
                              'accel_misalignment_std'), 0.3 * noise.gyro_scale_std)}
 
 
-# What a chip has by default; the other grades have noise and biases alone.
-_OF_CHIP = errors_of(PRESETS['chip'])
+# Defaults of the grade chip; the other grades have only noise and biases by default.
+_CHIP_ERRORS = errors_of(PRESETS['chip'])
 
 
 class SimulationError(UsageError):
@@ -60,7 +60,7 @@ class SimulationError(UsageError):
 def _argument(default: Any, text: str, unit: str = '', minimum: float = 0.0,
               maximum: float = math.inf, *, group: str, names: tuple[str, ...] = (),
               choices: tuple[Any, ...] = ()) -> Any:
-    """Describe a number, as many numbers as `names`, or one of `choices`; None means optional."""
+    """Return a field for a number, for one number per name, or for one of `choices`."""
     return dataclasses.field(default=default, metadata={
         'text': text, 'unit': unit, 'minimum': minimum, 'maximum': maximum, 'group': group,
         'names': names, 'choices': choices})
@@ -72,10 +72,11 @@ _imu, _motion, _gnss = (partial(_argument, group=group) for group in ('IMU', 'mo
 @dataclass(frozen=True)
 class Arguments:
     """
-    Everything that `simulate` can be asked for; SimulationError where an argument makes no sense.
+    The arguments of `simulate`, checked; a SimulationError says which one makes no sense.
 
-    Each field's metadata holds ``text``, ``unit``, ``minimum`` and ``maximum`` (inclusive),
-    ``choices``, ``names`` of its numbers where it has several, and its ``group`` of options.
+    Metadata of the fields from ``imu_rate`` on: ``text`` for the help, ``unit``, ``minimum`` and
+    ``maximum`` (inclusive), ``choices``, ``names`` of several numbers, and ``group`` of options.
+    None as the default makes a field optional.
     """
 
     scenario: str
@@ -89,8 +90,8 @@ class Arguments:
     imu_jitter: float = _imu(0.0, 'samples are off their time by up to this part of the interval '
                              'between them; stamps tell the displaced instants', '1', 0.0, 0.49)
     lever_arm: Sequence[float] = _imu(
-        (1.0, 1.0, 1.0), 'IMU to antenna in the IMU frame', 'm', -_MOST['lever_arm'],
-        _MOST['lever_arm'], names=('X', 'Y', 'Z'))
+        (1.0, 1.0, 1.0), 'IMU to antenna in the IMU frame', 'm', -_MAXIMA['lever_arm'],
+        _MAXIMA['lever_arm'], names=('X', 'Y', 'Z'))
     mount_rpy_deg: Sequence[float] = _imu(
         (0.0, 0.0, 0.0), 'attitude of the IMU in the vehicle', 'deg', -math.inf,
         names=('ROLL', 'PITCH', 'YAW'))
@@ -103,7 +104,7 @@ class Arguments:
         names=('X', 'Y', 'Z'))
     gyro_scale_std: float | None = _imu(
         None, 'scale factor error of each gyroscope, 1 sigma, 0.01 is one percent; default: 0, '
-        'of a chip what its grade states', '1', 0.0, _MOST['gyro_scale_std'])
+        'of a chip what its grade states', '1', 0.0, _MAXIMA['gyro_scale_std'])
     gyro_misalignment_std: float | None = _imu(
         None, 'what a gyroscope feels of the rate about each other axis, 1 sigma; default: 0, '
         'of a chip what its grade states', '1')
@@ -120,9 +121,9 @@ class Arguments:
     quantum: Sequence[float] = _imu(
         (0.0, 0.0), 'gyroscopes and accelerometers read multiples of this', 'rad/s and m/s^2',
         names=('GYRO', 'ACCEL'))
-    flip_axis: str = _imu('', 'this axis of the IMU has the wrong sign', choices=tuple(IMU_AXES))
+    flip_axis: str = _imu('', 'this axis of the IMU has the wrong sign', choices=tuple(AXIS_SIGNS))
     flip_gyro: str = _imu('', 'this angular rate alone has the wrong sign',
-                          choices=tuple(IMU_AXES))
+                          choices=tuple(AXIS_SIGNS))
     accel_sign: int = _imu(1, '-1: the accelerometers have the sign of gravity', choices=(1, -1))
 
     latitude_deg: float = _motion(48.0, 'where it starts', 'deg', -89.0, 89.0)
@@ -138,9 +139,9 @@ class Arguments:
     gnss_phase: float = _gnss(0.0137, 'stamp of the first epoch; by default no IMU sample is at '
                               'a GNSS stamp', 's')
     gnss_latency: float = _gnss(0.0, 'messages arrive so long after their stamp', 's', 0.0,
-                                _MOST['gnss_lateness'] - LATENESS_MARGIN)
+                                _MAXIMA['gnss_lateness'] - LATENESS_MARGIN)
     gnss_delay: float = _gnss(0.0, 'measurements are older than their stamp by this', 's', 0.0,
-                              _MOST['gnss_delay'])
+                              _MAXIMA['gnss_delay'])
     velocity_std: float = _gnss(0.1, 'white noise of the velocity, 1 sigma, horizontal', 'm/s')
     velocity_std_vertical: float | None = _gnss(
         None, 'and vertical; default: the same', 'm/s')
@@ -161,8 +162,9 @@ class Arguments:
                                 choices=('enu', 'ned'))
 
     def __post_init__(self) -> None:
-        from ins_align.simulation.scenarios import SCENARIOS
+        from ins_align.simulation.scenarios import SCENARIOS  # the help does without numpy
 
+        # `in` a tuple, because a wrong value need not be hashable.
         _require('scenario', self.scenario, f'one of {", ".join(SCENARIOS)}',
                  self.scenario in tuple(SCENARIOS))
         grade = self.imu_grade
@@ -190,13 +192,13 @@ class Arguments:
         if self.duration * rate > _MAX_SAMPLES:
             raise SimulationError(f'{self.duration:g} s at {rate:g} Hz are too many '
                                   f'samples, the limit is {_MAX_SAMPLES}')
-        for name, of_chip in _OF_CHIP.items():
+        for name, of_chip in _CHIP_ERRORS.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, of_chip if grade == 'chip' else 0.0)
 
     @property
     def imu_noise(self) -> ImuNoise:
-        """Return what the errors of the IMU are drawn from, in SI units."""
+        """Return the noise of the IMU and the sigmas of its constant errors, in SI units."""
         noise = PRESETS[self.imu_grade] if isinstance(self.imu_grade, str) else self.imu_grade
         own = {name: getattr(self, name, None) for name in ImuNoise._fields}
         return noise._replace(**{name: value for name, value in own.items() if value is not None})

@@ -14,14 +14,14 @@
 """
 True motion of a simulated vehicle, and what perfect sensors on it would measure.
 
-Motion is given in closed form, so that truth is known at any instant: a scenario is a function of
-time that gives velocity and attitude, with a continuous angular acceleration and jerk; positions
-come from integrating the velocity. Bodies are FLU, axes ENU, angles radians, yaw
+A scenario is a function of time that gives velocity and attitude in closed form, so that the truth
+is known at any instant; angular acceleration and jerk are continuous. Positions come from
+integrating the velocity. Body axes are forward-left-up, velocities ENU, angles radians, yaw is
 counter-clockwise from east.
 
-The IMU's readings come from python-ins (PyPI), which derives them from a trajectory with its own
-Earth model. The antenna is evaluated at the very instant of measurement, which need not be that
-of an IMU sample.
+The IMU's readings come from python-ins (PyPI), which derives them from the trajectory with its own
+Earth model. The antenna's motion is computed at the instants of the GNSS measurements, which need
+not be those of IMU samples.
 """
 
 from __future__ import annotations
@@ -36,23 +36,22 @@ from ins_align.geometry.rotation import Array, cross, log_so3, matrix_from_rpy
 from ins_align.gnss.messages import ENU_FROM_NED
 import numpy as np
 
-_Rows = Sequence[tuple[float, float, float]]
-
 _GRAVITY = 9.81     # m/s^2, for banking only
-_LEAD_IN = 1000.0   # s of motion before t = 0 that a profile can be asked for
+_MARGIN = 1000.0    # s for which a profile is defined before its start and after its end
 
-# Rows of (duration in s, acceleration in m/s^2, turn rate in rad/s); a block ends at rest.
+# Rows of duration in s, acceleration in m/s^2 and turn rate in rad/s, from rest to rest.
+_Rows = Sequence[tuple[float, float, float]]
 _CITY = ((1.0, 0.0, 0.0), (6.0, 2.0, 0.0), (5.0, 0.0, 0.0), (3.0, -2.0, 0.0),
          (5.2, 0.0, 0.3), (4.0, 2.0, 0.0), (6.0, 0.0, 0.05), (4.0, -2.0, 0.0),
          (4.5, 0.0, -0.35), (4.0, 1.5, 0.0), (5.0, 0.0, -0.06), (6.0, -2.0, 0.0),
          (4.0, 0.0, 0.0))
-# A robot turns on the spot too.
+# A robot also turns on the spot.
 _YARD = ((1.0, 0.0, 0.0), (1.5, 0.5, 0.0), (12.0, 0.0, 0.0), (1.5, -0.5, 0.0), (3.2, 0.0, 1.0),
          (1.5, 0.4, 0.0), (8.0, 0.0, 0.15), (6.0, 0.0, -0.2), (1.5, -0.4, 0.0), (3.0, 0.0, -0.7),
          (2.0, 0.0, 0.0), (2.0, -0.2, 0.0), (3.0, 0.0, 0.2), (2.0, 0.2, 0.0))
 _BACK_OUT = ((2.0, 0.0, 0.0), (2.0, -0.75, 0.0), (5.0, 0.0, 0.25), (2.0, 0.75, 0.0),
              (1.0, 0.0, 0.0))
-_THROW = ((2.0, 0.5, 3.5), (0.0, 30.0, 0.0))  # durations, accelerations
+_THROW = ((2.0, 0.5, 3.5), (0.0, 30.0, 0.0))  # durations in s, accelerations in m/s^2
 _CIRCUIT = ((7.0, 0.0, 0.35), (3.0, 0.0, 0.0), (7.0, 0.0, -0.35), (4.0, 0.0, 0.1))
 
 
@@ -60,28 +59,28 @@ class Motion(NamedTuple):
     """Velocity of the IMU and attitude of the vehicle at n instants."""
 
     velocity: Array  # (n, 3), ENU, m/s
-    rpy: Array       # (n, 3), roll, pitch, yaw
+    rpy: Array       # (n, 3), roll, pitch, yaw, rad
 
 
 class Scenario(NamedTuple):
     """One kind of motion."""
 
-    motion: Callable[[Array, float], Motion]  # of times (n,), and how long it must last, s
-    duration: float  # s, unless told otherwise
-    set_off: float   # s from a stand still to full motion
+    motion: Callable[[Array, float], Motion]  # of times (n,) and the duration, s
+    duration: float  # s, by default
+    set_off: float   # s from standstill to full motion
 
 
 def motion_of(time: Array, scenario: Scenario, duration: float, heading: float, crab: float,
               stand_still: float) -> Motion:
     """
-    Return the motion of a scenario at times (n,), for so many seconds.
+    Return the motion of a scenario at times (n,), s.
 
-    Heading turns the whole trajectory about the vertical, crab the nose alone; the motion begins
-    after some seconds at rest.
+    Heading turns the whole trajectory about the vertical, crab the attitude only, rad. The vehicle
+    sets off after `stand_still` seconds at rest.
     """
     pace = np.ones_like(time)
     if stand_still > 0:
-        # The same path, passed along slowly at first.
+        # The vehicle follows the same path, slowly at first.
         pace = _step(time, stand_still, scenario.set_off)
         time = _step_integral(time, stand_still, scenario.set_off)
     velocity, rpy = scenario.motion(time, duration)
@@ -90,25 +89,27 @@ def motion_of(time: Array, scenario: Scenario, duration: float, heading: float, 
 
 
 def _step(time: Array, start: float, width: float) -> Array:
-    """Go from 0 to 1 with two continuous derivatives."""
+    """Return a step from 0 to 1 within `width`, with two continuous derivatives."""
     x = np.clip((time - start) / width, 0.0, 1.0)
     return x ** 3 * (10 - 15 * x + 6 * x ** 2)
 
 
 def _step_integral(time: Array, start: float, width: float) -> Array:
+    """Return the integral of `_step`."""
     x = np.clip((time - start) / width, 0.0, 1.0)
     return width * x ** 4 * (2.5 - 3 * x + x ** 2) + np.maximum(time - start - width, 0.0)
 
 
 def _profile(durations: Sequence[float], values: Sequence[float], width: float) -> Any:
-    """Make a PPoly that steps smoothly, within `width`, to each of the values in turn."""
+    """Return a PPoly that holds each value for its duration, with smooth steps between them."""
     from scipy.interpolate import PPoly
 
     ends = np.cumsum(durations)
     starts = np.concatenate([[0.0], ends[:-1]])
     steps = np.diff(values, prepend=0.0)
-    breaks = np.concatenate([[-_LEAD_IN], np.column_stack([starts, starts + width]).ravel(),
-                             [ends[-1] + _LEAD_IN]])
+    # A constant piece from before t = 0, then a step and a constant piece for each value.
+    breaks = np.concatenate([[-_MARGIN], np.column_stack([starts, starts + width]).ravel(),
+                             [ends[-1] + _MARGIN]])
     coefficients = np.zeros((6, len(breaks) - 1))
     smooth = slice(1, None, 2)
     coefficients[0, smooth] = 6 * steps / width ** 5
@@ -121,7 +122,7 @@ def _profile(durations: Sequence[float], values: Sequence[float], width: float) 
 
 @lru_cache(maxsize=8)
 def _course(first: _Rows, block: _Rows, duration: float, width: float) -> tuple[Any, Any]:
-    """Acceleration and turn rate of `first` and then `block` again and again."""
+    """Return acceleration and turn rate, as PPoly, of `first` and then repetitions of `block`."""
     rows = list(first)
     length = sum(row[0] for row in first)
     while length < duration:
@@ -132,7 +133,7 @@ def _course(first: _Rows, block: _Rows, duration: float, width: float) -> tuple[
 
 
 def _along(speed: Array, yaw: Array, climb: Array) -> Array:
-    """Velocity of `speed` along a course and a climb angle."""
+    """Return the ENU velocity, (n, 3), of a speed along a course and a climb angle, (n,)."""
     level = speed * np.cos(climb)
     return np.stack([level * np.cos(yaw), level * np.sin(yaw), speed * np.sin(climb)], axis=-1)
 
@@ -157,9 +158,9 @@ def _flight(time: Array, duration: float) -> Motion:
 def _road(time: Array, duration: float, first: _Rows = (), block: _Rows = _CITY,
           bumps: float = 1.0) -> Motion:
     """
-    Drive a block again and again, by default of streets and corners, after what comes first.
+    Drive the rows of `first`, then repeat `block`, by default city streets with corners.
 
-    `bumps` says how many times closer together slopes and bumps are than those of streets.
+    Slopes and bumps are `bumps` times closer together than those of streets.
     """
     acceleration, rate = _course(first, block, duration, 0.8)
     speed_along = acceleration.antiderivative()
@@ -187,6 +188,7 @@ def _launch(time: Array, duration: float) -> Motion:
 
 def _hover(time: Array, duration: float) -> Motion:
     """Wander about a point as a quadrotor does: it leans where it accelerates, yaws slowly."""
+    # Axis, amplitude in m/s, period in s, phase.
     waves = ((0, 0.7, 7.3, 0.3), (0, 0.5, 12.1, 1.1), (1, 0.8, 9.1, 2.0), (1, 0.4, 5.9, 0.0),
              (2, 0.2, 8.3, 0.7))
     velocity = np.zeros((len(time), 3))
@@ -204,7 +206,7 @@ def _hover(time: Array, duration: float) -> Motion:
 
 def _steady(time: Array, duration: float, speed: float,
             waves: Sequence[tuple[int, float, float, float]] = ()) -> Motion:
-    """Hold speed and course; waves (axis, amplitude, period, phase) swing the attitude alone."""
+    """Hold speed and course; waves (axis, amplitude, period, phase) turn only the attitude."""
     rpy = np.zeros((len(time), 3))
     for axis, *wave in waves:
         rpy[:, axis] += _wave(time, *wave)
@@ -235,22 +237,22 @@ SCENARIOS = {
 FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
 START_NS = 1_750_000_000_000_000_000  # stamp of t = 0
 
-# Splines are inexact at their ends: so many samples more on both sides are thrown away. An error
-# there falls by 0.27 per sample.
+# Splines are inexact at their ends, with an error that falls by a factor of 0.27 per sample: so
+# many more samples are computed on both sides and left out.
 _PADDING = 32
 _JITTER_SEED = 1
-_RATE_STEP = 1e-3  # s
+_RATE_STEP = 1e-3  # s, of the numerical derivative of the attitude
 
 
 def displaced(lla: Array, offset: Array) -> Array:
-    """Move positions (n, 3) in degrees and m by offsets (n, 3) in ENU of some metres."""
+    """Return positions (n, 3), degrees and m, moved by small offsets (n, 3), ENU, m."""
     from pyins.transform import perturb_lla
 
     return perturb_lla(lla, offset @ ENU_FROM_NED)
 
 
 def wrapped(lla: Array) -> Array:
-    """Bring longitudes into [-180, 180)."""
+    """Return positions (n, 3), degrees and m, with longitudes in [-180, 180)."""
     result = lla.copy()
     result[:, 1] = (result[:, 1] + 180.0) % 360.0 - 180.0
     return result
@@ -258,9 +260,10 @@ def wrapped(lla: Array) -> Array:
 
 class Trajectory(NamedTuple):
     """
-    What does not depend on noise, mount and antenna; v is the vehicle, forward-left-up.
+    Motion of a vehicle and perfect IMU samples, independent of mounting, noise and antenna.
 
-    N samples at the IMU's instants; velocities ENU, positions in degrees, degrees, metres.
+    N samples at the IMU's instants, in the vehicle's frame v, forward-left-up; velocities are ENU,
+    m/s, positions degrees, degrees, metres.
     """
 
     motion: Callable[[Array], Motion]
@@ -268,12 +271,12 @@ class Trajectory(NamedTuple):
     C_nv: Array              # (N, 3, 3)
     velocity: Array          # (N, 3)
     lla: Array               # (N, 3), longitude in [-180, 180)
-    gyro: Array              # (N, 3)
-    accel: Array             # (N, 3)
-    lla_spline: Callable[[Array], Array]  # (n, 3), longitude continuous
+    gyro: Array              # (N, 3), rad/s
+    accel: Array             # (N, 3), specific force, m/s^2
+    lla_spline: Callable[[Array], Array]  # of times (n,), (n, 3), longitude continuous
 
     def antenna(self, time: Array, C_vb: Array, lever_arm: Array) -> tuple[Array, Array]:
-        """Position (n, 3) in degrees and m and velocity (n, 3) in ENU of the antenna."""
+        """Return the antenna's position, degrees and m, and ENU velocity at times (n,)."""
         from pyins.earth import principal_radii
 
         velocity, rpy = self.motion(time)
@@ -306,7 +309,7 @@ def trajectory_of(
         scenario: str, duration: float, imu_rate: float, imu_jitter: float, latitude_deg: float,
         longitude_deg: float, altitude: float, heading_deg: float, crab_deg: float,
         stand_still: float) -> Trajectory:
-    """Make the trajectory of `simulate`'s arguments; the last few are kept, read-only."""
+    """Return the trajectory for arguments of `simulate`; the last few are kept, read-only."""
     from pyins.earth import principal_radii
     from pyins.sim import generate_imu
     from pyins.transform import mat_from_rph
@@ -323,6 +326,7 @@ def trajectory_of(
     time = stamps * 1e-9
     velocity, rpy = motion(time)
     roll, pitch, yaw = np.degrees(rpy).T
+    # The trajectory begins before t = 0, with the padding, and is at the given place at t = 0.
     before = velocity[:_PADDING + 1].mean(axis=0, keepdims=True) * time[0]
     start = displaced(np.array([[latitude_deg, longitude_deg, altitude]]), before)
     truth, imu = generate_imu(time, start[0], np.stack([roll, -pitch, 90 - yaw], axis=-1),

@@ -14,8 +14,8 @@
 """
 Simulated recordings: sensors of a moving vehicle with truth.
 
-Perfect sensors come from `scenarios`; here they get their errors, the GNSS receiver its rate,
-latency, outages and outliers, and the whole becomes a recording.
+Perfect readings come from `scenarios`. This module adds the errors of the IMU, the noise, latency,
+outages and outliers of the GNSS receiver, and writes the recording.
 """
 
 from __future__ import annotations
@@ -36,11 +36,12 @@ from ins_align.config import Config, ImuNoise, PRESETS
 from ins_align.geometry.rotation import Array, matrix_from_rpy, quaternion_from_matrix
 from ins_align.gnss.messages import ENU_FROM_NED, Fix, Velocity
 from ins_align.simulation import scenarios
-from ins_align.simulation.arguments import Arguments, IMU_AXES, LATENESS_MARGIN, SimulationError
+from ins_align.simulation.arguments import (
+    Arguments, AXIS_SIGNS, LATENESS_MARGIN, SimulationError)
 from ins_align.simulation.scenarios import displaced, START_NS, Trajectory, trajectory_of, wrapped
 import numpy as np
 
-# Those that campaigns draw from: with one more all their runs would be others.
+# Scenarios that the experiments draw from: one more would change all their runs.
 SCENARIOS = tuple(scenarios.SCENARIOS)[:8]
 STORAGES = ('mcap', 'sqlite3')
 TOPICS = {'/imu/data_raw': 'sensor_msgs/msg/Imu', '/reference/imu': 'sensor_msgs/msg/Imu',
@@ -49,7 +50,7 @@ TOPICS = {'/imu/data_raw': 'sensor_msgs/msg/Imu', '/reference/imu': 'sensor_msgs
           '/tf_static': 'tf2_msgs/msg/TFMessage'}
 PACKAGES = ('builtin_interfaces/', 'std_msgs/', 'geometry_msgs/', 'sensor_msgs/', 'tf2_msgs/')
 
-_TRUTH_STD = 1e-6  # rad, stated on the reference topic: zero would mean unknown
+_TRUTH_STD = 1e-6  # rad, stated on the reference topic, where zero would mean unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +81,7 @@ class Simulation:
     gyro_bias: Array                # (3,), rad/s, at the first sample
     accel_bias: Array               # (3,), m/s^2
     lever_arm: Array                # (3,), IMU to antenna in the IMU frame, m
-    imu_noise: ImuNoise             # what the errors are drawn from
+    imu_noise: ImuNoise             # noise, and the sigmas of the constant errors
     gyro_std: float                 # rad/s per sample
     accel_std: float                # m/s^2 per sample
     meta: dict[str, Any]            # the arguments of `simulate`
@@ -96,9 +97,9 @@ class Simulation:
 
     def messages(self) -> Iterator[tuple[str, Any]]:
         """
-        Yield what a subscriber gets, in the order of arrival.
+        Yield messages as a subscriber gets them, in the order of arrival.
 
-        Each is 'imu' with the samples since the message before (stamps (n,), gyro (n, 3), accel
+        Each is 'imu' with the samples since the last GNSS epoch (stamps (n,), gyro (n, 3), accel
         (n, 3)), 'fix' with a `Fix`, or 'velocity' with a `Velocity`.
         """
         upto = np.searchsorted(self.imu_stamps_ns, self.gnss_arrival_ns, side='right')
@@ -119,12 +120,12 @@ class Simulation:
                    self.position_covariance, 0)
 
     def velocity_measurement(self, k: int) -> Velocity:
-        """Return the velocity of GNSS epoch k as a message, whatever its frame taken for ENU."""
+        """Return the velocity of GNSS epoch k as a message, taken for ENU even if it is NED."""
         return Velocity(int(self.gnss_stamps_ns[k]), self.velocity[k], self.velocity_covariance)
 
 
 def give(aligner: Any, kind: str, payload: Any) -> None:
-    """Give an aligner one of the messages of a simulation."""
+    """Pass one of `Simulation.messages` to an aligner."""
     if kind == 'imu':
         aligner.add_imu(*payload)
     else:
@@ -135,54 +136,53 @@ def simulate(scenario: str, **options: Any) -> Simulation:
     """
     Simulate the sensors of a vehicle that moves as one of `SCENARIOS`.
 
-    The options are the fields of `Arguments`, in SI units but where the name says degrees; what
-    makes no sense raises SimulationError.
+    The options are the fields of `Arguments`, in SI units except where the name says degrees. A
+    SimulationError says which one makes no sense.
     """
-    asked = Arguments(scenario, **options)
-    trajectory = trajectory_of(scenario, *(float(getattr(asked, name)) for name in (
+    args = Arguments(scenario, **options)
+    trajectory = trajectory_of(scenario, *(float(getattr(args, name)) for name in (
         'duration', 'imu_rate', 'imu_jitter', 'latitude_deg', 'longitude_deg', 'altitude',
         'heading_deg', 'crab_deg', 'stand_still')))
-    streams = [np.random.default_rng(child)
-               for child in np.random.SeedSequence(int(asked.seed)).spawn(6)]
-    C_vb = matrix_from_rpy(np.radians(asked.mount_rpy_deg))
-    lever_b = np.array(asked.lever_arm, dtype=float)
+    streams = np.random.default_rng(int(args.seed)).spawn(6)
+    C_vb = matrix_from_rpy(np.radians(args.mount_rpy_deg))
+    lever_b = np.array(args.lever_arm, dtype=float)
     return Simulation(
         truth_stamps_ns=trajectory.stamps_ns, truth_C_nb=trajectory.C_nv @ C_vb,
         truth_velocity=trajectory.velocity, truth_lla=trajectory.lla, lever_arm=lever_b,
-        meta=dict(vars(asked)), _trajectory=trajectory, _C_vb=C_vb,
-        **_imu(asked, trajectory, C_vb, streams),
-        **_gnss(asked, trajectory, C_vb, lever_b, streams))
+        meta=dict(vars(args)), _trajectory=trajectory, _C_vb=C_vb,
+        **_imu(args, trajectory, C_vb, streams),
+        **_gnss(args, trajectory, C_vb, lever_b, streams))
 
 
-def _imu(asked: Arguments, trajectory: Trajectory, C_vb: Array,
+def _imu(args: Arguments, trajectory: Trajectory, C_vb: Array,
          streams: list[np.random.Generator]) -> dict[str, Any]:
-    """Return what the IMU reads, and its errors."""
-    noise, scale = asked.imu_noise, 0.0 if asked.ideal else 1.0
+    """Return the fields of `Simulation` that hold the IMU's readings and its errors."""
+    noise, scale = args.imu_noise, 0.0 if args.ideal else 1.0
     truth_gyro, truth_accel = trajectory.gyro @ C_vb, trajectory.accel @ C_vb
     gyro_bias = scale * noise.gyro_bias_std * streams[0].standard_normal(3)
     accel_bias = scale * noise.accel_bias_std * streams[0].standard_normal(3)
-    if asked.accel_bias is not None:
-        accel_bias = scale * np.array(asked.accel_bias, dtype=float)
+    if args.accel_bias is not None:
+        accel_bias = scale * np.array(args.accel_bias, dtype=float)
         noise = noise._replace(accel_bias_std=max(
-            noise.accel_bias_std, float(np.sqrt(np.mean(np.square(asked.accel_bias))))))
+            noise.accel_bias_std, float(np.sqrt(np.mean(np.square(args.accel_bias))))))
     gyro_matrix, accel_matrix = (
         np.eye(3) + scale * scale_std * np.diag(streams[0].standard_normal(3))
         + scale * misalignment_std * (1 - np.eye(3)) * streams[0].standard_normal((3, 3))
         for scale_std, misalignment_std in (
-            (asked.gyro_scale_std, asked.gyro_misalignment_std),
-            (asked.accel_scale_std, asked.accel_misalignment_std)))
+            (args.gyro_scale_std, args.gyro_misalignment_std),
+            (args.accel_scale_std, args.accel_misalignment_std)))
     walk = _random_walk(trajectory.stamps_ns * 1e-9, scale * noise.rate_random_walk, streams[0])
-    gyro_std = scale * noise.angle_random_walk * math.sqrt(asked.imu_rate)
-    accel_std = scale * noise.velocity_random_walk * math.sqrt(asked.imu_rate)
-    sign = np.array(IMU_AXES[asked.flip_axis])
+    gyro_std = scale * noise.angle_random_walk * math.sqrt(args.imu_rate)
+    accel_std = scale * noise.velocity_random_walk * math.sqrt(args.imu_rate)
+    sign = np.array(AXIS_SIGNS[args.flip_axis])
     shape = truth_gyro.shape
-    gyro = sign * IMU_AXES[asked.flip_gyro] * (
+    gyro = sign * AXIS_SIGNS[args.flip_gyro] * (
         truth_gyro @ gyro_matrix.T + gyro_bias + walk
         + gyro_std * streams[1].standard_normal(shape))
-    accel = asked.accel_sign * sign * (truth_accel @ accel_matrix.T + accel_bias
-                                       + accel_std * streams[2].standard_normal(shape))
-    for reading, dead_band, quantum in zip((gyro, accel), asked.dead_band, asked.quantum):
-        if not asked.ideal:
+    accel = args.accel_sign * sign * (truth_accel @ accel_matrix.T + accel_bias
+                                      + accel_std * streams[2].standard_normal(shape))
+    if not args.ideal:
+        for reading, dead_band, quantum in zip((gyro, accel), args.dead_band, args.quantum):
             reading[np.abs(reading) < dead_band] = 0.0
             if quantum > 0:
                 np.rint(reading / quantum, out=reading)
@@ -193,55 +193,55 @@ def _imu(asked: Arguments, trajectory: Trajectory, C_vb: Array,
             'accel_std': accel_std}
 
 
-def _gnss(asked: Arguments, trajectory: Trajectory, C_vb: Array, lever_b: Array,
+def _gnss(args: Arguments, trajectory: Trajectory, C_vb: Array, lever_b: Array,
           streams: list[np.random.Generator]) -> dict[str, Any]:
-    """Return what the receiver sends."""
-    scale = 0.0 if asked.ideal else 1.0
-    stamps, time = _gnss_epochs(asked)
+    """Return the fields of `Simulation` that hold what the receiver sends."""
+    scale = 0.0 if args.ideal else 1.0
+    stamps, time = _gnss_epochs(args)
     lla, velocity = trajectory.antenna(time, C_vb, lever_b)
-    vertical = asked.velocity_std_vertical
-    velocity_sigma = np.array([asked.velocity_std, asked.velocity_std,
-                               asked.velocity_std if vertical is None else vertical])
-    position_sigma = asked.position_std * np.array([1.0, 1.0, 2.0])
-    outlier = streams[4].random(len(time)) < asked.outlier_rate
+    vertical = args.velocity_std_vertical
+    velocity_sigma = np.array([args.velocity_std, args.velocity_std,
+                               args.velocity_std if vertical is None else vertical])
+    position_sigma = args.position_std * np.array([1.0, 1.0, 2.0])
+    outlier = streams[4].random(len(time)) < args.outlier_rate
     direction = streams[4].standard_normal((len(time), 3))
     direction *= (outlier / np.linalg.norm(direction, axis=1))[:, None]
     velocity = (velocity + scale * velocity_sigma * streams[3].standard_normal(velocity.shape)
-                + asked.outlier_velocity * direction)
+                + args.outlier_velocity * direction)
     offset = (scale * position_sigma * streams[3].standard_normal(lla.shape)
-              + asked.outlier_position * direction)
-    if not asked.ideal:
-        # The last draws of a stream each, so that they change nothing else.
-        for error, std, stream in ((offset, asked.position_drift_std, streams[3]),
-                                   (velocity, asked.velocity_drift_std, streams[5])):
-            error += gauss_markov(stamps * 1e-9, std, asked.gnss_correlation, stream)
+              + args.outlier_position * direction)
+    if not args.ideal:
+        # Drawn last from their streams, so that they change no other error.
+        for error, std, stream in ((offset, args.position_drift_std, streams[3]),
+                                   (velocity, args.velocity_drift_std, streams[5])):
+            error += gauss_markov(stamps * 1e-9, std, args.gnss_correlation, stream)
     lla = wrapped(displaced(lla, offset))
     velocity_covariance = np.diag(velocity_sigma ** 2)
-    if asked.velocity_frame == 'ned':
+    if args.velocity_frame == 'ned':
         velocity = velocity @ ENU_FROM_NED
         velocity_covariance = ENU_FROM_NED @ velocity_covariance @ ENU_FROM_NED
     gnss_stamps_ns = START_NS + stamps
     return {'gnss_stamps_ns': gnss_stamps_ns,
-            'gnss_arrival_ns': gnss_stamps_ns + round(asked.gnss_latency * 1e9),
+            'gnss_arrival_ns': gnss_stamps_ns + round(args.gnss_latency * 1e9),
             'lla_deg': lla, 'velocity': velocity, 'velocity_covariance': velocity_covariance,
             'position_covariance': np.diag(position_sigma ** 2), 'outlier': outlier}
 
 
-def _gnss_epochs(asked: Arguments) -> tuple[np.ndarray, Array]:
-    """Stamps in ns and true instants of measurement in s since the start."""
-    count = max(int((asked.duration - asked.gnss_phase) * asked.gnss_rate + 1e-6) + 1, 0)
-    stamps = np.rint((asked.gnss_phase + np.arange(count) / asked.gnss_rate) * 1e9).astype(
+def _gnss_epochs(args: Arguments) -> tuple[np.ndarray, Array]:
+    """Return stamps, ns, and true instants of measurement, s, since the start."""
+    count = max(math.floor((args.duration - args.gnss_phase) * args.gnss_rate + 1e-6) + 1, 0)
+    stamps = np.rint((args.gnss_phase + np.arange(count) / args.gnss_rate) * 1e9).astype(
         np.int64)
     seconds = stamps * 1e-9
-    received = seconds >= asked.gnss_delay
-    for start, end in asked.outages:
+    received = seconds >= args.gnss_delay
+    for start, end in args.outages:
         received &= (seconds < start) | (seconds >= end)
-    return stamps[received], seconds[received] - asked.gnss_delay
+    return stamps[received], seconds[received] - args.gnss_delay
 
 
 def gauss_markov(time: Array, std: float, correlation_time: float,
                  random: np.random.Generator) -> Array:
-    """First-order Gauss-Markov process (n, 3) of constant variance."""
+    """Return a first-order Gauss-Markov process (n, 3) of constant variance."""
     decay = np.exp(-np.diff(time, prepend=-np.inf) / correlation_time)
     drive = std * np.sqrt(1 - decay ** 2)[:, None] * random.standard_normal((len(time), 3))
     for k in range(1, len(drive)):
@@ -250,7 +250,7 @@ def gauss_markov(time: Array, std: float, correlation_time: float,
 
 
 def _random_walk(time: Array, density: float, random: np.random.Generator) -> Array:
-    """Random walk (n, 3) from 0 on."""
+    """Return a random walk (n, 3) that begins at 0."""
     steps = np.sqrt(np.diff(time, prepend=time[0]))[:, None]
     return np.cumsum(density * steps * random.standard_normal((len(time), 3)), axis=0)
 
@@ -260,13 +260,13 @@ def write_bag(simulation: Simulation, path: str | os.PathLike, storage: str = 'm
     """
     Write a rosbag2 of what a vehicle would have recorded, with truth on `/reference/imu`.
 
-    Messages are in the order of arrival, the receive time being the arrival. Beside the data the
-    bag's directory gets ``ins_align.yaml``, the parameters that suit the recording; the arguments
-    of the simulation and the drawn biases are in the bag's custom data.
+    Messages are in the order of arrival, which is their receive time. The directory also gets
+    ``ins_align.yaml`` with the parameters that suit the recording; the arguments of the simulation
+    and the biases are in the bag's custom data.
 
-    The path becomes a directory, written whole or not at all; SimulationError says that it is
-    there, or that storage is none of `STORAGES`. `tf` writes to `/tf_static`, too, how IMU and
-    antenna are mounted: frames base_link, imu and gnss.
+    The path becomes a directory, written whole or not at all; a SimulationError says that it
+    exists already, or that storage is none of `STORAGES`. `tf` writes the mounting of IMU and
+    antenna to `/tf_static`, too: frames base_link, imu and gnss.
     """
     path = Path(path)
     if storage not in STORAGES:
@@ -308,12 +308,12 @@ def _header(ros: SimpleNamespace, stamp_ns: int, frame: str) -> Any:
     return ros.Header(ros.Time(*divmod(stamp_ns, 1_000_000_000)), frame)
 
 
-# Time of arrival, topic and message.
+# Time of arrival, ns, topic and message.
 _Messages = Iterator[tuple[int, str, Any]]
 
 
 def _static_transforms(simulation: Simulation, ros: SimpleNamespace) -> _Messages:
-    """Yield what a robot publishes of its model."""
+    """Yield the mounting of IMU and antenna."""
     start, C_vb = int(simulation.imu_stamps_ns[0]), simulation._C_vb
     yield start, '/tf_static', ros.TFMessage([
         ros.TransformStamped(_header(ros, start, 'base_link'), child, ros.Transform(
@@ -324,6 +324,7 @@ def _static_transforms(simulation: Simulation, ros: SimpleNamespace) -> _Message
 
 
 def _imu_messages(simulation: Simulation, ros: SimpleNamespace) -> _Messages:
+    """Yield the IMU's readings, and the truth on the reference topic."""
     unknown, exact = np.array([-1.0] + 8 * [0.0]), np.zeros(9)
     truth, gyro_covariance, accel_covariance = (
         (std ** 2 * np.eye(3)).ravel()
@@ -370,7 +371,7 @@ def noise_parameters(noise: ImuNoise) -> dict[str, float]:
 
 
 def _parameter_file(simulation: Simulation) -> str:
-    """Return the node's YAML with what is known of the recording."""
+    """Return a parameter file of the node that suits the recording."""
     meta = simulation.meta
     values = {'lever_arm': simulation.lever_arm.tolist(), 'gnss_delay': float(meta['gnss_delay']),
               'velocity_frame': meta['velocity_frame']}
@@ -379,7 +380,7 @@ def _parameter_file(simulation: Simulation) -> str:
         values['gnss_lateness'] = lateness
     grade = meta['imu_grade']
     values['imu_grade'] = grade if grade in PRESETS else 'custom'
-    # Noise that is less than a preset's is covered by it.
+    # Only what exceeds the preset is stated.
     covered = noise_parameters(PRESETS.get(grade, ImuNoise(0.0, 0.0, 0.0, 0.0)))
     values |= {name: value for name, value in noise_parameters(simulation.imu_noise).items()
                if value > covered[name]}
