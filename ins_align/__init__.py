@@ -35,8 +35,8 @@ Names
 are integer nanoseconds. Attitude errors are small rotations about the axes of ENU (left errors):
 ``C_nb = exp_so3(phi) C_nb_estimated``.
 
-Chain rule: ``C_nb(t) = C_n0n(t)^T C_nb(0) C_b0b(t)``; the one unknown is ``C_nb(0)``, the
-initial attitude.
+Chain rule: ``C_nb(t) = C_n0n(t)^T C_nb(0) C_b0b(t)``; the unknown is the initial attitude
+``C_nb(0)``.
 """
 
 from importlib import import_module
@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from ins_align.results import Attitude, Epoch, State, Status
     from ins_align.simulation.simulate import simulate
 
-# The public names and where they are. They are imported when they are used (PEP 562), so that
-# nobody needs what only another name needs: a robot no rosbags, the help of a command no numpy.
+# The public names and their modules, which are imported when a name is used (PEP 562): a robot
+# needs no rosbags, and the help of a command does not load numpy.
 _MODULES = {
     'align': 'offline', 'Aligner': 'aligner', 'Attitude': 'results', 'Config': 'config',
     'ConfigError': 'config', 'Epoch': 'results', 'Fix': 'gnss.messages',

@@ -14,13 +14,14 @@
 """
 The aligner: messages in, attitudes and states out.
 
-A message's way, in eight steps: 1 the caller turns it into numbers (`gnss.messages`,
-`ros.inputs`, `recordings.decode`); 2 it waits in a queue until nothing late can precede it;
-3 queue and antenna give an epoch; 4 preintegration gives the IMU's interval before it; 5 the bank
-propagates and updates; 6 the rivals are heard; 7 the declaration decides; 8 an `Epoch` goes out.
+A message is processed in eight steps: 1 the caller turns it into numbers (`gnss.messages`,
+`ros.inputs`, `recordings.decode`); 2 it is queued until no late message can precede it; 3 GNSS
+messages become an epoch of the antenna; 4 the IMU samples before the epoch are preintegrated;
+5 the method, as a rule the bank of filters, propagates and updates; 6 the rival hypotheses are
+compared; 7 the declaration decides on the state; 8 an `Epoch` is returned.
 
-An epoch is processed when IMU samples `gnss_lateness` newer than it have come, so that the results
-depend on the messages alone and not on when `update` is called.
+An epoch is processed when the IMU is `gnss_lateness` ahead of it, so that the results depend on
+the messages alone and not on when `update` is called.
 """
 
 from collections import Counter
@@ -43,53 +44,54 @@ import numpy as np
 
 __all__ = ['Aligner', 'Attitude', 'Epoch', 'State', 'Status']
 
-# Without GNSS there is an epoch without measurement this often, which bounds the queues (ns).
+# During a GNSS outage an epoch without measurement is inserted at this interval, which bounds the
+# queues (ns).
 DRY_INTERVAL_NS = 2_000_000_000
-# Positions alone are used when no velocity came for this long (ns).
+# An alignment starts with positions alone if no velocity came for this long after the first (ns).
 NO_VELOCITY_NS = 2_000_000_000
-MAX_WARNINGS = 100      # different sentences about messages that could not be used
-# Why messages were left out, by the end of the name under which they are counted.
+MAX_WARNINGS = 100      # different texts about messages that could not be used
+# Why messages were left out, by the ending of the name of their count.
 _LEFT_OUT = {'no_fix': 'without a fix', 'undecodable': 'that cannot be decoded',
              'nan': 'without numbers or with impossible ones',
              'duplicate': 'with the stamp of another (does the driver set stamps?)',
              'late': 'further behind the IMU than gnss_lateness allows',
              'ahead': 'far ahead of the IMU'}
-_DECLARED = {State.LEVELLED: 1, State.ALIGNED: 2}
+_RANK = {State.LEVELLED: 1, State.ALIGNED: 2}    # of what is declared; 0 in other states
 
 
 class Aligner:
     """
-    In-motion alignment from messages as they come.
+    In-motion alignment from messages, taken in the order of their arrival.
 
-    By default all parameters have their defaults. `base` leads from the vehicle's frame to that of
-    the IMU, of use with ``vehicle``; by default they are the same. The attribute `declared` is the
-    initial attitude as it was declared, None while none is.
+    `config` is by default `Config()`. `base` transforms from the vehicle's base frame to the IMU
+    frame; it is used with ``vehicle`` and by default is the identity. The attribute `declared` is
+    the initial attitude as it was declared, or None while none is declared.
     """
 
     def __init__(self, config: Config | None = None, base: Transform | None = None) -> None:
-        """Wait for the first messages."""
+        """Start without messages."""
         self.config = Config() if config is None else config
         self._base = base
-        self._counts: Counter[str] = Counter()      # of messages, by what became of them
+        self._counts: Counter[str] = Counter()      # messages and epochs, by outcome
         self._events: list[Event] = []
         self._warned: set[str] = set()
-        self._done: list[Epoch] = []                # not returned yet
+        self._done: list[Epoch] = []                # not yet returned by `update`
         self._delay_ns = round(self.config.gnss_delay * 1e9)
-        self._started_over = ''                     # why, until the next epoch
+        self._started_over = ''                     # the reason; '' from the next epoch on
         self._method: Bank | NoteMethod | None = None
         self._forget_all()
 
     def _forget_all(self) -> None:
-        """Forget everything but the counts."""
+        """Forget everything but the counts, events and finished epochs."""
         lateness_ns = round(self.config.gnss_lateness * 1e9) + max(self._delay_ns, 0)
         self._imu = ImuBuffer(lateness_ns, self._counts, self.config.imu_noise)
         self._gnss = GnssBuffer(lateness_ns, self._counts, max(-self._delay_ns, 0))
-        self._refusal = ''                          # why velocities cannot be used
+        self._refusal = ''                          # why the last velocity could not be used
         self._first_t0_ns: int | None = None
         self._forget(None)
 
     def _forget(self, learnt: Learnt | None) -> None:
-        """Wait for another t0; the queues stay, and what was learnt of sensors and antenna."""
+        """Drop the alignment and wait for a new t0; keep the queues and `learnt` for its start."""
         if self._method is not None:
             self._counts.update(_epoch_counts(self._method))
         self._learnt = learnt
@@ -99,10 +101,10 @@ class Aligner:
         self._force_check = ForceCheck()
         self._counts_before = Counter(self._counts)
         self._first_fix_ns: int | None = None
-        self._lined_up: list[AntennaEpoch] = []     # epochs that wait for steps 4 to 8
-        self._last_ns: int | None = None            # the last epoch since t0; None before it
-        self._start_ns = self._measured_ns = 0      # t0 before it moves; the last measurement
-        self._without_velocity = False              # though velocities came
+        self._queued: list[AntennaEpoch] = []       # epochs that wait for steps 4 to 8
+        self._last_ns: int | None = None            # stamp of the last epoch; None before t0
+        self._start_ns = self._measured_ns = 0      # first epoch; last one with a measurement
+        self._without_velocity = False              # although velocity messages came
         since = 'since it started over' if self._started_over else 'yet'
         self._verdict = Verdict(State.WAITING_FOR_IMU, f'no IMU sample {since}')
         self._time_to_align_s: float | None = None
@@ -121,7 +123,7 @@ class Aligner:
         if not isinstance(stamp_ns, np.ndarray):
             self._add_sample(stamp_ns, gyro, accel)
             return
-        # Copies: they are used later.
+        # Copies, because the samples are used later.
         stamps_ns = np.array(stamp_ns, np.int64)
         gyro, accel = np.array(gyro, float), np.array(accel, float)
         if not self._imu.add_in_order(stamps_ns, gyro, accel):
@@ -132,9 +134,11 @@ class Aligner:
         if self._imu.add(stamp_ns, gyro, accel):
             return
         since = self._imu.held
-        self._process()                             # what could have been asked for before
+        # Epochs from before the jump, which an earlier `update` could have returned.
+        self._process()
         self._counts['clock_jumps'] += 1
-        # A recording that is played again says nothing new: what it said before is no prior.
+        # Sensor errors that were learnt are dropped: if a recording is played again, they come
+        # from the same data and are no independent prior.
         self._start_over('the clock of the IMU jumped back')
         for held_ns, values in since:
             self._imu.add(held_ns, values[:3], values[3:])
@@ -153,7 +157,7 @@ class Aligner:
                        self._imu.newest_ns)
 
     def reject(self, reason: str, why: str = '') -> None:
-        """Count a message that the caller could not use; `why`, in words, is an event, once."""
+        """Count a message that the caller could not use; `why`, in words, is an event once."""
         self._counts[reason] += 1
         self._refusal = why or self._refusal
         if why and why not in self._warned and len(self._warned) < MAX_WARNINGS:
@@ -161,44 +165,45 @@ class Aligner:
             self._events.append(Event(Severity.WARNING, why))
 
     def reset(self, reason: str = 'on request') -> None:
-        """Start over, with nothing known; the reason in words."""
+        """Start over from nothing, for a reason in words."""
         self._counts['resets'] += 1
         self._start_over(reason)
 
     def _start_over(self, why: str) -> None:
-        self._say_start_over(why)
+        self._announce_restart(why)
         self._forget_all()
 
-    def _say_start_over(self, why: str) -> None:
+    def _announce_restart(self, why: str) -> None:
         self._started_over = f'alignment starts over: {why}'
         self._events.append(Event(Severity.WARNING, self._started_over))
 
     def reconfigure(self, config: Config) -> None:
-        """Change thresholds and hold time; ConfigError if anything else differs."""
-        for own in dataclasses.fields(Config):
-            if own.metadata['read_only'] and (getattr(config, own.name)
-                                              != getattr(self.config, own.name)):
-                raise ConfigError(f'{own.name} cannot change while running: set it at start')
+        """Change thresholds and hold time; a ConfigError says if another parameter differs."""
+        for field in dataclasses.fields(Config):
+            name = field.name
+            if field.metadata['read_only'] and getattr(config, name) != getattr(self.config, name):
+                raise ConfigError(f'{name} cannot change while running: set it at start')
         self.config = self._declaration.config = config
 
     # Processing: steps 3 to 8
 
     def update(self, dry: bool = False, last: bool = False) -> list[Epoch]:
         """
-        Process what nothing late can precede any more; return the epochs since the last call.
+        Process the queued messages that no late one can precede; return the new epochs.
 
-        `dry`: with those without measurement that divide an outage; `last`: nothing more comes.
+        With `dry`, epochs without measurement that divide an outage are returned as well. `last`
+        says that no more messages come, so that all that are queued are processed.
         """
         self._process(last)
         done, self._done = self._done, []
         return [epoch for epoch in done if dry or not epoch.dry]
 
     def flush(self, dry: bool = False) -> list[Epoch]:
-        """Process the rest, at the end of a recording; otherwise as `update`."""
+        """Process all queued messages, at the end of a recording; otherwise as `update`."""
         return self.update(dry, last=True)
 
     def _process(self, last: bool = False) -> None:
-        """Process the messages that wait, as far as nothing late can precede them any more."""
+        """Process the queued messages that no late one can precede, or with `last` all."""
         upto_ns = self._imu.settled_ns(last)
         if upto_ns is None:
             if left_out := self._left_out('imu'):
@@ -206,13 +211,13 @@ class Aligner:
             return
         for message in self._gnss.release(upto_ns, last):
             self._bridge_outage(message.stamp_ns)
-            self._line_up(message)
+            self._queue(message)
         waiting_ns = self._gnss.oldest_ns
         self._bridge_outage(upto_ns if waiting_ns is None else min(upto_ns, waiting_ns))
         self._align()
         if self._last_ns is not None and self._imu.silent:
             self._counts['imu_gap'] += 1
-            self._lose(NO_SAMPLE)
+            self._restart(NO_SAMPLE)
         if self._last_ns is None:
             self._imu.forget_before(upto_ns)
             if self._imu.silent:
@@ -220,15 +225,15 @@ class Aligner:
             elif self._first_fix_ns is None:
                 self._wait(State.WAITING_FOR_GNSS, 'no GNSS position yet', self._left_out('fix'))
 
-    def _line_up(self, message: GnssEpoch) -> None:
-        """Make an epoch of GNSS messages: t0, or one that follows it."""
+    def _queue(self, message: GnssEpoch) -> None:
+        """Make an epoch of GNSS messages: t0, or one that waits for steps 4 to 8."""
         if self._last_ns is not None and message.stamp_ns <= self._last_ns:
             self._counts['gnss_out_of_order'] += 1
             return
-        # 3. Queue and antenna give an epoch.
+        # 3. GNSS messages become an epoch of the antenna.
         epoch = self._antenna.epoch(message)
         if self._antenna.jumped:
-            self._lose('the position jumped')
+            self._restart('the position jumped')
             epoch = self._antenna.epoch(message)
         if self._last_ns is None:
             if epoch is not None:
@@ -238,32 +243,32 @@ class Aligner:
             if silence := self._imu.silence(self._last_ns, epoch.stamp_ns):
                 self._counts[silence.counter] += 1
                 self._counts['epochs_before_start'] += not epoch.dry
-                self._lose(silence.why)
+                self._restart(silence.why)
             else:
-                self._lined_up.append(epoch)
+                self._queued.append(epoch)
                 self._last_ns = epoch.stamp_ns
 
     def _align(self) -> None:
-        """Take the epochs that are lined up through steps 4 to 8, many at a time."""
-        epochs, self._lined_up = self._lined_up, []
+        """Take the queued epochs through steps 4 to 8, many at a time."""
+        epochs, self._queued = self._queued, []
         method = self._method
         if method is None or not epochs:
             return
         for part in self._imu.parts([epoch.stamp_ns for epoch in epochs]):
-            # 4. Preintegration gives the IMU's interval before each.
+            # 4. The IMU samples before each epoch are preintegrated.
             imu = preintegrate(*self._imu.cut([epoch.stamp_ns for epoch in epochs[part]],
                                               [epoch.gravity_drift for epoch in epochs[part]]))
-            # 5. The bank propagates and updates; each epoch comes when the estimates are its.
+            # 5. The method propagates and updates; it yields an epoch when its estimates hold.
             taken = method.advance(epochs[part], imu)
             for epoch, force, seconds in zip(taken, imu.force.tolist(), imu.duration.tolist()):
                 self._force_check.add(force, seconds)
                 self._judge(epoch, method)
 
     def _judge(self, epoch: AntennaEpoch, method: Bank | NoteMethod) -> None:
-        """Decide what is declared after an epoch, and yield it."""
-        # 6. The rivals have been heard: what they object is a part of the fit.
+        """Decide on the state after an epoch, and append the `Epoch` to the output."""
+        # 6. The fit holds what the rival hypotheses object.
         fit = method.fit()
-        # 7. The declaration decides the state and the words.
+        # 7. The declaration decides on the state and words the reason.
         verdict = self._decide(epoch, method, fit)
         if epoch.v_n is not None:
             self._without_velocity = False
@@ -280,7 +285,7 @@ class Aligner:
             self.declared = self._time_to_align_s = None
             self._counts['withdrawals'] += 1
         self._set_verdict(verdict)
-        # 8. The epoch goes out: to topics, or to a row of a table.
+        # 8. The epoch is ready for `update` to return.
         sensors = method.sensor_errors()
         self._done.append(Epoch(
             epoch.stamp_ns, (epoch.stamp_ns - (self._first_t0_ns or 0)) * 1e-9, verdict.state,
@@ -289,7 +294,7 @@ class Aligner:
         self._started_over = ''
 
     def _decide(self, epoch: AntennaEpoch, method: Bank | NoteMethod, fit: Fit) -> Verdict:
-        """Take over the attitudes after an epoch; return the verdict of the declaration."""
+        """Set the attitudes after an epoch; return the verdict of the declaration."""
         stamp_ns, declaration = epoch.stamp_ns, self._declaration
         initial, current = method.initial(), method.current()
         self._initial = self._current = None
@@ -314,7 +319,7 @@ class Aligner:
     # Start, outages, loss
 
     def _start(self, epoch: AntennaEpoch) -> None:
-        """Make an epoch t0 if it can be one, or say what it waits for."""
+        """Make an epoch t0 if possible; otherwise say what is missing."""
         if not epoch.position_measured:
             return
         if self._first_fix_ns is None:
@@ -327,11 +332,10 @@ class Aligner:
         if epoch.v_n is None and not alone:
             self._wait(State.WAITING_FOR_GNSS, 'no GNSS velocity yet', no_velocity)
             return
-        use_position = config.use_position
-        if use_position == 'auto':
-            # Beside velocities positions gain little and hurt when their errors wander or their
-            # stamps are a few milliseconds off.
-            use_position = epoch.v_n is None
+        # With velocities, positions gain little, and they hurt where their errors wander or their
+        # stamps are a few milliseconds off.
+        use_position = config.use_position is True or (
+            config.use_position == 'auto' and epoch.v_n is None)
         if epoch.v_n is None and not use_position:
             self._wait(State.WAITING_FOR_GNSS, 'no GNSS velocity yet, and use_position is false')
             return
@@ -346,33 +350,32 @@ class Aligner:
         self._without_velocity = bool(no_velocity) and wanted and epoch.v_n is None
         imu = preintegrate(*self._imu.start(epoch.stamp_ns))
         if config.method == 'bank':
-            self._method = Bank(config, epoch, imu, bool(use_position), self._learnt,
-                                self._base)
+            self._method = Bank(config, epoch, imu, use_position, self._learnt, self._base)
         else:
             self._method = NoteMethod(config, epoch, imu, epoch.v_n is None)
         self._judge(epoch, self._method)
 
     def _bridge_outage(self, upto_ns: int) -> None:
-        """Go on without GNSS up to a stamp in steps of bounded length."""
+        """Insert epochs without measurement, up to a stamp."""
         while self._last_ns is not None and upto_ns - self._last_ns > DRY_INTERVAL_NS:
-            self._line_up(GnssEpoch(self._last_ns + DRY_INTERVAL_NS))
+            self._queue(GnssEpoch(self._last_ns + DRY_INTERVAL_NS))
 
-    def _lose(self, why: str) -> None:
-        """Start over without the attitude; what was learnt of the sensors is kept."""
+    def _restart(self, why: str) -> None:
+        """Restart the alignment, keeping what it has learnt of the sensors."""
         self._align()
         learnt = self._learnt
         if self._method is not None:
             self._counts['restarts'] += 1
-            self._say_start_over(why)
+            self._announce_restart(why)
             learnt = self._method.learnt()
         self._forget(learnt)
 
     def _unused_velocities(self) -> str:
-        """Return in words why velocities that came are of no use, or ''."""
+        """Return in words why velocity messages could not be used, or ''."""
         return self._refusal or self._left_out('velocity')
 
     def _left_out(self, kind: str) -> str:
-        """List in words which messages of a kind were left out since the last start."""
+        """List in words the messages of a kind that were left out since the last start."""
         parts = []
         for ending, why in _LEFT_OUT.items():
             name = f'{kind}_{ending}'
@@ -386,13 +389,13 @@ class Aligner:
         self._set_verdict(Verdict(state, what + (why and f': {why}')))
 
     def _set_verdict(self, verdict: Verdict) -> None:
-        """Take over a verdict; another state is an event."""
+        """Set the verdict; a change of state is an event."""
         before, state = self._verdict.state, verdict.state
         if state is not before:
             severity = Severity.INFO
             if state is State.FAULT:
                 severity = Severity.ERROR
-            elif _DECLARED.get(state, 0) < _DECLARED.get(before, 0):
+            elif _RANK.get(state, 0) < _RANK.get(before, 0):
                 severity = Severity.WARNING
             self._events.append(Event(severity, f'{state.value}: {verdict.reason}'))
         self._verdict = verdict
@@ -406,20 +409,20 @@ class Aligner:
 
     @property
     def newest_imu_ns(self) -> int | None:
-        """Return the stamp of the newest IMU sample of use, None where there is none."""
+        """Return the stamp of the newest valid IMU sample, None where there is none."""
         return int(self._imu.stamps[-1]) if self._imu.stamps.size else None
 
     def attitude_now(self) -> Attitude | None:
         """
-        Return the current attitude, carried on with the gyros to the newest IMU sample.
+        Return the current attitude, propagated with the gyros to the newest IMU sample.
 
-        None before there is one, and after a gap of the IMU.
+        None before there is an attitude, and after a gap of the IMU.
         """
         prediction = self.prediction()
         return None if prediction is None else prediction.attitude()
 
     def prediction(self) -> Prediction | None:
-        """Return the attitude at the newest IMU sample, to be carried on; None after a gap."""
+        """Return a prediction that stands at the newest IMU sample; None as `attitude_now`."""
         current, method = self._current, self._method
         if current is None or method is None:
             return None
@@ -435,7 +438,7 @@ class Aligner:
 
     @property
     def counts(self) -> Counter[str]:
-        """Return what became of messages and epochs, by name."""
+        """Return how many messages and epochs had which outcome, by name."""
         counts = Counter(self._counts)
         counts.update(_epoch_counts(self._method))
         return counts
@@ -451,7 +454,7 @@ class Aligner:
 
 
 def _epoch_counts(method: Bank | NoteMethod | None) -> Counter[str]:
-    """Return what became of the epochs of an alignment."""
+    """Return the counts that an alignment keeps itself."""
     fit = Fit(0) if method is None else method.fit()
     return Counter(epochs_used=fit.offered - fit.rejected,
                    epochs_rejected_velocity=fit.rejected_velocity,

@@ -12,9 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Checks of units, coordinates and clocks that need no alignment: for node, replay and info.
+Checks of units, coordinates and clocks that need no alignment, for node, replay and info.
 
-What is found is said in sentences that tell what to set or to change.
+Their results are sentences that tell what to set or to change.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import fields, replace
 import math
-from typing import Union
 
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, Index
@@ -35,27 +34,32 @@ from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
 from ins_align.results import State, Status
 import numpy as np
 
-ANY_GYRO_RATE = 70.0  # rad/s: more than the 4000 deg/s that any usual gyroscope measures
-TOO_FAST_SHARE = 1e-3  # of the samples may be beyond that: spikes
-LENGTH_CELLS, MIN_LENGTHS = 20, 20  # of GRID s over which forces are summed up; sums to judge by
-SHORTER, AS_LONG = 0.85, 0.15  # a quarter of the sums is so short; within this they are right
-MIN_MISFIT = 0.1  # of the logarithm of a length: by so much exchanged positions fit better
-_LIMITS = {own.name: own.metadata['maximum'] for own in fields(Config)}
-MAX_LATENESS, MAX_DELAY = _LIMITS['gnss_lateness'], _LIMITS['gnss_delay']  # s
-LATE_SHARE, MIN_LATE = 0.1, 10  # of GNSS messages that are worth a word
+ANY_GYRO_RATE = 70.0  # rad/s: usual gyroscopes measure at most 4000 deg/s, which is less
+TOO_FAST_SHARE = 1e-3  # of the samples may exceed that, as spikes
+# The specific force is summed over so many cells of GRID s; so many sums are needed to judge.
+LENGTH_CELLS, MIN_LENGTHS = 20, 20
+# Ratio of a sum's length to the expected one: the lower quartile is below the first where rates
+# are wrong; the median is within the second of 1 where they are right.
+SHORTER, AS_LONG = 0.85, 0.15
+MIN_MISFIT = 0.1  # by how much log(speed ratio) must be closer to 0 with exchanged positions
+_MAXIMA = {field.name: field.metadata['maximum'] for field in fields(Config)}
+MAX_LATENESS, MAX_DELAY = _MAXIMA['gnss_lateness'], _MAXIMA['gnss_delay']  # s
+LATE_SHARE, MIN_LATE = 0.1, 10  # share and number of late GNSS messages that are reported
 BEYOND_THE_POLES = 'latitudes are beyond the poles: they are exchanged with the longitudes'
-CELLS, GNSS_MESSAGES = 600, 3000  # kept of the latest data: 5 minutes, at up to 10 Hz
+CELLS, GNSS_MESSAGES = 600, 3000  # that are kept: the latest 5 minutes, at up to 10 Hz
 
 
 def degrees_fault(too_fast: bool, times: Array, gyro: Array, accel: Array, velocities: Series,
                   ) -> str:
     """
-    Say that angular rates are in deg/s, as those are that are too fast; empty where they are not.
+    Return in words that the angular rates are in deg/s, or ''.
 
-    Of rates, rad/s, and specific forces, m/s^2, shape (N, 3), averaged over GRID s, at increasing
-    times, s; velocities are as from `on_grid`. The sum of the specific force over some seconds,
-    turned as the rates say, is as long as the change of velocity and gravity make it, whatever
-    the attitude and the axes are; turned 57 times as far it becomes shorter.
+    They are if they are `too_fast`, or if the specific force shows it: rotated by the rates and
+    integrated over some seconds, it is as long as the change of velocity less gravity, whatever
+    the attitude and the axes are. Rates that are 57 times too large make it shorter.
+
+    `times` are increasing, s, shape (N,); `gyro`, rad/s, and `accel`, m/s^2, are means over GRID s
+    around them, shape (N, 3); `velocities` are as from `on_grid`.
     """
     if not too_fast:
         lengths = _lengths(times, gyro, accel, velocities)
@@ -68,26 +72,26 @@ def degrees_fault(too_fast: bool, times: Array, gyro: Array, accel: Array, veloc
 
 
 def _lengths(times: Array, gyro: Array, accel: Array, velocities: Series) -> Array:
-    """Return how long sums of specific forces are over how long they should be, shape (K,)."""
+    """Return ratios of the lengths of integrated specific force to the expected ones, (K,)."""
     if velocities.times.size < 2 or times.size <= LENGTH_CELLS:
         return np.zeros(0)
-    turned = cumulative_rotations(exp_so3(GRID * gyro)) @ accel[..., None]
+    f_b0 = cumulative_rotations(exp_so3(GRID * gyro)) @ accel[..., None]
     ends = times + 0.5 * GRID
     v_n = np.column_stack([np.interp(ends, velocities.times, v) for v in velocities.vectors.T])
-    felt, seen = (sums[LENGTH_CELLS:] - sums[:-LENGTH_CELLS]
-                  for sums in (np.cumsum(GRID * turned[..., 0], axis=0), v_n))
+    measured, expected = (sums[LENGTH_CELLS:] - sums[:-LENGTH_CELLS]
+                          for sums in (np.cumsum(GRID * f_b0[..., 0], axis=0), v_n))
     seconds = ends[LENGTH_CELLS:] - ends[:-LENGTH_CELLS]
     good = ((seconds < GRID * (LENGTH_CELLS + 0.5)) & (ends[:-LENGTH_CELLS] > velocities.times[0])
             & (ends[LENGTH_CELLS:] < velocities.times[-1]))
-    seen[:, 2] += STANDARD_GRAVITY * seconds
-    return np.asarray(np.linalg.norm(felt[good], axis=1) / np.linalg.norm(seen[good], axis=1))
+    expected[:, 2] += STANDARD_GRAVITY * seconds
+    return np.linalg.norm(measured[good], axis=1) / np.linalg.norm(expected[good], axis=1)
 
 
 def exchange_fault(positions_deg: Series, velocities: Series) -> str:
     """
-    Say that latitude and longitude are exchanged; empty where they are not.
+    Return in words that latitude and longitude are exchanged, or ''.
 
-    Of positions, degrees and m, and velocities as if they were ENU, m/s.
+    Positions are latitude, longitude, degrees, and altitude, m; velocities, m/s, are taken as ENU.
     """
     vectors = positions_deg.vectors
     if vectors.shape[0] < 2 or np.abs(vectors[:, 1]).max() > 90.0:
@@ -95,7 +99,7 @@ def exchange_fault(positions_deg: Series, velocities: Series) -> str:
     as_sent, exchanged = (
         velocity_frame(velocities, without_wild_positions(track(
             Series(positions_deg.times, vectors[:, order])))) for order in ([0, 1, 2], [1, 0, 2]))
-    # Velocities north-east-down would fit the positions as they are, in length too.
+    # Velocities in NED would fit the positions as they were sent, in length too.
     if (as_sent.frame in ('enu', 'unknown')
             or _misfit(as_sent) <= _misfit(exchanged) + MIN_MISFIT):
         return ''
@@ -104,18 +108,18 @@ def exchange_fault(positions_deg: Series, velocities: Series) -> str:
 
 
 def _misfit(frame: VelocityFrame) -> float:
-    """Return the logarithm by which lengths differ; infinite where directions do not fit."""
+    """Return the absolute log(speed ratio); infinite where directions do not fit."""
     ratio = frame.speed_ratio if frame.frame in ('enu', 'ned') else None
     return abs(math.log(ratio)) if ratio else math.inf
 
 
 def beyond_the_poles(latitude_deg: float, longitude_deg: float) -> bool:
-    """Whether a position could only be one with latitude and longitude exchanged."""
+    """Whether a position is possible only with latitude and longitude exchanged."""
     return abs(longitude_deg) <= 90.0 < abs(latitude_deg) <= 180.0
 
 
 def lateness_advice(lateness: float) -> tuple[str, str]:
-    """Say that GNSS messages come so late, s, behind newer IMU samples; with the gnss_lateness."""
+    """Return advice for GNSS messages that are `lateness` s late, and the gnss_lateness to set."""
     value = f'{min(math.ceil(2.0 * lateness) / 2.0 + 0.5, MAX_LATENESS):g}'
     return (f'GNSS messages come up to {lateness:.1f} s later than newer IMU samples: set '
             f'gnss_lateness to {value}; if it is their clock that is behind, and not the '
@@ -123,24 +127,24 @@ def lateness_advice(lateness: float) -> tuple[str, str]:
 
 
 class InputChecks:
-    """Looks at messages as they arrive, in bounded memory."""
+    """Checks messages as they arrive, in bounded memory."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._cells: dict[int, Array] = {}  # count, sums of rate and specific force
+        self._cells: dict[int, Array] = {}  # count, sums of rate and specific force, (7,)
         self._samples = self._too_fast = self._beyond_the_poles = 0
-        self._newest_ns: Index = np.zeros(0, np.int64)  # of the samples so far, if there are any
+        self._newest_ns: Index = np.zeros(0, np.int64)  # IMU stamp, shape (1,) once there is one
         self._late: deque[float] = deque(maxlen=10 * MIN_LATE)
         self._fixes: deque[tuple[float, ...]] = deque(maxlen=GNSS_MESSAGES)
         self._velocities: deque[tuple[float, ...]] = deque(maxlen=GNSS_MESSAGES)
 
     def add(self, stamps_ns: Index, gyro: Array, accel: Array,
-            gnss: Sequence[tuple[int, Union[Fix, Velocity]]]) -> None:
+            gnss: Sequence[tuple[int, Fix | Velocity]]) -> None:
         """
-        Take messages in the order of their arrival.
+        Take consecutive messages.
 
-        Stamps of IMU samples, ns, shape (N,), their rates, rad/s, and forces, m/s^2, shape (N, 3),
-        as sent; GNSS messages, each with how many of the samples come before it.
+        IMU samples as sent are stamps, ns, shape (N,), rates, rad/s, and specific forces, m/s^2,
+        shape (N, 3). Each GNSS message comes with the number of these samples before it.
         """
         newest = np.maximum.accumulate(np.concatenate([self._newest_ns, stamps_ns]))
         for count, message in gnss:
@@ -148,7 +152,7 @@ class InputChecks:
                 self._late.append((int(newest[place - 1]) - message.stamp_ns) * 1e-9)
             self._add_gnss(message)
         if stamps_ns.size:
-            # The newest of these: a clock that was set back goes on from where it is.
+            # Not the newest of all: the IMU's clock may have been set back.
             self._newest_ns = stamps_ns.max(keepdims=True)
             self._add_imu(stamps_ns, gyro, accel)
 
@@ -177,9 +181,9 @@ class InputChecks:
 
     def judge(self, status: Status) -> Status:
         """
-        Return a status that is a FAULT where nothing can be aligned with such messages.
+        Return a status that is a FAULT if units or coordinates are wrong.
 
-        Until it is aligned, its reason says as well that messages come too late.
+        Its reason also says that GNSS messages come too late. An ALIGNED status is not changed.
         """
         if status.state is State.ALIGNED:
             return status
@@ -188,7 +192,7 @@ class InputChecks:
         return replace(status, reason='; '.join([status.reason, *self.late_messages()]))
 
     def faults(self) -> list[str]:
-        """Return what is wrong with units and coordinates, each in a sentence."""
+        """Return a sentence for each fault of units or coordinates."""
         fixes, velocities = self._gnss()
         motion = on_grid(velocities) if velocities.times.size > 1 else velocity_from_positions(
             track(fixes))
@@ -202,19 +206,19 @@ class InputChecks:
         return [fault for fault in (degrees, exchanged) if fault]
 
     def velocities(self) -> Series:
-        """Return the latest velocities, m/s, of positions where there are no others."""
+        """Return the latest velocities, ENU, m/s, or those that positions show if none came."""
         fixes, velocities = self._gnss()
         return velocities if velocities.times.size else differences(track(fixes))
 
     def _gnss(self) -> tuple[Series, Series]:
-        """Return the latest positions, degrees and m, and velocities, m/s."""
+        """Return the latest positions, degrees and m, and velocities, ENU, m/s."""
         fixes, velocities = (
             series_of(*np.split(np.array(rows), [1], axis=1)) if rows else EMPTY
             for rows in (self._fixes, self._velocities))
         return fixes, velocities
 
     def late_messages(self) -> list[str]:
-        """Return that messages come too late, in a sentence, where they do."""
+        """Return a sentence if GNSS messages come too late, else nothing."""
         late = [lateness for lateness in self._late if lateness > self._config.gnss_lateness]
         if len(late) >= max(MIN_LATE, LATE_SHARE * len(self._late)) and max(late) < MAX_LATENESS:
             return [lateness_advice(float(np.quantile(late, 0.99)))[0]]

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The command ``ins_align``: look into recordings, replay, simulate, repeat experiments."""
+"""The command ``ins_align``: inspect and replay recordings, simulate, repeat experiments."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from ins_align.config import (
 from ins_align.outputs import (
     check_plot, check_writable, names_for, not_aligned, Outcome, process, STANDARD_OUTPUT,
     survey, Task, write_whole)
-from ins_align.processes import keep_to_one, processors, run_all, run_on_cluster
+from ins_align.processes import keep_to_one, run_all, run_on_cluster
 
 # Everything else is imported where it is used: --help must not wait for numpy.
 
 ALIGNED, NOT_ALIGNED, UNUSABLE, INTERRUPTED, NO_READER = 0, 1, 2, 130, 141
 
-# Where the package to install has another name than the module.
+# Packages to install whose names differ from that of the module.
 PACKAGES = {'backports': 'backports.zstd', 'PIL': 'pillow', 'pyins': 'python-ins',
             'yaml': 'pyyaml'}
 
@@ -89,17 +89,17 @@ example:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that says in one sentence what is wrong."""
+    """A parser that reports an error in one sentence."""
 
     def error(self, message: str) -> NoReturn:
-        """Leave with the exit status of bad usage."""
+        """Exit with the status of bad usage."""
         self.exit(UNUSABLE, f'{self.prog}: {message}; see "{self.prog} --help"\n')
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line, by default that of the process; return the exit status."""
+    """Run a command line, by default that of the process; return the exit status."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # of any encoding
+        if isinstance(stream, io.TextIOWrapper):  # its encoding may lack characters
             stream.reconfigure(errors='backslashreplace')
     arguments, unknown = parser().parse_known_args(argv)
     if unknown:
@@ -111,14 +111,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except ModuleNotFoundError as error:
-        sentence, status = str(_missing(error)), UNUSABLE
-    except BrokenPipeError:  # whoever reads the output has left, as "head" does
+        sentence, status = str(_not_installed(error)), UNUSABLE
+    except BrokenPipeError:  # the reader of the output has ended, as "head" does
         sentence, status = '', NO_READER
     except (UsageError, OSError) as error:
         sentence, status = str(error), UNUSABLE
         if isinstance(error, OSError):
             sentence = f'{error.filename or "output"}: {error.strerror}'
-            if error.filename is None:  # the disk is full: Python complains again when it closes
+            if error.filename is None:  # disk full: closing would fail again
                 os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     if sentence:
         print(f'ins_align {arguments.command}: {sentence}', file=sys.stderr)
@@ -139,7 +139,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _help(arguments: argparse.Namespace) -> int:
-    """Say what there is to those who give no command."""
+    """Print the help if no command is given."""
     arguments.parser.print_help()
     return UNUSABLE
 
@@ -239,21 +239,22 @@ def _add_simulate(commands: Any) -> None:
                          help='no GNSS between these seconds; repeatable')
     groups: dict[str, Any] = {}
     for field in fields(Arguments):
-        line = field.metadata
-        if not line:
+        metadata = field.metadata
+        if not metadata:
             continue
-        if line['group'] not in groups:
-            groups[line['group']] = command.add_argument_group(line['group'])
-        unit = line['unit'] if line['unit'] != '1' else ''
+        group, choices = metadata['group'], metadata['choices']
+        if group not in groups:
+            groups[group] = command.add_argument_group(group)
+        unit = metadata['unit'] if metadata['unit'] != '1' else ''
         default = field.default
         if isinstance(default, tuple):
             default = ' '.join(map(str, default))
-        groups[line['group']].add_argument(
+        groups[group].add_argument(
             '--' + field.name.replace('_', '-'), default=argparse.SUPPRESS,
-            type=type(field.default) if line['choices'] else float,
-            nargs=len(line['names']) or None,
-            metavar=line['names'] or unit.upper() or ('NAME' if line['choices'] else 'X'),
-            help=line['text'] + (unit and f', {unit}')
+            type=type(field.default) if choices else float,
+            nargs=len(metadata['names']) or None,
+            metavar=metadata['names'] or unit.upper() or ('NAME' if choices else 'X'),
+            help=metadata['text'] + (unit and f', {unit}')
             + (f' (default: {default})' if default else ''))
     command.add_argument('--tf', action='store_true',
                          help='write how IMU and antenna are mounted to /tf_static')
@@ -277,13 +278,13 @@ def _add_experiment(commands: Any) -> None:
 def run_info(arguments: argparse.Namespace) -> int:
     """Run ``ins_align info``."""
     _check_outputs(arguments, {})
-    return _tell(arguments, map(survey, arguments.bags))
+    return _print_outcomes(arguments, map(survey, arguments.bags))
 
 
 def run_replay(arguments: argparse.Namespace) -> int:
     """Run ``ins_align replay``."""
     keep_to_one()
-    gc.set_threshold(100_000)  # rows and results by the thousand, none of which is garbage
+    gc.set_threshold(100_000)  # thousands of objects are made, and hardly any is garbage
     files = {option: names_for(path, arguments.bags) for option in ('csv', 'plot', 'results')
              if (path := getattr(arguments, option)) is not None}
     _check_outputs(arguments, files)
@@ -299,10 +300,10 @@ def run_replay(arguments: argparse.Namespace) -> int:
     if arguments.dask is not None:
         found = run_on_cluster(process, tasks, arguments.dask)
     elif len(tasks) > 1:
-        found = run_all(process, tasks, arguments.jobs or processors())
+        found = run_all(process, tasks, arguments.jobs)
     else:
         found = [_with_a_bar(tasks[0])]
-    return _tell(arguments, (
+    return _print_outcomes(arguments, (
         not_aligned(task.name, f'a process died on the way ({type(outcome).__name__}), perhaps '
                     'for want of memory; --jobs 1 takes less')
         if isinstance(outcome, Exception) else outcome
@@ -310,7 +311,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
 
 
 def _with_a_bar(task: Task) -> Outcome:
-    """Process one recording and show on a terminal how much of it has been read."""
+    """Process one recording, with a progress bar if there is a terminal."""
     from tqdm import tqdm
 
     with tqdm(total=1, leave=False, disable=None if sys.stderr else True,  # None: no terminal
@@ -319,7 +320,7 @@ def _with_a_bar(task: Task) -> Outcome:
 
 
 def _check_outputs(arguments: argparse.Namespace, files: dict[str, list[str]]) -> None:
-    """Find out before the work whether all files, by option one each recording, can be written."""
+    """Raise UsageError, before the work, unless all `files`, lists by option, can be written."""
     if STANDARD_OUTPUT in [getattr(arguments, option) for option in files]:
         raise UsageError('nothing but --json can go to standard output: give the name of a file')
     for path in files.get('results', ()):
@@ -336,11 +337,11 @@ def _check_outputs(arguments: argparse.Namespace, files: dict[str, list[str]]) -
             raise UsageError(f'{path} is given for two outputs')
 
 
-def _tell(arguments: argparse.Namespace, outcomes: Iterable[Outcome]) -> int:
-    """Print what came of each recording and write ``--json``; return the exit status."""
+def _print_outcomes(arguments: argparse.Namespace, outcomes: Iterable[Outcome]) -> int:
+    """Print the outcome of each recording and write ``--json``; return the exit status."""
     several = len(arguments.bags) > 1
     objects, statuses = [], []
-    # To the very end: a pool of processes that is dropped on the way is torn down in a race.
+    # All outcomes are read: a pool of processes that is dropped early is torn down in a race.
     for outcome in outcomes:
         objects.append(outcome.json)
         if error := outcome.json.get('error'):
@@ -377,8 +378,8 @@ def _config(arguments: argparse.Namespace) -> Config:
     return config_from_mapping(values)
 
 
-def _missing(error: ModuleNotFoundError) -> UsageError:
-    """Say what to install; a module of our own that is missing is a bug."""
+def _not_installed(error: ModuleNotFoundError) -> UsageError:
+    """Return the error that says what to install; raise that of a missing module of our own."""
     if (error.name or 'ins_align').startswith('ins_align'):
         raise error
     name = (error.name or '').split('.')[0]

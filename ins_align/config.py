@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""One typed, validated configuration for the node and for replay."""
+"""The parameters, typed and validated, for the node, replay and the library."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
 MAX_PARAMS_BYTES = 1 << 20
 
 AUTO_OR_BOOL = ('auto', True, False)
-# Declared by rclpy itself on every node, legal in a parameter file.
+# rclpy declares these on every node, so a parameter file may hold them.
 RCLPY_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 
 
 class UsageError(ValueError):
-    """A mistake of the user; the text says in one sentence what is wrong."""
+    """A mistake of the user; the text is one sentence that says what is wrong."""
 
 
 class ConfigError(UsageError):
-    """A setting is wrong; the text says which one, why, and what would be right."""
+    """A wrong parameter; the text says which one, why, and what would be right."""
 
 
 class ImuNoise(NamedTuple):
@@ -50,13 +50,13 @@ class ImuNoise(NamedTuple):
     velocity_random_walk: float  # m/s/sqrt(s)
     gyro_bias_std: float  # rad/s
     accel_bias_std: float  # m/s^2
-    gyro_scale_std: float = 0.0  # scale factor error, 0.01 is one percent
-    rate_random_walk: float = 0.0  # of the gyros' biases, rad/s/sqrt(s)
+    gyro_scale_std: float = 0.0  # scale factor error of the gyros, 0.01 is one percent
+    rate_random_walk: float = 0.0  # of the gyro biases, rad/s/sqrt(s)
 
 
 def _imu_noise(arw: float, vrw: float, gyro_bias: float, accel_bias: float,
                gyro_scale: float = 0.0, rate_walk: float = 0.0) -> ImuNoise:
-    """Convert deg/sqrt(h), m/s/sqrt(h), deg/s, m/s^2, 1, deg/s/sqrt(h) to SI."""
+    """Convert from deg/sqrt(h), m/s/sqrt(h), deg/s, m/s^2, 1 and deg/s/sqrt(h) to SI units."""
     return ImuNoise(math.radians(arw) / 60.0, vrw / 60.0, math.radians(gyro_bias), accel_bias,
                     gyro_scale, math.radians(rate_walk) / 60.0)
 
@@ -68,10 +68,10 @@ PRESETS = {
     'mems': _imu_noise(0.3, 0.09, 0.1, 0.05, 0.01, 0.15),
     # Bare chips of autopilots and phones, from data sheets. MPU-6000 (PS-MPU-6000A-00): zero-g
     # 50 to 80 mg, 400 ug/sqrt(Hz), scale 3 %, gyros 0.005 deg/s/sqrt(Hz). BMI055: zero-g 70 mg,
-    # zero-rate 1 deg/s, 0.014 deg/s/sqrt(Hz). Soldering and temperature come on top.
+    # zero-rate 1 deg/s, 0.014 deg/s/sqrt(Hz). Soldering and temperature add errors.
     'chip': _imu_noise(0.9, 0.27, 1.0, 0.5, 0.03, 0.45),
 }
-# What a chip reaches in a minute or two of turns, deg.
+# Sigmas that a chip reaches within one or two minutes with turns, deg.
 CHIP_THRESHOLDS = {'tilt_std_threshold': 1.0, 'heading_std_threshold': 2.0}
 
 
@@ -86,109 +86,112 @@ def _parameter(default: Any, description: str, unit: str = '', minimum: float | 
 @dataclass(frozen=True)
 class Config:
     """
-    Everything that a user can set, checked.
+    All parameters, checked.
 
-    Each field's metadata holds ``description``, ``unit``, ``minimum`` and ``maximum`` (inclusive,
-    None: not a number), ``choices`` and ``read_only``. A value of the wrong type, outside its
-    range or that contradicts another one is a ConfigError.
+    Each field's metadata holds ``description``, ``unit``, ``minimum`` and ``maximum`` (inclusive;
+    None if it is not a number), ``choices`` and ``read_only``. A ConfigError is raised if a value
+    is of the wrong type, out of range or in contradiction to another one.
     """
 
     lever_arm: tuple[float, float, float] = _parameter(
-        (0.0, 0.0, 0.0), 'lever arm from the IMU to the GNSS antenna, in the IMU frame '
-        '(x forward, y left, z up); each number with a point: 0.0', 'm', -1000.0, 1000.0)
+        (0.0, 0.0, 0.0), 'vector from the IMU to the GNSS antenna, in the axes of the IMU (x '
+        'forward, y left, z up); each number with a decimal point: 0.0', 'm', -1000.0, 1000.0)
     lever_arm_std: float = _parameter(
-        1.0, 'how well the lever arm is known, 1 sigma per axis; above 0 it is estimated too',
+        1.0, 'uncertainty of the lever arm, 1 sigma per axis; above 0 the lever arm is estimated',
         'm', 0.0, 100.0)
     lever_arm_from_tf: str | bool = _parameter(
         'auto', 'take the lever arm from the transform between the frame_ids of IMU and position '
-        'messages (/tf_static); auto: where there is one and lever_arm is not set, or zero; true: '
-        'wait for it', choices=AUTO_OR_BOOL)
+        'messages (/tf_static); auto: if there is one and lever_arm is not set or zero; true: '
+        'always, and wait for it', choices=AUTO_OR_BOOL)
     base_frame: str = _parameter(
-        '', 'frame whose attitude the status and JSON give as well, as TF has it; empty: none')
+        '', 'frame whose attitude status and JSON give as well, from TF; empty: none')
     vehicle: str = _parameter(
-        'none', 'what is known of the motion: base_frame (the IMU, where that is empty) has x '
-        'forward and z up, and its origin moves along x, that of a car at the rear axle. Gives a '
-        'heading on a straight road; a car that is faster than a few m/s is taken to go forwards. '
-        'Where the motion contradicts it, it is not used, with a remark',
+        'none', 'type of vehicle: base_frame (the IMU if that is empty) has x forward and z up, '
+        'and its origin, for a car at the rear axle, moves along x. This gives a heading on a '
+        'straight road; a car that is faster than a few m/s is taken to go forwards. If the '
+        'motion contradicts this, it is not used, and the reason says so',
         choices=('none', 'car', 'boat', 'aeroplane'))
     vehicle_velocity_std: float = _parameter(
-        0.0, 'velocity sideways and upwards that lasts (slip, leeway, wind), 1 sigma; 0: of a car '
-        '0.1, of a boat 1, of an aeroplane 10', 'm/s', 0.0, 100.0)
+        0.0, 'lasting velocity sideways and upwards (slip, leeway, wind), 1 sigma; 0: 0.1 for a '
+        'car, 1 for a boat, 10 for an aeroplane', 'm/s', 0.0, 100.0)
     mount_yaw_std: float = _parameter(
-        1.0, 'how well the x axis is known to point along the motion, sideways and upwards, 1 '
-        'sigma; no heading from it is better', 'deg', 0.0, 30.0)
+        1.0, 'angle between the x axis and the direction of motion, sideways and upwards, 1 '
+        'sigma; a heading from vehicle is no better than this', 'deg', 0.0, 30.0)
     use_velocity: str | bool = _parameter(
-        'auto', 'align with GNSS velocities; auto: when they arrive', choices=AUTO_OR_BOOL)
+        'auto', 'align with GNSS velocities; auto: if they arrive', choices=AUTO_OR_BOOL)
     use_position: str | bool = _parameter(
-        'auto', 'align with GNSS positions; auto: when no velocity arrives', choices=AUTO_OR_BOOL)
+        'auto', 'align with GNSS positions; auto: if no velocity arrives', choices=AUTO_OR_BOOL)
     fix_type: str = _parameter(
         'NavSatFix', 'message type of the position topic; GPSFix of gps_msgs and NavPVT of '
-        'ublox_msgs bring the velocity too, and no velocity topic is read',
+        'ublox_msgs include the velocity, and no velocity topic is read',
         choices=('NavSatFix', 'GPSFix', 'NavPVT'))
     velocity_type: str = _parameter(
         'TwistWithCovarianceStamped', 'message type of the velocity topic',
         choices=('TwistWithCovarianceStamped', 'TwistStamped', 'Odometry', 'Vector3Stamped'))
     velocity_frame: str = _parameter(
-        'auto', 'world frame in which the antenna velocity is given: east-north-up or '
-        'north-east-down, whatever its frame_id says; auto: enu, and a velocity with the frame_id '
-        'of a body is refused', choices=('auto', 'enu', 'ned'))
+        'auto', 'world frame of the antenna velocity: east-north-up or north-east-down, whatever '
+        'the frame_id is; auto: enu, but a velocity with the frame_id of a body is refused',
+        choices=('auto', 'enu', 'ned'))
     velocity_vertical: str = _parameter(
         'measured', 'absent: the receiver does not measure the vertical velocity and sends 0, as '
         'NMEA drivers do', choices=('measured', 'absent'))
     gnss_delay: float = _parameter(
-        0.0, 'a GNSS measurement is older than its stamp by this much', 's', -60.0, 60.0)
+        0.0, 'how much older than its stamp a GNSS measurement is', 's', -60.0, 60.0)
     gnss_delay_std: float = _parameter(
-        0.1, 'how well the delay is known, 1 sigma; above 0 it is estimated too', 's', 0.0, 10.0)
+        0.1, 'uncertainty of the delay, 1 sigma; above 0 the delay is estimated', 's', 0.0, 10.0)
     gnss_lateness: float = _parameter(
-        1.0, 'how much later than newer IMU samples a GNSS or IMU message may arrive and '
-        'still be used', 's', 0.0, 60.0)
+        1.0, 'how much later than newer IMU samples a GNSS or IMU message may arrive and still be '
+        'used', 's', 0.0, 60.0)
     imu_grade: str = _parameter(
-        'mems', 'preset of the six figures below; custom: the first four must be given',
-        choices=(*PRESETS, 'custom'))
+        'mems', 'preset of the six parameters below, of which those above 0 replace the figure of '
+        'the preset; custom: the first four must be set', choices=(*PRESETS, 'custom'))
     angle_random_walk: float = _parameter(
         0.0, "angle random walk of the gyroscopes; 0: the preset's", 'deg/sqrt(h)', 0.0, 1000.0)
     velocity_random_walk: float = _parameter(
-        0.0, "velocity random walk of the accelerometers; 0: the preset's", 'm/s/sqrt(h)',
-        0.0, 1000.0)
+        0.0, "velocity random walk of the accelerometers; 0: the preset's", 'm/s/sqrt(h)', 0.0,
+        1000.0)
     gyro_bias_std: float = _parameter(
         0.0, "gyroscope bias, 1 sigma per axis; 0: the preset's", 'deg/s', 0.0, 100.0)
     accel_bias_std: float = _parameter(
         0.0, "accelerometer bias, 1 sigma per axis; 0: the preset's", 'm/s^2', 0.0, 10.0)
     gyro_scale_std: float = _parameter(
         0.0, 'scale factor error of the gyroscopes, 1 sigma per axis, 0.01 is one percent; 0: the '
-        "preset's; where that is above 0 it is estimated, as are, 3 tenths of it, misalignment "
-        'and the errors of the accelerometers', '1', 0.0, 0.5)
+        "preset's. If it is above 0, scale factors, misalignment (3 tenths of it) and the same "
+        'errors of the accelerometers (3 tenths of it) are estimated', '1', 0.0, 0.5)
     rate_random_walk: float = _parameter(
-        0.0, "rate random walk of the gyroscopes: how their biases change; 0: the preset's",
-        'deg/s/sqrt(h)', 0.0, 100.0)
+        0.0, 'rate random walk of the gyroscopes, the random walk of their biases; 0: the '
+        "preset's", 'deg/s/sqrt(h)', 0.0, 100.0)
     velocity_std: float = _parameter(
-        0.3, 'horizontal GNSS velocity, 1 sigma per axis, where messages carry none, and '
-        'where its estimate starts then', 'm/s', 1e-4, 100.0)
+        0.3, 'horizontal GNSS velocity, 1 sigma per axis, if the messages state none; the noise '
+        'is then estimated from this value on', 'm/s', 1e-4, 100.0)
     velocity_std_vertical: float = _parameter(
-        0.6, 'vertical GNSS velocity, 1 sigma, where messages carry none', 'm/s', 1e-4, 100.0)
+        0.6, 'vertical GNSS velocity, 1 sigma, if the messages state none', 'm/s', 1e-4, 100.0)
     position_std: float = _parameter(
-        2.5, 'horizontal GNSS position, 1 sigma per axis, where messages carry none, and '
-        'where its estimate starts then', 'm', 1e-4, 1000.0)
+        2.5, 'horizontal GNSS position, 1 sigma per axis, if the messages state none; the noise '
+        'is then estimated from this value on', 'm', 1e-4, 1000.0)
     position_std_vertical: float = _parameter(
-        5.0, 'vertical GNSS position, 1 sigma, where messages carry none', 'm', 1e-4, 1000.0)
+        5.0, 'vertical GNSS position, 1 sigma, if the messages state none', 'm', 1e-4, 1000.0)
     heading_std_threshold: float = _parameter(
-        1.0, 'declare the heading when its sigma is below', 'deg', 1e-4, 180.0, runtime=True)
+        1.0, 'the heading is declared if its sigma is below this', 'deg', 1e-4, 180.0,
+        runtime=True)
     tilt_std_threshold: float = _parameter(
-        0.5, 'declare roll and pitch when their sigmas are below', 'deg', 1e-4, 90.0, runtime=True)
+        0.5, 'roll and pitch are declared if their sigmas are below this', 'deg', 1e-4, 90.0,
+        runtime=True)
     hold_time: float = _parameter(
-        1.0, 'every condition must have held for this long before a declaration', 's',
-        0.0, 3600.0, runtime=True)
+        1.0, 'how long all conditions must hold before a declaration', 's', 0.0, 3600.0,
+        runtime=True)
     trust_imu_axes: bool = _parameter(
-        False, 'the axes and signs of the IMU are known to be right: declare a heading without '
-        'waiting for motion that shows it, also at rest', choices=(True, False))
+        False, 'axes and signs of the IMU are certainly right: declare a heading without motion '
+        'that confirms them, also at rest', choices=(True, False))
     method: str = _parameter(
-        'bank', 'vif, pif: velocity and position integration formula as published, whose sigmas '
-        "know nothing of the IMU's errors; bank: filters that know them",
-        choices=('vif', 'pif', 'bank'))
+        'bank', 'bank: bank of Kalman filters, which estimate the errors of the IMU; vif, pif: '
+        'velocity and position integration formula as published, whose sigmas do not include '
+        'these errors', choices=('vif', 'pif', 'bank'))
     free_start: bool = _parameter(
-        True, 'vif and pif: leave the noisy first velocity and rate out of every later vector; '
-        'false: the published formula to the letter', choices=(True, False))
-    world_frame_id: str = _parameter('map', 'frame_id of published attitudes: the ENU frame')
+        True, 'vif and pif: do not use the noisy first velocity and rate in every later vector; '
+        'false: the published formula', choices=(True, False))
+    world_frame_id: str = _parameter(
+        'map', 'frame_id of published attitudes: the ENU frame')
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -219,7 +222,7 @@ class Config:
 
     @property
     def imu_noise(self) -> ImuNoise:
-        """Noise of the IMU in SI units: the preset's, where a figure is given that one."""
+        """Noise of the IMU in SI units: the figures above 0, and the preset for the others."""
         own = _imu_noise(self.angle_random_walk, self.velocity_random_walk,
                          self.gyro_bias_std, self.accel_bias_std, self.gyro_scale_std,
                          self.rate_random_walk)
@@ -230,7 +233,7 @@ class Config:
 
 
 def config_from_mapping(values: Mapping[str, Any]) -> Config:
-    """Make a configuration of names and values; a ConfigError names what is wrong."""
+    """Return the configuration with these values by name; a ConfigError says what is wrong."""
     known, unknown = without_unknown(values)
     if unknown:
         raise ConfigError(unknown[0])
@@ -239,10 +242,10 @@ def config_from_mapping(values: Mapping[str, Any]) -> Config:
 
 def without_unknown(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """
-    Return the values whose names are known, and a sentence on each of the others.
+    Return the values of known parameters, and a warning for each unknown name.
 
-    A file with parameters for many nodes is not wrong; a slip of the pen must not pass unseen.
-    What rclpy itself declares on every node is left out without a word.
+    Unknown names are no error, because a file may hold parameters of other nodes, but they may be
+    misspelt. The parameters that rclpy declares on every node are left out without a warning.
     """
     known = [field.name for field in dataclasses.fields(Config)]
     sentences = []
@@ -257,10 +260,10 @@ def without_unknown(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str
 
 def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
-    Read the values for this node from a ROS 2 parameter file, by name, not checked.
+    Read the parameters of this node from a ROS 2 parameter file; return unchecked values by name.
 
     The YAML has ``ros__parameters`` below the node's name or a wildcard (``/**``). A ConfigError
-    says that the file cannot be read, or holds no parameters for this node or those of two.
+    is raised if the file cannot be read, or holds parameters for no node of this name or for two.
     """
     try:
         with open(path, 'rb') as file:
@@ -289,7 +292,7 @@ def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """Split ``name=value``, the value written as in YAML; a ConfigError says what is wrong."""
+    """Return name and value of ``name=value``, the value in YAML; may raise ConfigError."""
     name, equals, value = text.partition('=')
     if not equals or not name.strip():
         raise ConfigError(f'expected NAME=VALUE, got {reprlib.repr(text)}')
@@ -301,7 +304,7 @@ def _parse_yaml(text: str | bytes, source: str) -> Any:
     import yaml
 
     class Loader(yaml.SafeLoader):
-        """Reads 1e-3 as a number and refuses aliases, both as ROS does."""
+        """Loads YAML as ROS does: 1e-3 is a number, aliases are refused."""
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
@@ -324,7 +327,7 @@ def _parse_yaml(text: str | bytes, source: str) -> Any:
 
 
 def _node_sections(tree: Any, prefix: str, depth: int = 8) -> Iterable[tuple[str, Any]]:
-    """Find each ``ros__parameters`` with the full name of the node that it is for."""
+    """Yield the full node name and the content of each ``ros__parameters`` section."""
     if not isinstance(tree, dict) or depth == 0:
         return
     for key, content in tree.items():
@@ -336,17 +339,18 @@ def _node_sections(tree: Any, prefix: str, depth: int = 8) -> Iterable[tuple[str
 
 def checked(field: dataclasses.Field[Any], value: Any) -> Any:
     """
-    Return a value in the type of a field's default.
+    Return a value, checked and converted to the type of the field's default.
 
-    A ConfigError says what the field takes: one of its ``choices``, a name, or a number or as many
-    as its default or its ``names`` has, in its ``unit`` from ``minimum`` to ``maximum``.
+    A field takes one of its ``choices``, a name, a number, or as many numbers as its default or
+    its ``names`` has; numbers are in ``unit``, from ``minimum`` to ``maximum``. A ConfigError says
+    what is expected.
     """
-    line, default = field.metadata, field.default
-    if choices := line['choices']:
-        # A parameter that may be a word or a truth value arrives as "true" where only words fit.
+    metadata, default = field.metadata, field.default
+    if choices := metadata['choices']:
+        # Where only a string fits, a boolean arrives as "true".
         if isinstance(value, str) and value.lower() in ('true', 'false') and True in choices:
             value = value.lower() == 'true'
-        # 1 == True, but a number is neither a word nor a truth value.
+        # The type is compared too, because 1 == True.
         fits = any(type(value) is type(choice) and value == choice for choice in choices)
         expected = f'one of {listed_choices(choices)}'
     elif isinstance(default, str):
@@ -354,15 +358,15 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
         fits = value == default == '' or isinstance(value, str) and bool(
             re.fullmatch(r'[^\s/][^\s]{0,255}', value))
     else:
-        count = len(default if isinstance(default, tuple) else line.get('names', ()))
-        expected = (f'{count} finite numbers' if count else 'a finite number') + _range(line)
+        count = len(default if isinstance(default, tuple) else metadata.get('names', ()))
+        expected = (f'{count} finite numbers' if count else 'a finite number') + _range(metadata)
         try:
             numbers = list(value) if count and not isinstance(value, (str, Mapping)) else [value]
             fits = len(numbers) == (count or 1) and all(
                 isinstance(number, Real) and not isinstance(number, bool)
-                and math.isfinite(number) and line['minimum'] <= number <= line['maximum']
+                and math.isfinite(number) and metadata['minimum'] <= number <= metadata['maximum']
                 for number in numbers)
-        except (TypeError, OverflowError):  # no list; an integer that is none of the floats
+        except (TypeError, OverflowError):  # not a list; an integer too large for a float
             fits = False
         if fits:
             value = tuple(map(float, value)) if count else float(value)
@@ -373,14 +377,16 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
 
 
 def listed_choices(choices: Iterable[Any]) -> str:
-    """List what a parameter can be, as it is written in YAML."""
+    """List the choices of a parameter as they are written in YAML."""
     return ', '.join(str(choice).lower() if isinstance(choice, bool) else str(choice) or '""'
                      for choice in choices)
 
 
-def _range(line: Mapping[str, Any]) -> str:
-    """Say in which unit and between which limits a number is."""
-    unit = '' if line['unit'] in ('', '1') else f' in {line["unit"]}'
-    if line['maximum'] < math.inf:
-        return f'{unit} from {line["minimum"]:g} to {line["maximum"]:g}'
-    return unit + (f', {line["minimum"]:g} or above' if line['minimum'] > -math.inf else '')
+def _range(metadata: Mapping[str, Any]) -> str:
+    """Return the unit and the limits of a number in words."""
+    unit = '' if metadata['unit'] in ('', '1') else f' in {metadata["unit"]}'
+    if metadata['maximum'] < math.inf:
+        return f'{unit} from {metadata["minimum"]:g} to {metadata["maximum"]:g}'
+    if metadata['minimum'] > -math.inf:
+        return f'{unit}, {metadata["minimum"]:g} or above'
+    return unit

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Where the antenna and the vehicle's base are, from the robot's tree of frames (TF)."""
+"""Where the antenna and the vehicle's base frame are on the robot, from its frame tree (TF)."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ from ins_align.geometry.rotation import Array, matrix_from_quaternion, Transform
 from ins_align.results import Event, Severity
 import numpy as np
 
-ROUNDING = 1e-6  # m: numbers of a robot's model that differ less are the same
-# A robot's model is published once, to all who join: it is there as soon as the sensors are.
-WAIT = 2.0  # s, for what may not be there, from when both sensors have sent
-MAX_HELD = 4000
+ROUNDING = 1e-6  # m: smaller differences between lever arms are rounding
+# Fixed transforms are published once and kept for late subscribers, so they arrive about when the
+# first sensor messages do.
+WAIT = 2.0  # s, for an optional transform, after both sensors have sent messages
+MAX_HELD = 4000  # messages
 
-# Target and source frame to the transform between them, None where there is none.
+# Returns the transform from a source frame to a target frame (target, source), None if unknown.
 Lookup = Callable[[str, str], 'Transform | None']
 
 
 def transform_from_msg(msg: Any) -> Transform:
-    """Convert geometry_msgs/Transform; numbers that are none end in nan."""
+    """Convert geometry_msgs/Transform; an invalid quaternion gives nan."""
     turn, way = msg.rotation, msg.translation
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
     with np.errstate(invalid='ignore'):
@@ -44,14 +45,14 @@ def transform_from_msg(msg: Any) -> Transform:
 
 
 class FixedFrames:
-    """The fixed part of a tree of frames, as /tf_static has it."""
+    """The frame tree of /tf_static."""
 
     def __init__(self) -> None:
         """Start without any frame."""
         self._parents: dict[str, tuple[str, Transform]] = {}
 
     def add(self, msg: Any) -> None:
-        """Take a geometry_msgs/TransformStamped; of one child the last counts."""
+        """Take a geometry_msgs/TransformStamped; it replaces an earlier one of the same child."""
         self._parents[msg.child_frame_id.strip('/')] = (
             msg.header.frame_id.strip('/'), transform_from_msg(msg.transform))
 
@@ -62,7 +63,7 @@ class FixedFrames:
 
     def _to_root(self, frame: str) -> tuple[str, Transform]:
         frame, transform = frame.strip('/'), Transform(np.eye(3), np.zeros(3))
-        for _ in self._parents:  # as many steps as there can be: a loop has no end
+        for _ in self._parents:  # bounded, because the tree may contain a loop
             if frame in self._parents:
                 frame, step = self._parents[frame]
                 transform = step.after(transform)
@@ -70,21 +71,20 @@ class FixedFrames:
 
 
 class Mounting(NamedTuple):
-    """What TF says, and what follows from it."""
+    """Configuration and base frame according to TF."""
 
-    config: Config  # with the lever arm to align with
-    base: Transform | None  # from the configured base to the IMU
-    words: Sequence[Event] = ()  # what was taken from TF, what contradicts it
-    missing: Sequence[str] = ()  # transforms that parameters insist on and TF lacks, in words
-    complete: bool = True  # whether all is there that would be used
+    config: Config  # with the lever arm to use
+    base: Transform | None  # from base_frame to the IMU frame
+    words: Sequence[Event] = ()  # what was taken from TF, and what contradicts it
+    missing: Sequence[str] = ()  # transforms that parameters require and TF lacks, in words
+    complete: bool = True  # False: a transform to the antenna may still come
 
 
 def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Config) -> Mounting:
     """
-    Look up lever arm and mounting, as ``lever_arm_from_tf`` and ``base_frame`` want them.
+    Look up the transforms that ``lever_arm_from_tf`` and ``base_frame`` ask for.
 
-    `lookup` returns the transform from its second argument to its first, or None; the frames are
-    the frame_id of the IMU's and of the position messages.
+    `imu_frame` and `antenna_frame` are the frame_ids of the IMU and the position messages.
     """
     words: list[Event] = []
     missing: list[str] = []
@@ -106,7 +106,7 @@ def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Co
 
 def _with_lever_arm(config: Config, found: Array, frames: tuple[str, str],
                     words: list[Event]) -> Config:
-    """Return the configuration with the lever arm of TF where it is to be used."""
+    """Return the configuration, with the lever arm of TF if that is to be used; add to `words`."""
     is_set = config.lever_arm != Config.lever_arm
     numbers = ', '.join(f'{number:.4g}' for number in np.round(found, 4) + 0.0)     # no -0
     in_tf = f'[{numbers}] m (from {frames[0]} to {frames[1]})'
@@ -129,10 +129,10 @@ def _with_lever_arm(config: Config, found: Array, frames: tuple[str, str],
 
 class MountingSearch:
     """
-    Looks for the transforms that the parameters want while messages arrive.
+    Looks for the transforms that the parameters ask for, while messages arrive.
 
-    It begins once both sensors have sent messages. Without a `lookup` there is no TF: a
-    ConfigError if the parameters cannot do without.
+    The search begins when both sensors have sent messages. `lookup` is None where there is no TF;
+    if the parameters require a transform then, a ConfigError is raised.
     """
 
     def __init__(self, config: Config, lookup: Lookup | None) -> None:
@@ -141,14 +141,14 @@ class MountingSearch:
         if self._required and lookup is None:
             raise ConfigError('lever_arm_from_tf is true or base_frame is set, but tf2_ros is not '
                               'installed: sudo apt install ros-$ROS_DISTRO-tf2-ros-py')
-        self.antenna_frame: str | None = None  # until a position has come
+        self.antenna_frame: str | None = None  # None: no position yet
         self._imu_frame: str | None = None
-        self._lever_arm = config.lever_arm  # that is in use
+        self._lever_arm = config.lever_arm  # in use
         self._held: deque[tuple[int, Any]] = deque(maxlen=MAX_HELD)
         self.restart()
 
     def restart(self) -> None:
-        """Look again: the IMU is another one."""
+        """Search again, because the IMU is a different one."""
         self.mounting: Mounting | None = None
         self.waits_for = 'a message of the IMU and a position' if self._required else ''
         self._since: float | None = None
@@ -157,11 +157,11 @@ class MountingSearch:
     def take(self, items: list[tuple[int, Any]], now: float,
              ) -> tuple[list[tuple[int, Any]], Mounting | None]:
         """
-        Look for the transforms; keep the messages until they are known or given up.
+        Search on; return the items to process now, and the mounting when it is found.
 
-        Items are messages and, callable, requests, with when they came, ns; IMU samples have a
-        `frame_id`. Returns what to align with now, which is all that was kept where a lever arm
-        was found, and once what TF says. `now` is in seconds.
+        Items are messages and requests (which are callable) with the time when they came, ns; IMU
+        samples have a `frame_id`. Messages are kept during the search. At its end all of them are
+        returned, if they had to wait or the lever arm has changed. `now` is in seconds.
         """
         if self.mounting is not None:
             return items, None
@@ -181,7 +181,7 @@ class MountingSearch:
         return [*requests, *held] if anew else items, self.mounting
 
     def _find(self, now: float) -> Mounting | None:
-        """Return what TF says, or that it says nothing; None while that is not known."""
+        """Return the mounting; None while the search goes on."""
         if self._lookup is None:
             return Mounting(self._config, None)
         if self._imu_frame is None or self.antenna_frame is None:

@@ -11,14 +11,14 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Recorded data through the aligner: recordings, `replay`, and arrays, `align`."""
+"""Alignment of recorded data: `replay` for recordings, `align` for arrays."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 import os
-from typing import Any, TYPE_CHECKING, Union
+from typing import Any, TYPE_CHECKING
 
 from ins_align.aligner import Aligner
 from ins_align.checks import InputChecks
@@ -35,16 +35,16 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# The aligner is asked after so many messages: many epochs cost less each than few.
+# `Aligner.update` is called after so many messages: an epoch costs less among many.
 MESSAGES = 2500
-# Stamps that were seconds are below this (ns); those that were nanoseconds by mistake are not.
+# Stamps given as seconds are below this (ns), unless they are nanoseconds by mistake.
 MAX_STAMP_NS = 9e18
-# Stamps of a receiver that are closer were not nanoseconds.
+# GNSS stamps that are closer on average were not given as nanoseconds.
 MIN_INTERVAL_NS = 1_000_000
 
 
 class _Run:
-    """An aligner that takes recorded messages, and collects what comes of it."""
+    """Passes recorded messages to an aligner and collects the epochs."""
 
     def __init__(self, config: Config, base: Transform | None = None) -> None:
         self._config = config
@@ -54,14 +54,14 @@ class _Run:
         self._waiting = 0
 
     def add(self, stamps_ns: Index, gyro: Array, accel: Array,
-            gnss: Sequence[tuple[int, Union[Fix, Velocity, tuple[str, str]]]],
+            gnss: Sequence[tuple[int, Fix | Velocity | tuple[str, str]]],
             undecodable: int = 0) -> None:
         """
         Take consecutive messages.
 
-        IMU samples, shapes (N,), ns, and (N, 3), rad/s and m/s^2, and how many messages hold none.
-        Each GNSS message comes with how many of the samples are before it; of one that cannot be
-        used the arguments of `Aligner.reject` stand in its place.
+        IMU samples have the shapes (N,), ns, and (N, 3), rad/s and m/s^2; `undecodable` counts IMU
+        messages without a sample. Each GNSS message comes with the number of these samples before
+        it; one that cannot be used is replaced by the arguments of `Aligner.reject`.
         """
         aligner, position = self._aligner, 0
         for _ in range(undecodable):
@@ -86,7 +86,7 @@ class _Run:
             if isinstance(message, (Fix, Velocity))])
 
     def other_delay(self, stamps_ns: Index, samples: Array) -> str:
-        """Say that the motion, with samples of shape (N, 6), shows another delay; or ''."""
+        """Return in words that the motion shows another GNSS delay, or ''; samples are (N, 6)."""
         good = np.isfinite(samples).all(axis=1)
         motion, start = self._checks.velocities(), stamps_ns.min()
         found = fit_motion(series_of((stamps_ns[good] - start) * 1e-9, samples[good]),
@@ -100,7 +100,7 @@ class _Run:
                 f'set gnss_delay={delay:.2f}')
 
     def result(self, **of_recording: Any) -> Result:
-        """Return what came of it, at the end."""
+        """Process the rest and return the result."""
         self._epochs += self._aligner.flush(dry=True)
         return Result(config=self._config, status=self._checks.judge(self._aligner.status()),
                       epochs=in_order_of_time(self._epochs), **of_recording)
@@ -119,13 +119,13 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
     path : path
         rosbag2 directory or file, ROS 1 bag.
     config : Config, optional
-        By default all parameters at their defaults.
+        By default `Config()`.
     imu_topic, fix_topic, velocity_topic : str, optional
         Where there is more than one candidate.
     start, duration : float, optional
         Part of the recording, seconds from its start, by recorded time.
     progress : callable, optional
-        Called with how much has been read, 0 to 1.
+        Called with the share that has been read, 0 to 1.
 
     Returns
     -------
@@ -137,7 +137,7 @@ def replay(path: str | os.PathLike[str], config: Config | None = None, *,
         If the recording cannot be read, lacks a topic, or has no messages in the part asked for.
 
     """
-    from ins_align.recordings.reader import read  # with rosbags, which arrays do not need
+    from ins_align.recordings.reader import read  # needs rosbags, `align` does not
 
     run: _Run | None = None
     fixes: list[tuple[int, float, float]] = []
@@ -170,12 +170,12 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     Parameters
     ----------
     stamps : array_like, shape (N,)
-        When the IMU measured: seconds, or nanoseconds if they are integers.
+        Stamps of the IMU samples: seconds, or nanoseconds if they are integers.
     gyro, accel : array_like, shape (N, 3)
         Angular rate, rad/s, and specific force, m/s^2, forward-left-up.
     fixes : array_like, shape (K, 4), (K, 7) or (K, 13); or sequence of Fix
-        Columns: stamp, in the unit of `stamps` and of the same clock; latitude, longitude,
-        degrees; altitude, m; if known three standard deviations, m, or nine covariances, m^2,
+        Columns: stamp, in the unit and on the clock of `stamps`; latitude, longitude, degrees;
+        altitude, m; if known three standard deviations, m, or nine covariances, m^2,
         east-north-up.
     velocities : array_like, shape (L, 4), (L, 7) or (L, 13); or sequence of Velocity; or None
         Columns: stamp; east, north, up, m/s; if known three standard deviations, m/s, or nine
@@ -187,16 +187,16 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     -------
     Result
         ``initial`` and ``current``, the attitudes at t0 and at the last epoch, with covariances;
-        ``aligned``, ``status`` with the reason in words, ``epochs``. Rows with nan, or with what
-        is masked, are left out and counted in ``status.counts``.
+        ``aligned``, ``status`` with the reason in words, ``epochs``. Rows with nan or masked
+        numbers are left out and counted in ``status.counts``.
 
     Raises
     ------
     ConfigError
         If a parameter is not known, its value is wrong, or it needs a recording.
     ValueError
-        If an array has the wrong shape, or its stamps are no times, in another unit, out of order
-        by more than `gnss_lateness` or of another clock than those of the IMU.
+        If an array has the wrong shape, or its stamps are not finite, in another unit, out of
+        order by more than ``gnss_lateness``, or on another clock than those of the IMU.
 
     """
     settings = config_from_mapping(config)
@@ -204,7 +204,7 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
         raise ConfigError('base_frame and lever_arm_from_tf need the transforms of a recording, '
                           'which arrays do not have: leave them out, and set lever_arm')
     unit_ns = 1.0 if np.asarray(stamps).dtype.kind in 'iu' else 1e9
-    stamps_ns = _nanoseconds('the IMU', np.asarray(stamps), unit_ns)
+    stamps_ns = _nanoseconds('the IMU', np.ma.asarray(stamps), unit_ns)
     rates, forces = _numbers(gyro), _numbers(accel)
     for name, array in (('gyro', rates), ('accel', forces)):
         if stamps_ns.ndim != 1 or array.shape != (stamps_ns.size, 3):
@@ -218,7 +218,7 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
             _check_clock(name, [message.stamp_ns for message in found], stamps_ns)
             gnss += found
     gnss.sort(key=lambda message: message.stamp_ns)
-    # Each message comes behind the IMU samples that have its stamp or an older one.
+    # Each message follows the IMU samples up to its stamp.
     before = np.searchsorted(np.maximum.accumulate(stamps_ns),
                              [message.stamp_ns for message in gnss], side='right')
     run = _Run(settings)
@@ -232,21 +232,21 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
 
 
 def _numbers(given: Any) -> Array:
-    """Return an array of numbers, nan where one is masked."""
+    """Return an array of floats, with nan for what is masked."""
     return np.asarray(np.ma.filled(np.ma.asarray(given, float), np.nan))
 
 
 def _nanoseconds(name: str, stamps: np.ndarray, unit_ns: float) -> Index:
-    if stamps.dtype.kind not in 'iu':
-        stamps = np.round(stamps.astype(float) * unit_ns)
+    if stamps.dtype.kind not in 'iu' or np.ma.is_masked(stamps):
+        stamps = np.round(_numbers(stamps) * unit_ns)
         if not np.all(np.abs(stamps) < MAX_STAMP_NS):
             raise ValueError(f'the stamps of {name} must be seconds, or nanoseconds if those of '
-                             'the IMU are integers, without nan')
-    return stamps.astype(np.int64)
+                             'the IMU are integers, without nan and none of them masked')
+    return np.asarray(stamps).astype(np.int64)
 
 
 def _check_order(stamps_ns: Index, lateness: float) -> None:
-    """Raise ValueError where stamps of the IMU are too far apart, or further back than allowed."""
+    """Raise ValueError if stamps of the IMU are too far apart or too far out of order."""
     intervals_ns = np.diff(np.unique(stamps_ns))
     if intervals_ns.size and np.median(intervals_ns) > MAX_GAP_NS:
         raise ValueError(f'the samples of the IMU are {np.median(intervals_ns) * 1e-9:.6g} s '
@@ -261,7 +261,7 @@ def _check_order(stamps_ns: Index, lateness: float) -> None:
 
 
 def _check_clock(name: str, gnss_ns: list[int], imu_ns: Index) -> None:
-    """Raise ValueError where the times of a GNSS array have nothing in common with the IMU's."""
+    """Raise ValueError if the times of a GNSS array and of the IMU do not overlap."""
     if not gnss_ns or not imu_ns.size:
         return
     first, last, imu_first, imu_last = (
@@ -273,7 +273,7 @@ def _check_clock(name: str, gnss_ns: list[int], imu_ns: Index) -> None:
 
 
 def _messages(name: str, given: Any, kind: type, unit_ns: float, config: Config) -> list[Any]:
-    """Return fixes or velocities, of a table if that is given."""
+    """Return fixes or velocities, from messages or from a table."""
     if len(given) == 0 or all(isinstance(message, kind) for message in given):
         return list(given)
     table = _numbers(given)
@@ -289,7 +289,7 @@ def _messages(name: str, given: Any, kind: type, unit_ns: float, config: Config)
     known = table.shape[1] > 4
     covariances = np.zeros((len(table), 6, 6))
     if table.shape[1] == 7:
-        # What is below 0 is no standard deviation, and no covariance: none is known.
+        # The square keeps the sign: a negative one means that it is not known.
         covariances[:, [0, 1, 2], [0, 1, 2]] = table[:, 4:] * np.abs(table[:, 4:])
     elif known:
         covariances[:, :3, :3] = table[:, 4:].reshape(-1, 3, 3)

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What comes of a recording: the files that a command writes, named, checked, written whole."""
+"""What a command makes of a recording: its result, and output files, named and checked."""
 
 from __future__ import annotations
 
@@ -35,31 +35,31 @@ PLOT_SUFFIXES = ('.png', '.pdf', '.svg', '.jpg', '.jpeg', '.webp', '.eps', '.tif
 
 @dataclass(frozen=True)
 class Task:
-    """One recording, how to replay it and what to write; paths that hold on every machine."""
+    """One recording, how to replay it and what to write; paths other than `name` are absolute."""
 
     name: str  # of the recording, as it was given
-    arguments: dict[str, Any]  # of `replay`
-    csv: str | None = None
+    arguments: dict[str, Any]  # for `replay`
+    csv: str | None = None  # this and the following: files to write
     plot: str | None = None
     results: str | None = None
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a recording."""
+    """What a command tells of a recording."""
 
-    json: dict[str, Any]  # what --json writes of it; with an "error" there is nothing else
-    text: str = ''  # to print
+    json: dict[str, Any]  # for --json; if it has an "error", the other fields are empty
+    text: str = ''  # for standard output
     warnings: tuple[str, ...] = ()
 
 
 def not_aligned(bag: str, error: str) -> Outcome:
-    """Return the outcome of a recording that an error kept from being aligned."""
+    """Return the outcome of a recording that could not be aligned because of an error."""
     return Outcome({'bag': bag, 'aligned': False, 'error': about(bag, error)})
 
 
 def process(task: Task, progress: Callable[[float], None] | None = None) -> Outcome:
-    """Replay one recording and write its files; whatever the user can put right is an error."""
+    """Replay one recording and write its files; problems that a user can solve are an error."""
     from ins_align.offline import replay
     from ins_align.recordings import BagError
     from ins_align.report import plot, summary
@@ -87,7 +87,7 @@ def process(task: Task, progress: Callable[[float], None] | None = None) -> Outc
 
 
 def survey(bag: str) -> Outcome:
-    """Tell what a recording holds."""
+    """Inspect a recording."""
     from ins_align.recordings import BagError
     from ins_align.recordings.info import describe, inspect
 
@@ -101,9 +101,9 @@ def survey(bag: str) -> Outcome:
 
 def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any]) -> None:
     """
-    Write a file whole or not at all, with a function that gets it open.
+    Write a file whole or not at all; `write` gets the open file.
 
-    A link stays one, to a file that is replaced. What is there and is no file is not replaced.
+    The target of a link is replaced, not the link. What exists and is no file is not replaced.
     """
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():
@@ -120,7 +120,7 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any])
 
 
 def names_for(path: str, bags: Sequence[str]) -> list[str]:
-    """Name an output of each recording: of several, their own names come before the suffix."""
+    """Return an output path for each recording; with several, their names precede the suffix."""
     if len(bags) == 1:
         return [path]
     labels = [Path(bag).resolve().name.split('.')[0] or 'bag' for bag in bags]
@@ -131,7 +131,7 @@ def names_for(path: str, bags: Sequence[str]) -> list[str]:
 
 
 def about(bag: str, text: str) -> str:
-    """Let a sentence on a recording begin with the path as it was given."""
+    """Return a sentence on a recording that begins with its path as given."""
     from ins_align.recordings import one_line
 
     path = Path(bag)
@@ -143,13 +143,13 @@ def about(bag: str, text: str) -> str:
 
 
 def check_writable(path: str, inputs: Sequence[str]) -> None:
-    """Find out before the work whether its result can be written, and spoils no input."""
+    """Raise UsageError, before the work, if an output cannot be written or spoils an input."""
     if what := _in_the_way(Path(os.path.realpath(path)), list(map(os.path.realpath, inputs))):
         raise UsageError(f'cannot write {path}: {what}')
 
 
 def _in_the_way(target: Path, inputs: Sequence[str]) -> str:
-    """Say why nothing should be written there; both without links."""
+    """Return why nothing should be written there, or ''; links are resolved in all paths."""
     from ins_align.recordings.bag import begins_like_a_recording, STORAGE_NAME
 
     folder = target.parent
@@ -168,7 +168,7 @@ def _in_the_way(target: Path, inputs: Sequence[str]) -> str:
 
 
 def check_plot(path: str) -> None:
-    """Find out before the work whether a figure can be drawn in the format that is asked for."""
+    """Raise an error, before the work, if a figure cannot be drawn in the format of the name."""
     if Path(path).suffix.lower() not in PLOT_SUFFIXES:
         raise UsageError(f'cannot draw {path}: its name must end with one of '
                          f'{", ".join(PLOT_SUFFIXES)}')

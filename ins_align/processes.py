@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Many tasks in processes, here or on a Dask cluster, and the threads that each may take."""
+"""Tasks in several processes, here or on a Dask cluster, and the threads that each may use."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ def processors() -> int:
 
 def keep_to_one() -> None:
     """
-    Let linear algebra libraries that are not loaded yet keep to one thread, unless told otherwise.
+    Limit linear algebra libraries that are not loaded yet to one thread, if nothing else is set.
 
-    Small matrices, now and then: more threads would not share that work, they would wait for more
-    of it in a busy loop and take the processor from who has some.
+    The matrices here are too small to be shared out. More threads would only wait in a busy loop,
+    which takes processor time from other processes.
     """
     for variable in VARIABLES:
         os.environ.setdefault(variable, '1')
 
 
 def _serve_parent(folder: str) -> None:
-    """Leave Ctrl-C and a folder for what is unpacked to the parent; end when it is killed."""
+    """Set up a worker: the parent handles Ctrl-C and removes the folder; end when it ends."""
     tempfile.tempdir = folder
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -67,10 +67,10 @@ def _end_with_parent() -> None:
 def run_all(function: Callable[[Any], T], tasks: Sequence[Any], jobs: int | None,
             ) -> Iterator[T | Exception]:
     """
-    Do tasks in so many processes; yield in their order what a function returns of each.
+    Call a function with each task in `jobs` processes; yield the results in order.
 
-    By default one process a processor; one job is this process. Where the process of a task is
-    gone, the exception that says so takes the place of what it should have returned.
+    The default is one process per processor; one job runs in this process. If the process of a
+    task dies, the exception that says so takes the place of its result.
     """
     jobs = min(jobs or processors(), len(tasks))
     if jobs <= 1:
@@ -91,20 +91,20 @@ def run_all(function: Callable[[Any], T], tasks: Sequence[Any], jobs: int | None
 def run_on_cluster(function: Callable[[Any], T], tasks: Sequence[Any], address: str,
                    ) -> Iterator[T | Exception]:
     """
-    Do tasks on a Dask cluster, otherwise as `run_all`; a UsageError says that there is none.
+    Run tasks on a Dask cluster, otherwise as `run_all`; UsageError if no scheduler answers.
 
-    The workers read and write the files: they need the same folders as this machine. What a worker
-    that dies had in hand, another one does again; files are replaced as a whole.
+    The workers read and write the files, so they need the same folders as this machine. If a
+    worker dies, another one repeats its tasks, which does no harm: files are written whole.
     """
     import asyncio
 
     from distributed import Client
 
     try:
-        # A client by itself waits for a stranger for ever.
+        # A client waits for ever if something else than a scheduler answers.
         asyncio.run(asyncio.wait_for(_ask_scheduler(address), CONNECT_TIMEOUT))
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
-    except Exception as error:  # strangers answer all kinds of things
+    except Exception as error:  # another server may answer anything
         reason = f'{type(error).__name__}: {error}'.partition('\n')[0].rstrip(': ')
         raise UsageError(f'no Dask scheduler answers at {address} ({reason}); an address is '
                          'like tcp://localhost:8786') from None
@@ -112,12 +112,12 @@ def run_on_cluster(function: Callable[[Any], T], tasks: Sequence[Any], address: 
         try:
             yield from _in_order(executor, function, tasks, Exception)
         finally:
-            executor.shutdown(wait=False)       # nobody asks for what has not begun
+            executor.shutdown(wait=False)       # cancels the remaining tasks
 
 
 def _in_order(executor: Executor, function: Callable[[Any], T], tasks: Sequence[Any],
               lost: type[Exception]) -> Iterator[T | Exception]:
-    """Yield what comes of tasks; `lost` says that whoever worked on one is gone."""
+    """Yield the results of tasks, or the error where `lost` says that the worker is gone."""
     for future in [executor.submit(function, task) for task in tasks]:
         try:
             yield future.result()
@@ -126,12 +126,12 @@ def _in_order(executor: Executor, function: Callable[[Any], T], tasks: Sequence[
 
 
 async def _ask_scheduler(address: str) -> None:
-    """Raise whatever tells that there is no scheduler."""
+    """Raise an error of any kind unless a scheduler answers."""
     from distributed import Security
     from distributed.comm import get_address_host_port
     from distributed.core import rpc
 
-    get_address_host_port(address)  # there is a port
+    get_address_host_port(address)  # raises if there is no port
     arguments = Security().get_connection_args('client')
     async with rpc(address, connection_args=arguments) as scheduler:
         if 'workers' not in await scheduler.identity():

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What a person sees of a result: the table and the picture of a replay."""
+"""The table and the figure of a replay."""
 
 from __future__ import annotations
 
@@ -35,26 +35,26 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-CHANGES_AT_ENDS = 3  # of the state: the first and the last so many are in the table
-# Okabe and Ito's palette, which the colour-blind can tell apart.
+CHANGES_AT_ENDS = 3  # so many first and last changes of the state are in the table
+# Okabe and Ito's palette for colour-blind readers.
 STATE_COLOURS = {
     State.WAITING_FOR_IMU: '#999999', State.WAITING_FOR_GNSS: '#999999',
     State.ALIGNING: '#E69F00', State.LEVELLED: '#56B4E9', State.ALIGNED: '#009E73',
     State.FAULT: '#D55E00'}
 COLOURS = '#0072B2', '#CC79A7', '#D55E00'  # roll, pitch, yaw; x, y, z; east, north, up
 HEADING = COLOURS[2]
-INNOVATION_LIMIT = 5.0  # sigmas shown at least
-LOST_SIGMA_DEG = 60.0  # above this a heading is not worth drawing
-THIN = {'linewidth': 0.8, 'linestyle': ':'}  # of a limit
+INNOVATION_LIMIT = 5.0  # least end of the axis of innovations, sigmas
+LOST_SIGMA_DEG = 60.0  # an angle with a larger sigma is not drawn
+THIN = {'linewidth': 0.8, 'linestyle': ':'}  # for lines that show limits
 
 
 def format_table(rows: Sequence[Sequence[Any]], header: Sequence[str] = (),
                  indent: str = '') -> str:
     """
-    Align columns of text: the first to the left, all others to the right.
+    Return a table as text, with the first column aligned to the left, the others to the right.
 
-    Cells are text; floats get four significant digits, None is a dash. An indent is in front of
-    every line; there is no newline at the end.
+    Floats are written with four significant digits, None as a dash. `indent` begins every line;
+    there is no newline at the end.
     """
     cells = [[_cell(cell) for cell in row] for row in rows]
     if header:
@@ -79,10 +79,10 @@ def _cell(value: Any) -> str:
 
 
 def summary(result: Result) -> str:
-    """Return the table that ``ins_align replay`` prints of a recording."""
+    """Return what ``ins_align replay`` prints of a recording."""
     status = result.status
     lines = [result.bag, *_wrapped(f'{result.state_in_words}: {status.reason}', '  '),
-             *_list_of_changes(result)]
+             *_changes(result)]
     declared = None if status.initial is None else result.declared
     rows = []
     for name, attitude in (
@@ -115,12 +115,12 @@ def summary(result: Result) -> str:
     return '\n'.join(lines)
 
 
-def _list_of_changes(result: Result) -> list[str]:
-    """Tell each change of the state, of many the first and the last."""
+def _changes(result: Result) -> list[str]:
+    """Return lines on the changes of the state; of many, on the first and the last ones."""
     told = [_wrapped(f'{span.first.state.value}: {span.reason}', f'  {span.first.t_s:8.1f} s  ')
             for span in result.spans]
     if len(told) < 2:
-        return []  # what it says is the state at the end
+        return []  # it is the final state, which is shown anyway
     left_out = len(told) - 2 * CHANGES_AT_ENDS
     if left_out > 1:
         told[CHANGES_AT_ENDS:-CHANGES_AT_ENDS] = [
@@ -129,7 +129,7 @@ def _list_of_changes(result: Result) -> list[str]:
 
 
 def _wrapped(text: str, begin: str) -> list[str]:
-    """Break a sentence into lines as wide as the terminal, of which the others are indented."""
+    """Break a sentence into lines as wide as the terminal, with a hanging indent."""
     return textwrap.wrap(
         text, max(shutil.get_terminal_size().columns, 2 * len(begin)), initial_indent=begin,
         subsequent_indent=' ' * (len(begin) + 2), break_long_words=False, break_on_hyphens=False)
@@ -145,13 +145,13 @@ def _nuisance_table(result: Result) -> str:
             ('GNSS delay, s', 1.0, status.gnss_delay, status.gnss_delay_std)):
         values, sigmas = np.atleast_1d(value) * scale, np.atleast_1d(std) * scale
         rows.append([name, *(f'{number:+.4f}' for number in values), *[''] * (3 - len(values)),
-                     # 0: given, not estimated
+                     # Sigma 0: configured and not estimated.
                      *(f'{sigma:.4f}' if sigma else '-' for sigma in sigmas)])
     return format_table(rows, ['estimate', 'x', 'y', 'z', 'sigma x', 'y', 'z'], '  ')
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure that needs no display, inches."""
+    """Return an empty figure, inches, that needs no display."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -162,29 +162,30 @@ def new_figure(width: float, height: float) -> Figure:
 
 def plot(result: Result) -> Figure:
     """
-    Draw the picture of a recording.
+    Draw the figure of a recording.
 
-    Attitude with its sigma, where it was declared, the sigmas against their thresholds, normalised
-    innovations, biases, the error where there is a reference, and the track by state.
+    It shows the attitude with its sigma and the times when it was declared, the sigmas and their
+    thresholds, normalised innovations, biases, the track by state, and errors if there is a
+    reference.
     """
-    series = _Series(result)
+    history = _History(result)
     figure = new_figure(16.0, 11.0)
     figure.suptitle(f'{one_line(Path(result.bag).name or result.bag)}: {result.state_in_words}',
                     fontsize=13, parse_math=False)
     left, right = map(figure.add_subfigure, figure.add_gridspec(1, 2, width_ratios=(3, 2)))
     tilt, yaw, sigmas, innovations = left.subplots(4, 1, sharex=True)
-    heights = [1.0] * (2 if series.errors is None else 3) + [2.2]
+    heights = [1.0] * (2 if history.errors is None else 3) + [2.2]
     gyro, accel, *error, way = right.subplots(len(heights), 1, height_ratios=heights)
-    _angles(tilt, 'roll, pitch (deg)', series, result, {'roll': 0, 'pitch': 1})
-    _angles(yaw, 'yaw (deg, counter-\nclockwise from east)', series, result, {'yaw': 2})
-    _sigmas(sigmas, series, result)
-    _innovations(innovations, series)
-    _biases(gyro, 'gyro bias (deg/s)', series.time, np.degrees(series.gyro_bias),
+    _angles(tilt, 'roll, pitch (deg)', history, result, {'roll': 0, 'pitch': 1})
+    _angles(yaw, 'yaw (deg, counter-\nclockwise from east)', history, result, {'yaw': 2})
+    _sigmas(sigmas, history, result)
+    _innovations(innovations, history)
+    _biases(gyro, 'gyro bias (deg/s)', history.time, np.degrees(history.gyro_bias),
             np.degrees(result.status.gyro_bias_std))
-    _biases(accel, 'accelerometer\nbias (m/s\u00b2)', series.time, series.accel_bias,
+    _biases(accel, 'accelerometer\nbias (m/s\u00b2)', history.time, history.accel_bias,
             result.status.accel_bias_std)
     for axes in error:
-        _errors(axes, series)
+        _errors(axes, history)
     _track(way, result)
     upper = [gyro, accel, *error]
     for axes in upper[:-1]:
@@ -200,12 +201,11 @@ def plot(result: Result) -> Figure:
     return figure
 
 
-class _Series:
+class _History:
     """
-    A result's epochs as arrays over time.
+    The epochs of a result as arrays over time.
 
-    Epochs without GNSS and those without an attitude, as where an alignment starts over, are rows
-    of nan, so that nothing is drawn across them.
+    Epochs without GNSS or without an attitude are rows of nan, so that no line is drawn across.
     """
 
     def __init__(self, result: Result) -> None:
@@ -234,68 +234,68 @@ class _Series:
 
 
 def _sigma(attitude: Attitude) -> list[float]:
-    """Return sigmas of roll, pitch and yaw, degrees: of the first two the larger one of level."""
+    """Return sigmas of roll, pitch and yaw, degrees: that of tilt, the larger one, twice."""
     east, north, up = attitude.sigma_deg.tolist()
     return [max(east, north), max(east, north), up]
 
 
 def _broken_at_wraps(angle: Array, *arrays: Array) -> Iterator[Array]:
-    """Put a gap into arrays where a line would run from one end of the scale to the other."""
+    """Yield the arrays with a gap where the angle wraps from one end of the scale to the other."""
     wraps = np.flatnonzero(np.abs(np.diff(angle)) > 180.0) + 1
     return (np.insert(array, wraps, np.nan) for array in arrays)
 
 
-def _angles(axes: Axes, label: str, series: _Series, result: Result,
+def _angles(axes: Axes, label: str, history: _History, result: Result,
             columns: dict[str, int]) -> None:
-    """Draw angles with the reference, and as they were declared: at their t0."""
+    """Draw angles with the reference, and the declared ones at their t0."""
     axes.set_ylabel(label)
-    if not np.isfinite(series.time).any():
+    if not np.isfinite(history.time).any():
         axes.text(0.5, 0.5, 'no attitude', transform=axes.transAxes, ha='center')
         return
     bands = []
     for name, column in columns.items():
-        sigma = series.sigma[:, column]
-        angle = np.where(sigma < LOST_SIGMA_DEG, series.angles[:, column], np.nan)
-        time, angle, sigma = _broken_at_wraps(angle, series.time, angle, sigma)
+        sigma = history.sigma[:, column]
+        angle = np.where(sigma < LOST_SIGMA_DEG, history.angles[:, column], np.nan)
+        time, angle, sigma = _broken_at_wraps(angle, history.time, angle, sigma)
         axes.plot(time, angle, color=COLOURS[column], linewidth=2.0, label=name)
         bands.append((name, column, time, angle - sigma, angle + sigma))
-    if series.reference is not None:
-        for angle in series.reference[:, [*columns.values()]].T:
-            axes.plot(*_broken_at_wraps(angle, series.time, angle), 'k--', linewidth=0.8,
+    if history.reference is not None:
+        for angle in history.reference[:, [*columns.values()]].T:
+            axes.plot(*_broken_at_wraps(angle, history.time, angle), 'k--', linewidth=0.8,
                       label='reference')
     if (declared := result.declared) is not None:
         for column in columns.values():
             axes.errorbar(result.t_s(declared), declared.roll_pitch_yaw_deg[column],
                           _sigma(declared)[column], fmt='kD', markersize=4.0, capsize=3.0,
                           label='declared, at its t0')
-    limits = axes.get_ylim()  # the first sigmas would make flat lines of the angles
+    limits = axes.get_ylim()  # the first, wide part of the bands must not set them
     for name, column, time, low, high in bands:
         axes.fill_between(time, low, high, color=COLOURS[column], alpha=0.25, linewidth=0,
                           label=f'{name}, 1 sigma')
     axes.set_ylim(limits)
 
 
-def _sigmas(axes: Axes, series: _Series, result: Result) -> None:
+def _sigmas(axes: Axes, history: _History, result: Result) -> None:
     axes.set_ylabel('1 sigma (deg)')
     axes.set_yscale('log')
     for name, column, threshold in (('tilt', 0, result.config.tilt_std_threshold),
                                     ('heading', 2, result.config.heading_std_threshold)):
         colour = COLOURS[column]
-        axes.plot(series.time, series.sigma[:, column], color=colour, linewidth=1.2,
+        axes.plot(history.time, history.sigma[:, column], color=colour, linewidth=1.2,
                   label=f'{name}, current')
-        axes.plot(series.time, series.initial_sigma[:, column], ':', color=colour, linewidth=1.0,
+        axes.plot(history.time, history.initial_sigma[:, column], ':', color=colour, linewidth=1.0,
                   label=f'{name}, at t0')
         axes.axhline(threshold, color=colour, linestyle='--', linewidth=0.8, label='threshold')
 
 
-def _innovations(axes: Axes, series: _Series) -> None:
+def _innovations(axes: Axes, history: _History) -> None:
     axes.set_ylabel('innovation of\nthe GNSS (sigma)')
-    if not np.isfinite(series.innovations).any():
+    if not np.isfinite(history.innovations).any():
         return
-    # Outliers may be anything: they are drawn at the edge.
-    limit = max(INNOVATION_LIMIT, 1.5 * float(np.nanquantile(np.abs(series.innovations), 0.99)))
-    for name, colour, values in zip(('east', 'north', 'up'), COLOURS, series.innovations.T):
-        axes.plot(series.time, values.clip(-limit, limit), '.', color=colour, markersize=3.0,
+    # Outliers may be of any size; they are drawn at the edge.
+    limit = max(INNOVATION_LIMIT, 1.5 * float(np.nanquantile(np.abs(history.innovations), 0.99)))
+    for name, colour, values in zip(('east', 'north', 'up'), COLOURS, history.innovations.T):
+        axes.plot(history.time, values.clip(-limit, limit), '.', color=colour, markersize=3.0,
                   label=name)
     for level in (3.0, -3.0):
         axes.axhline(level, color='black', label='3 sigma', **THIN)
@@ -303,7 +303,7 @@ def _innovations(axes: Axes, series: _Series) -> None:
 
 
 def _biases(axes: Axes, label: str, time: Array, biases: Array, std: Array) -> None:
-    """Draw three biases, and at the end how well they are known."""
+    """Draw three biases, with their sigma at the end."""
     axes.set_ylabel(label)
     known = np.flatnonzero(np.isfinite(time))
     if not known.size:
@@ -313,15 +313,15 @@ def _biases(axes: Axes, label: str, time: Array, biases: Array, std: Array) -> N
     for colour, value, sigma in zip(COLOURS, biases[known[-1]], std):
         axes.errorbar(time[known[-1]], value, sigma, fmt='none', ecolor=colour, capsize=3.0,
                       label='1 sigma at the end')
-    settled = biases[known[len(known) // 10:]]  # the first seconds tell nothing yet
+    settled = biases[known[len(known) // 10:]]  # the first estimates vary too much
     low, high = settled.min() - std.max(), settled.max() + std.max()
     margin = 0.1 * (high - low) or 1.0
     axes.set_ylim(low - margin, high + margin)
 
 
-def _errors(axes: Axes, series: _Series) -> None:
+def _errors(axes: Axes, history: _History) -> None:
     axes.set_ylabel('error against\nreference (deg)')
-    errors = series.errors
+    errors = history.errors
     assert errors is not None
     finite = np.isfinite(errors).all(axis=1)
     if not finite.any():
@@ -329,20 +329,19 @@ def _errors(axes: Axes, series: _Series) -> None:
                   transform=axes.transAxes, ha='center')
         return
     for name, colour, values in zip(('roll', 'pitch', 'yaw'), COLOURS, errors.T):
-        axes.plot(series.time, values, color=colour, linewidth=1.0, label=name)
+        axes.plot(history.time, values, color=colour, linewidth=1.0, label=name)
     for level in (3.0, -3.0):
-        axes.plot(series.time, level * series.sigma[:, 2], color=HEADING,
+        axes.plot(history.time, level * history.sigma[:, 2], color=HEADING,
                   label='heading, 3 sigma', **THIN)
-    # What is seen of an error is its end: its first seconds, of every start, are as large as an
-    # angle can be.
-    settled = finite & (series.aligned if series.aligned.any()
-                        else series.time >= np.median(series.time[finite]))
+    # The axis fits the errors after convergence; the first ones after a start may be of any size.
+    settled = finite & (history.aligned if history.aligned.any()
+                        else history.time >= np.median(history.time[finite]))
     limit = max(1.0, 2.0 * float(np.abs(errors[settled if settled.any() else finite]).max()))
     axes.set_ylim(-limit, limit)
 
 
 def _track(axes: Axes, result: Result) -> None:
-    """Draw the fixes by the state at each."""
+    """Draw the fixes, coloured by state."""
     axes.set_xlabel('east (m)')
     axes.set_ylabel('north (m)')
     axes.set_aspect('equal', adjustable='datalim')
@@ -350,7 +349,7 @@ def _track(axes: Axes, result: Result) -> None:
     if not len(fixes):
         return
     east, north = track(Series(fixes[:, 0], fixes[:, 1:])).vectors.T
-    epochs = sorted(result.epochs, key=attrgetter('stamp_ns'))  # a clock may have been set back
+    epochs = sorted(result.epochs, key=attrgetter('stamp_ns'))  # the clock may have been set back
     stamps = np.array([epoch.stamp_ns for epoch in epochs], float)
     index = np.searchsorted(stamps, fixes[:, 0], side='right') - 1
     states = [epochs[i].state if i >= 0 else State.WAITING_FOR_GNSS for i in index]
@@ -364,7 +363,7 @@ def _track(axes: Axes, result: Result) -> None:
 
 
 def _shade(axes: Axes, result: Result, named: bool) -> None:
-    """Shade the times that were declared; one legend with the names is enough."""
+    """Shade the times in which something was declared; label them if `named`."""
     for words, state in (('roll and pitch declared', State.LEVELLED),
                          ('declared aligned', State.ALIGNED)):
         for first, last in result.spans_of(state):
@@ -374,7 +373,7 @@ def _shade(axes: Axes, result: Result, named: bool) -> None:
 
 
 def _add_legend(axes: Axes, columns: int) -> None:
-    """Put a legend above the axes, where nothing that is drawn can lie under it."""
+    """Put a legend above the axes, where it covers nothing; equal labels appear once."""
     handles: dict[str, Any] = {}
     for handle, name in zip(*axes.get_legend_handles_labels()):
         handles.setdefault(name, handle)

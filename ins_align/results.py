@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What an alignment yields: its state, attitudes, epochs, events, the status."""
+"""Results of an alignment: state, attitudes, epochs, events, status; as JSON and table."""
 
 from __future__ import annotations
 
@@ -33,11 +33,12 @@ if TYPE_CHECKING:
     from ins_align.recordings.reader import Topics
 
 OK, WARN, ERROR = range(3)  # levels of diagnostic_msgs/DiagnosticStatus
-MAX_REFERENCE_GAP_NS = 1_500_000_000  # the reference is not interpolated over more
+MAX_REFERENCE_GAP_NS = 1_500_000_000  # the reference is not interpolated over longer gaps
 
-# Estimates beside the attitude, with the unit as it stands in names.
+# Estimates other than the attitude, with the unit as written in names of outputs.
 ESTIMATES = {'gyro_bias': 'rad_s', 'accel_bias': 'm_s2', 'lever_arm': 'm', 'gnss_delay': 's'}
-FOR_PLOTS = 'roll_pitch_yaw_deg', 'sigma_deg'  # of an attitude: topics too, and of these names
+# Properties of an attitude that also have topics of these names, for plotting.
+FOR_PLOTS = 'roll_pitch_yaw_deg', 'sigma_deg'
 _ATTITUDE_COLUMNS = 'qx,qy,qz,qw,sigma_e_deg,sigma_n_deg,sigma_u_deg'
 CSV_HEADER = 'stamp_ns,t_s,state,' + ','.join(
     prefix + name for prefix in ('', 'current_') for name in _ATTITUDE_COLUMNS.split(','))
@@ -63,7 +64,7 @@ class Verdict:
 
 
 class Severity(Enum):
-    """How a log shows an event."""
+    """Severity of an event in a log."""
 
     INFO = 'info'
     WARNING = 'warning'
@@ -71,7 +72,7 @@ class Severity(Enum):
 
 
 class Event(NamedTuple):
-    """A sentence worth a log line."""
+    """A sentence for the log."""
 
     severity: Severity
     text: str
@@ -83,16 +84,16 @@ class Attitude:
 
     stamp_ns: int
     C_nb: Array  #: (3, 3), body to ENU
-    covariance: Array  #: (3, 3), of the small rotation about the axes of ENU, rad^2
+    covariance: Array  #: (3, 3), of the attitude error as a rotation about east, north, up, rad^2
 
     @cached_property
     def quaternion_xyzw(self) -> Array:
-        """Body to ENU, w >= 0, shape (4,)."""
+        """Quaternion, body to ENU, w >= 0, shape (4,)."""
         return quaternion_from_matrix(self.C_nb)
 
     @cached_property
     def roll_pitch_yaw_deg(self) -> list[float]:
-        """Degrees; nose down is positive pitch (REP-103), yaw is counter-clockwise from east."""
+        """Roll, pitch, yaw, degrees: pitch positive nose down, yaw counter-clockwise from east."""
         return list(np.degrees(roll_pitch_yaw(self.C_nb)).tolist())
 
     @property
@@ -102,17 +103,17 @@ class Attitude:
 
     @property
     def pitch_deg(self) -> float:
-        """Pitch, degrees; nose down is positive (REP-103)."""
+        """Pitch, degrees, positive nose down (REP-103)."""
         return self.roll_pitch_yaw_deg[1]
 
     @property
     def yaw_deg(self) -> float:
-        """Heading as yaw: degrees counter-clockwise from east."""
+        """Yaw, degrees counter-clockwise from east."""
         return self.roll_pitch_yaw_deg[2]
 
     @property
     def heading_deg(self) -> float:
-        """Heading as a compass has it: degrees clockwise from true north, 0 to 360."""
+        """Heading, degrees clockwise from true north, 0 to 360."""
         return (90.0 - self.yaw_deg) % 360.0
 
     @property
@@ -123,39 +124,39 @@ class Attitude:
 
 @dataclass(frozen=True)
 class Epoch:
-    """What came of an epoch."""
+    """State and estimates after an epoch."""
 
     stamp_ns: int
     t_s: float  #: s since the first t0
     state: State
     initial: Attitude | None  #: at t0
     current: Attitude | None  #: at this epoch
-    #: (3,), east, north, up: what the measured velocity (or position, where only that is used) did
-    #: not agree with the estimate before it, over its sigma; nan where nothing was tested.
+    #: (3,), east, north, up: innovation of the velocity (of the position where only that is
+    #: used) over its sigma; nan where nothing was tested.
     innovation: Array
     gyro_bias: Array  #: (3,), rad/s
     accel_bias: Array  #: (3,), m/s^2
-    dry: bool = False  #: whether it is without GNSS, on the way through an outage
-    reason: str = ''  #: for the state
-    #: Why the alignment started over since the epoch before; empty where it did not.
+    dry: bool = False  #: whether the epoch has no measurement and only divides a GNSS outage
+    reason: str = ''  #: why the state is as it is
+    #: Why the alignment started over since the previous epoch; empty if it did not.
     started_over: str = ''
 
 
 class Span(NamedTuple):
-    """Consecutive epochs of one alignment in one state: the first and the last of them."""
+    """The first and last of consecutive epochs of one alignment in one state."""
 
     first: Epoch
     last: Epoch
 
     @property
     def reason(self) -> str:
-        """Return why it began: for the state, and where the alignment started over."""
+        """Return why the span began: the reason for the state, after that of a restart."""
         return '; '.join(filter(None, [self.first.started_over, self.first.reason]))
 
 
 @dataclass(frozen=True)
 class Nuisance:
-    """Estimates beside the attitude at the last epoch, with their sigmas."""
+    """Estimates other than the attitude, at the last epoch, with their sigmas."""
 
     gyro_bias: Array  #: (3,), rad/s
     gyro_bias_std: Array
@@ -163,12 +164,12 @@ class Nuisance:
     accel_bias_std: Array
     lever_arm: Array  #: (3,), IMU to antenna in the IMU frame, m
     lever_arm_std: Array
-    gnss_delay: float  #: of the GNSS behind its stamps, s
+    gnss_delay: float  #: by which a measurement is older than its stamp, s
     gnss_delay_std: float
 
     @classmethod
     def configured(cls, config: Config) -> 'Nuisance':
-        """Return what is known before the first epoch."""
+        """Return what the configuration says, for use before the first epoch."""
         noise, zero = config.imu_noise, np.zeros(3)
         return cls(zero, np.full(3, noise.gyro_bias_std), zero, np.full(3, noise.accel_bias_std),
                    np.array(config.lever_arm), np.full(3, config.lever_arm_std),
@@ -177,7 +178,7 @@ class Nuisance:
 
 @dataclass(frozen=True, kw_only=True)
 class Status(Nuisance):
-    """The aligner's state in numbers: stamps and times, attitudes, estimates, counts."""
+    """The state of an alignment, with its reason, attitudes, estimates and counts."""
 
     state: State
     reason: str
@@ -191,10 +192,10 @@ class Status(Nuisance):
 
 class Reference:
     """
-    The attitude that a recording carries to compare with.
+    The reference attitude of a recording, to compare with.
 
-    Made of stamps, ns, and quaternions of `ImuSamples.orientations`, one part or more in any
-    order; of one stamp the first counts.
+    Each part, of one or more in any order, is stamps, ns, and quaternions as from
+    `ImuSamples.orientations`. Of equal stamps the first counts.
     """
 
     def __init__(self, *parts: tuple[np.ndarray, np.ndarray]) -> None:
@@ -203,7 +204,7 @@ class Reference:
         self._quaternions = quaternions[first]
 
     def attitude_at(self, stamp_ns: int) -> Array | None:
-        """Return ``C_nb``, shape (3, 3), interpolated; None where there is none close by."""
+        """Return ``C_nb``, shape (3, 3), interpolated; None outside and in long gaps."""
         after = int(np.searchsorted(self._stamps_ns, stamp_ns))
         if after < len(self._stamps_ns) and self._stamps_ns[after] == stamp_ns:
             return matrix_from_quaternion(self._quaternions[after])
@@ -217,7 +218,7 @@ class Reference:
             @ C_before
 
     def errors_deg(self, attitude: Attitude) -> Array:
-        """Return roll, pitch, yaw less the reference's, degrees, (3,); nan where it is not."""
+        """Return errors of roll, pitch, yaw, degrees, shape (3,); nan without a reference."""
         C_reference = self.attitude_at(attitude.stamp_ns)
         if C_reference is None:
             return np.full(3, np.nan)
@@ -227,21 +228,21 @@ class Reference:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Result:
-    """What came of an alignment of recorded data."""
+    """Result of an alignment of recorded data."""
 
     config: Config
     status: Status  #: at the end
-    epochs: tuple[Epoch, ...]  #: those without GNSS, too
-    bag: str = ''  #: path of the recording; empty, as is the rest, where arrays were aligned
+    epochs: tuple[Epoch, ...]  #: including those that divide outages
+    bag: str = ''  #: path of the recording; this and the following are empty for arrays
     warnings: tuple[str, ...] = ()
     reference: Reference | None = None
     topics: Topics | None = None
-    #: (K, 3), of usable fixes: stamp, ns; latitude and longitude, degrees.
+    #: (K, 3), usable fixes: stamp, ns; latitude and longitude, degrees.
     track: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def initial(self) -> Attitude | None:
-        """Return the attitude at t0 as it is known at the end."""
+        """Return the attitude at t0 as estimated at the end."""
         return self.status.initial
 
     @property
@@ -256,13 +257,13 @@ class Result:
 
     @property
     def declared(self) -> Attitude | None:
-        """Return the initial attitude as the node publishes it at the last declaration."""
+        """Return the initial attitude as the node would publish it at the last declaration."""
         aligned = self.spans_of(State.ALIGNED)
         return aligned[-1].first.initial if aligned else None
 
     @cached_property
     def spans(self) -> list[Span]:
-        """Return how the state changed, from the first epoch on, with what is said at the end."""
+        """Return the sequence of states, with that of the final status if it differs."""
         status = self.status
         end = [dataclasses.replace(epoch, state=status.state, reason=status.reason,
                                    started_over='')
@@ -276,12 +277,12 @@ class Result:
         return spans
 
     def spans_of(self, state: State) -> list[Span]:
-        """Return the times in a state."""
+        """Return the spans in a state."""
         return [span for span in self.spans if span.first.state is state]
 
     @property
     def state_in_words(self) -> str:
-        """Return the state at the end, when ALIGNED was declared first, s since the first t0."""
+        """Return the final state and when ALIGNED was first declared, s since the first t0."""
         state, aligned = self.status.state.value, self.spans_of(State.ALIGNED)
         if not aligned:
             return state
@@ -299,7 +300,7 @@ class Result:
         return f'Result({self.state_in_words}, {attitude}, {len(self.epochs)} epochs)'
 
     def t_s(self, attitude: Attitude) -> float:
-        """Return the time of an attitude, s since the first t0, on the clock of its stamp."""
+        """Return the time of `initial`, `declared` or `current`, s since the first t0."""
         epoch = (self.spans_of(State.ALIGNED)[-1].first if attitude is self.declared
                  else self.epochs[-1])
         return epoch.t_s - (epoch.stamp_ns - attitude.stamp_ns) * 1e-9
@@ -332,7 +333,7 @@ class Result:
         return content
 
     def to_csv(self) -> str:
-        """Return the table that ``--csv`` writes, a row per GNSS epoch."""
+        """Return the table that ``--csv`` writes, with a row per GNSS epoch."""
         epochs = [epoch for epoch in self.epochs if not epoch.dry]
         rows = zip([f'{epoch.stamp_ns},{epoch.t_s:.9f},{epoch.state.value}' for epoch in epochs],
                    _attitude_cells([epoch.initial for epoch in epochs]),
@@ -341,7 +342,7 @@ class Result:
 
 
 def _attitude_cells(attitudes: Sequence[Attitude | None]) -> Iterator[str]:
-    """Yield the columns of each attitude, all converted at a time; empty where there is none."""
+    """Yield the cells of each attitude, empty where there is none; converts all at once."""
     unknown = np.full((2, 3, 3), np.nan)
     C_nb, covariances = np.array([
         unknown if each is None else (each.C_nb, each.covariance) for each in attitudes
@@ -352,7 +353,7 @@ def _attitude_cells(attitudes: Sequence[Attitude | None]) -> Iterator[str]:
 
 
 def in_order_of_time(epochs: Iterable[Epoch]) -> tuple[Epoch, ...]:
-    """Let `Epoch.t_s` go on where it counts anew, since a clock was set back."""
+    """Return epochs whose `t_s` increases also where it begins anew after a clock was set back."""
     before_s = last_s = 0.0
     moved = []
     for epoch in epochs:
@@ -364,7 +365,7 @@ def in_order_of_time(epochs: Iterable[Epoch]) -> tuple[Epoch, ...]:
 
 
 def base_attitude(attitude: Attitude | None, base: Transform | None) -> Attitude | None:
-    """Return the attitude of the base; None where it or that of the IMU is not known."""
+    """Return the attitude of the base frame; None if the attitude or the base is unknown."""
     if attitude is None or base is None:
         return None
     return dataclasses.replace(attitude, C_nb=attitude.C_nb @ base.rotation)
@@ -380,20 +381,20 @@ def attitude_json(attitude: Attitude | None, stamped: bool = False) -> dict[str,
 
 
 def _finite(value: Any) -> Any:
-    """Return a number or an array as JSON has it: None for what is not finite."""
+    """Return a number or an array for JSON, with None for what is not finite."""
     if np.ndim(value):
         return [_finite(each) for each in value]
     return float(value) if math.isfinite(value) else None
 
 
 def level_of(state: State) -> int:
-    """Return the level of a state in diagnostics."""
+    """Return the level of a state in `diagnostic_msgs`."""
     return {State.ALIGNED: OK, State.FAULT: ERROR}.get(state, WARN)
 
 
 def status_values(status: Status, base_frame: str = '', base: Transform | None = None,
                   ) -> dict[str, str]:
-    """Return a status, with the attitude of a base, as names and texts, angles in degrees."""
+    """Return a status, with the attitude of a base frame, as texts by name; angles in degrees."""
     values: dict[str, Any] = {
         'state': status.state.value, 'reason': status.reason, 'stamp_ns': status.stamp_ns,
         't0_ns': status.t0_ns, 'time_to_align_s': status.time_to_align_s}
@@ -415,6 +416,8 @@ def status_values(status: Status, base_frame: str = '', base: Transform | None =
 
 
 def _text(value: Any) -> str:
-    if value is None or isinstance(value, (str, int)):
-        return '' if value is None else str(value)
+    if value is None:
+        return ''
+    if isinstance(value, (str, int)):
+        return str(value)
     return ' '.join(f'{number:.6g}' for number in np.atleast_1d(value))

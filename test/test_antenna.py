@@ -197,6 +197,18 @@ def test_gravity_is_in_doubt_by_the_way_since_the_last_gnss(velocity):
     assert math.sqrt(variance) == pytest.approx(9.8 * speed * 40.0 ** 2 / 2 / RADIUS, rel=0.01)
 
 
+def test_a_velocity_that_stopped_coming_says_nothing_of_a_later_speed():
+    """As if there had been none: 100 s at rest with velocities, then fixes alone at 30 m/s."""
+    density = []
+    for velocities in (100, 0):
+        antenna = Antenna(Config(), Counter())
+        for k in range(300):
+            north = max(30.0 * (k - 100), 0.0)
+            antenna.epoch(told(k * SECOND, north, (0.0, 0.0, 0.0) if k < velocities else None))
+        density.append(antenna.gravity_drift(319 * SECOND))
+    assert density[0] == density[1] == pytest.approx(9.78 * 30.0 / RADIUS * 20.0 ** 1.5, rel=0.01)
+
+
 def test_an_epoch_that_says_nothing_leaves_gravity_in_doubt():
     antenna = Antenna(Config(), Counter())
     antenna.epoch(told(0, 0.0, (0.0, 50.0, 0.0)))

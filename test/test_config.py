@@ -63,6 +63,14 @@ def test_yaml_file_describes_as_the_code_does():
             assert f'[{line["unit"]}, {line["minimum"]:g} to {line["maximum"]:g}' in text
 
 
+def test_page_describes_as_the_code_does():
+    page = (Path(__file__).parents[1] / 'docs' / 'parameters.md').read_text().split('The presets')
+    for field, row in zip(FIELDS, page[0].split('\n| `')[1:], strict=True):
+        name, *_, meaning = row.rstrip(' |\n').split(' | ')
+        assert name == f'{field.name}`'
+        assert meaning.replace('`', '').startswith(field.metadata['description'])
+
+
 @pytest.mark.parametrize('value', [[1, 2, 3], (1.0, 2.0, 3.0), np.array([1, 2, 3])])
 def test_lever_arm_takes_any_three_numbers(value):
     assert Config(lever_arm=value).lever_arm == (1.0, 2.0, 3.0)

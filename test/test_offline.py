@@ -141,6 +141,13 @@ def test_rows_with_nan_are_left_out_and_counted(flight):
     assert normalised_error(spoilt.current, flight) < chi2.ppf(0.9999, 3)
 
 
+def test_a_masked_stamp_of_the_imu_is_refused(flight):
+    stamps, gyro, accel = imu(flight)
+    masked = np.ma.masked_array(stamps, np.arange(len(stamps)) == 7)
+    with pytest.raises(ValueError, match='none of them masked'):
+        ins_align.align(masked, gyro, accel, *tables(flight, 'std'), **LEVER)
+
+
 def test_what_is_masked_is_left_out_as_nan_is(flight):
     stamps, gyro, accel = imu(flight)
     arrays = [gyro, accel, *tables(flight, 'std')]

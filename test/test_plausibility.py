@@ -295,6 +295,22 @@ def test_end_of_a_range_is_found(axis, end, block):
 
 
 @pytest.mark.parametrize('block', (1, 7, None))
+@pytest.mark.parametrize('rate', (25, 100))
+def test_each_excursion_beyond_the_range_may_hide_an_angle(rate, block):
+    """Single samples at 25 Hz, that miss an angle each, as several in a row do at 100 Hz."""
+    length = rate // 25
+    stamps = np.arange(16 * rate) * (1_000_000_000 // rate)
+    samples = 0.3 * np.random.default_rng(0).standard_normal((stamps.size, 6))
+    samples[:, 5] += 9.8
+    at_end = np.arange(stamps.size) % rate >= rate - length
+    samples[at_end, 0] = 35.0
+    check = checked(stamps, samples, block)
+    excursions = np.unique(check.stamps * rate // 1_000_000_000 // rate)
+    assert excursions.size >= 12
+    assert np.isin(excursions, np.array(check.blind) * rate // 1_000_000_000 // rate).all()
+
+
+@pytest.mark.parametrize('block', (1, 7, None))
 def test_what_is_not_the_end_of_a_range(block):
     stamps, samples = swinging()
     resting = np.round(samples / 0.01) * 0.01

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Experiments: what is known of the package in numbers, each made by one command.
+Experiments that measure how well the package works; one command runs each of them.
 
 Each prints its tables and writes ``NAME.md``, ``NAME.json`` and figures.
 """
@@ -24,7 +24,7 @@ from pathlib import Path
 
 from ins_align.config import UsageError
 
-# Title, function and by default how many runs of each, in the order in which `all` runs them.
+# Title, function and default number of runs (0: it takes none), in the order of `all`.
 NAMES = {
     'note': ("The note's experiment", 'bound.run_note', 100),
     'bound': ('The estimator at the Cramer-Rao bound', 'bound.run', 100),
@@ -35,8 +35,9 @@ NAMES = {
     'vehicle': ('What a vehicle knows of its motion', 'weak_spots.run_vehicle', 24),
     'settings': ('Right whatever the settings', 'declare.run_settings', 200),
     'recordings': ('Real recordings', 'recordings.run', 0)}
+# Experiments that need recordings, and those that use them where there are some.
 NEED_DATA, TAKE_DATA = ('recordings',), ('vehicle', 'recordings')
-# Only by name: it measures the machine too, and needs ROS. Its runs are minutes of data.
+# Not part of `all`: it measures the machine too and needs ROS. Its runs are minutes of data.
 MEASUREMENTS = {'bench': ('Speed', 'bench.run', 60)}
 
 
@@ -47,11 +48,11 @@ class ExperimentError(UsageError):
 def run(name: str, out_dir: str | Path, data_dir: str | Path | None = None,
         runs: int | None = None, jobs: int | None = None) -> None:
     """
-    Run one of `NAMES` or `MEASUREMENTS`, or 'all' of the former; pages go to `out_dir`.
+    Run one of `NAMES` or `MEASUREMENTS`, or 'all' of `NAMES`, and write pages to `out_dir`.
 
-    `data_dir` has recordings that carry a reference attitude on ``/reference/imu``; `runs` is of
-    Monte Carlo, `jobs` processes at a time, by default one a processor. ExperimentError says that
-    there is no such experiment or that it lacks its input.
+    `data_dir` is a folder of recordings with a reference attitude on ``/reference/imu``, `runs`
+    the number of Monte Carlo runs, `jobs` the number of parallel processes, by default one per
+    processor. Raises ExperimentError if there is no such experiment or an input is wrong.
     """
     known = (*NAMES, 'all', *MEASUREMENTS)
     if name not in known:
@@ -82,5 +83,5 @@ def _run(name: str, out: Path, data: Path | None, runs: int | None, jobs: int | 
     module, function = path.split('.')
     report = Report(name, title, out, (f' --runs {runs}' if default else '')
                     + (' --data DIR' if data else ''))
-    report.write(getattr(importlib.import_module(f'ins_align.experiments.{module}'), function)(
-        report, runs, jobs, data))
+    experiment = getattr(importlib.import_module(f'ins_align.experiments.{module}'), function)
+    report.write(experiment(report, runs, jobs, data))

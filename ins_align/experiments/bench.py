@@ -12,12 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Experiment ``bench``: speed, each figure against something measured in the same run.
+Experiment ``bench``: speed, each figure relative to another one measured in the same run.
 
-``--runs`` is how many minutes of data are replayed. ``python -m ins_align.experiments.bench`` is a
-process that runs beside the node: ``bare`` subscribes to what the node subscribes to and does
-nothing, ``republish`` publishes each IMU message unchanged, ``listen`` takes what is published,
-``play BAG`` plays the drivers.
+``--runs`` is the number of minutes of data that are replayed. ``python -m
+ins_align.experiments.bench`` starts one of the processes that run beside the node: ``bare`` has
+the subscriptions of the node and does nothing, ``republish`` publishes each IMU message unchanged,
+``listen`` subscribes to what is published, and ``play BAG`` publishes a recording in real time.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ from ins_align.simulation.simulate import give, simulate
 REPEATS = 3
 CPU_SECONDS = 20.0
 EPOCH_SECONDS = 600.0
-TARGETS = {'mcap': '2.0', 'sqlite3': '3.0'}     # of replay over a bare pass, by storage
+# Largest ratio of the times of a replay and of a bare pass over the messages, by storage.
+TARGETS = {'mcap': '2.0', 'sqlite3': '3.0'}
 COUNT = """
 from pathlib import Path
 import sys
@@ -56,7 +57,7 @@ NODE = '-m', 'ins_align.ros.main', '--ros-args', '-p', 'lever_arm:=[1.0, 1.0, 1.
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
-    """Measure everything one after the other, without anything else beside it."""
+    """Run ``bench``: all measurements, one after the other."""
     report.text('Ratios against something measured in the same run on the same machine; for '
                 'replay and start the median of three goes, for the node processor time of the '
                 'whole process while both run beside each other on the same messages.')
@@ -81,26 +82,27 @@ def elapsed(arguments: Sequence[str]) -> float:
     start = time.perf_counter()
     done = subprocess.run([sys.executable, *arguments], stdout=subprocess.DEVNULL,
                           stderr=subprocess.PIPE, text=True)
-    if done.returncode not in (0, 1):
+    # 1: a replay that has not aligned, unless Python ended so.
+    if done.returncode not in (0, 1) or 'Traceback' in done.stderr:
         raise RuntimeError(done.stderr)
     return time.perf_counter() - start
 
 
 def medians(*processes: Sequence[str]) -> list[float]:
-    """Run Python processes in turns and return the median time of each, s."""
+    """Run Python processes in turn, several times, and return the median time of each, s."""
     times = [[elapsed(arguments) for arguments in processes] for _ in range(REPEATS)]
     return [statistics.median(column) for column in zip(*times)]
 
 
 def recorded(folder: Path, *options: str) -> str:
-    """Simulate a recording."""
+    """Simulate a recording, named like the last option, and return its path."""
     bag = str(folder / options[-1])
     elapsed([*CLI, 'simulate', bag, '--scenario', 'car', '--imu-rate', '200', *options])
     return bag
 
 
 def replay_against_bare_pass(folder: Path, storage: str, minutes: int) -> JsonDict:
-    """Replay a recording, and only count its messages."""
+    """Compare the time of a replay with that of counting the messages of the recording."""
     bag = recorded(folder, '--duration', f'{60 * minutes}', '--storage', storage)
     return row(f'replay of {minutes} min, {storage}; bare pass', *medians(
         [*CLI, 'replay', bag, '--params', f'{bag}/ins_align.yaml'], ['-c', COUNT, bag]), 's',
@@ -108,7 +110,7 @@ def replay_against_bare_pass(folder: Path, storage: str, minutes: int) -> JsonDi
 
 
 def node_rows(folder: Path) -> list[JsonDict]:
-    """Compare processor times of nodes."""
+    """Compare the processor time of the node with that of simpler nodes on the same messages."""
     bag = recorded(folder, '--gnss-rate', '10', '--duration', f'{CPU_SECONDS + 15.0}')
     rows = []
     for title, *beside in (('node, nobody listens; node that does nothing', 'bare'),
@@ -130,7 +132,7 @@ def node_rows(folder: Path) -> list[JsonDict]:
 
 @contextmanager
 def _process(*arguments: str) -> Iterator[int]:
-    """Run a Python process, give its number and interrupt it in the end."""
+    """Run a Python process, yield its process id, and interrupt it at the end."""
     process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL,
                                stderr=subprocess.DEVNULL)
     try:
@@ -144,13 +146,13 @@ def _process(*arguments: str) -> Iterator[int]:
 
 
 def _cpu_seconds(pid: int) -> float:
-    """Processor time of a process, user and system."""
+    """Return the processor time of a process, user and system, s."""
     fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
 
 def epoch_rows() -> list[JsonDict]:
-    """Measure the time of every GNSS epoch with its IMU samples, and how memory grows."""
+    """Measure the processor time of each GNSS epoch with its IMU samples, and the memory."""
     data = simulate('car', duration=EPOCH_SECONDS)
     aligner = Aligner(config_for(data))
     times, resident = [], []
@@ -172,6 +174,7 @@ def epoch_rows() -> list[JsonDict]:
 # The processes beside the node
 
 def _types() -> dict[str, Any]:
+    """Return the topics to which the node subscribes, and their types."""
     from geometry_msgs.msg import TwistWithCovarianceStamped
     from sensor_msgs.msg import Imu, NavSatFix
 
@@ -179,6 +182,7 @@ def _types() -> dict[str, Any]:
 
 
 def _spin(name: str) -> None:
+    """Run the node ``bare``, ``republish`` or ``listen``."""
     import rclpy
     from rclpy.qos import QoSProfile, ReliabilityPolicy
 
@@ -187,20 +191,24 @@ def _spin(name: str) -> None:
 
     node, types = rclpy.create_node(name), _types()
     imu_type = types['/imu/data_raw']
-    for topic in ('/republish/imu', '/ins_align/imu') if name == 'listen' else ():
-        node.create_subscription(imu_type, topic, nothing, 100, raw=True)
-    for topic, kind in types.items() if name != 'listen' else ():
-        take = nothing
-        if (name, kind) == ('republish', imu_type):
-            take = node.create_publisher(imu_type, '~/imu', 100).publish
-        node.create_subscription(kind, topic, take, QoSProfile(
-            depth=2000 if kind is imu_type else 200, reliability=ReliabilityPolicy.BEST_EFFORT))
-    # A signal between two waits of the executor would not be seen.
+    if name == 'listen':
+        for topic in '/republish/imu', '/ins_align/imu':
+            node.create_subscription(imu_type, topic, nothing, 100, raw=True)
+    else:
+        for topic, kind in types.items():
+            take = nothing
+            if name == 'republish' and kind is imu_type:
+                take = node.create_publisher(imu_type, '~/imu', 100).publish
+            node.create_subscription(kind, topic, take, QoSProfile(
+                depth=2000 if kind is imu_type else 200,
+                reliability=ReliabilityPolicy.BEST_EFFORT))
+    # The timer wakes the executor, which would miss a signal that comes between two waits.
     node.create_timer(1.0, lambda: None)
     rclpy.spin(node)
 
 
 def _play(bag: str) -> None:
+    """Publish the messages of a recording at the times at which they were recorded."""
     import rclpy
     from rosbags.highlevel import AnyReader
 
@@ -211,7 +219,7 @@ def _play(bag: str) -> None:
     node = rclpy.create_node('play')
     publish = {topic: node.create_publisher(kind, topic, 1000).publish
                for topic, kind in types.items()}
-    time.sleep(2.0)  # they have to find each other
+    time.sleep(2.0)     # for publishers and subscribers to discover each other
     start = time.monotonic() - script[0][1] * 1e-9
     for topic, time_ns, data in script:
         time.sleep(max(0.0, start + time_ns * 1e-9 - time.monotonic()))
@@ -219,13 +227,16 @@ def _play(bag: str) -> None:
 
 
 def main(name: str, *arguments: str) -> int:
-    """Run one of the processes until it is interrupted."""
+    """Run one of the processes beside the node until it is interrupted."""
     import rclpy
     from rclpy.executors import ExternalShutdownException
 
     rclpy.init()
     with suppress(ExternalShutdownException):
-        _play(*arguments) if name == 'play' else _spin(name)
+        if name == 'play':
+            _play(*arguments)
+        else:
+            _spin(name)
     return 0
 
 

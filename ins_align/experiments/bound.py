@@ -12,14 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Experiments ``bound`` and ``note``: what an aligner that knows the very model reaches.
+Experiments ``bound`` and ``note``: the errors of an aligner that knows its model exactly.
 
-``bound`` has the errors of `method: bank` against the Cramer-Rao bound, and its sigma. The bound
-comes from the dense reference on the true motion. ``note`` has the note's simulation with and
-without its lever-arm term. The note says of its set-up: lever arm [1 1 1] m, 100 runs, the
-simulation of its predecessor, which it does not describe. Here: scenario `flight`, navigation
-grade, velocity 0.1 m/s at 5 Hz. Errors are those of the attitude at t0 after so many seconds of
-data.
+``bound`` compares the errors and sigmas of `method: bank` with the Cramer-Rao bound, which the
+dense reference computes on the true motion. ``note`` repeats the simulation of the note with and
+without its lever-arm term. The note states a lever arm of [1 1 1] m and 100 runs, and takes the
+rest from its predecessor without describing it; here it is scenario `flight`, navigation grade,
+velocities of 0.1 m/s at 5 Hz. Errors are those of the attitude at t0 after a time of data.
 """
 
 from __future__ import annotations
@@ -36,23 +35,23 @@ from ins_align.geometry.rotation import Array, roll_pitch_yaw
 from ins_align.report import new_figure
 import numpy as np
 
-TIMES = (10.0, 20.0, 50.0, 100.0)
-LEVER_STD, DELAY, DELAY_STD = 1.0, 0.12, 0.1
-# Targets.
+TIMES = (10.0, 20.0, 50.0, 100.0)       # s since t0, when errors are evaluated
+LEVER_STD, DELAY, DELAY_STD = 1.0, 0.12, 0.1    # of an unknown lever arm (m) and delay (s)
+# Targets: error over bound at most, and NEES/3 within.
 RATIO_LIMIT, NEES_RANGE = 1.10, (0.85, 1.15)
 
 
 def case_of(name: str, scenario: str, grade: str, config: JsonDict = {}, part: int = 1,
             **arguments: Any) -> Case:
-    """Return a case; `config` is beside the very model of its simulation."""
-    # Nothing is declared, for that may move t0, and the bound is about the first one.
+    """Return a case of an aligner that knows its model exactly, but for what `config` says."""
+    # Nothing is declared: a declaration may move t0, and the bound is about the first t0.
     return Case(name, ((scenario, grade),), None, {'duration': TIMES[-1] + 0.5, **arguments},
                 {'hold_time': 1e3, **config}, part, exact=True)
 
 
 MOVING = tuple(itertools.product(('flight', 'car'), GRADES))
 POSITIONS = {'use_velocity': False}
-# In the order of the tables. What has a sigma in the configuration is unknown to the bound too.
+# In the order of the tables. A lever arm or delay with a sigma is unknown to the bound too.
 CASES = (
     *(case_of('velocity', *moving) for moving in MOVING),
     *(case_of('velocity, gyro bias 0.5 deg/s', scenario, 'mems', part=2,
@@ -69,7 +68,7 @@ CASES = (
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
-    """Run ``bound``: every case; print ratios and normalised errors."""
+    """Run ``bound``: all cases, with their errors over the bound and their NEES."""
     [bounds] = parallel(bound_of, [CASES], jobs, 'bounds')
     groups = run_cases(run_exact, CASES, runs, jobs)
     results = [each for case, limit, (_, found) in zip(CASES, bounds, groups)
@@ -91,18 +90,19 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
 
 
 def _lever_arm(seed: int) -> JsonDict:
+    """Draw the true lever arm of a run in which it is unknown."""
     return {'lever_arm': LEVER_STD * np.random.default_rng([3, seed]).standard_normal(3)}
 
 
 def run_exact(task: tuple[Case, int]) -> JsonDict:
     """
-    Run an aligner that knows the very model.
+    Run a case with a seed, and return the errors of the attitude at t0 at each of K epochs.
 
-    At its K epochs: time (K,), s since t0, and of the attitude at t0 errors about east, north, up
-    (K, 3) and of roll, pitch, yaw (K, 3), degrees, and the normalised squared error (K,).
+    ``time`` (K,) is in s since t0, ``nees`` (K,) the normalised squared error; in degrees
+    ``error_deg`` (K, 3) is about east, north, up, and ``rpy_deg`` (K, 3) of roll, pitch, yaw.
     """
     case, seed = task
-    if 'lever_arm_std' in case.config:      # another one in each run, that of the bound is fixed
+    if 'lever_arm_std' in case.config:      # drawn in each run, while that of the bound is fixed
         case = case._replace(drawn=_lever_arm)
     simulation, stream, aligner = prepare(case, seed)
     rows = []
@@ -122,8 +122,8 @@ def run_exact(task: tuple[Case, int]) -> JsonDict:
             'rpy_deg': table[:, 5:]}
 
 
-def places_of(time: Array) -> Any:
-    """Return the places of the last epochs up to each of `TIMES`."""
+def epochs_at_times(time: Array) -> Any:
+    """Return the indices of the last epochs up to each of `TIMES`."""
     return np.searchsorted(time, np.add(TIMES, 1e-6)) - 1
 
 
@@ -134,7 +134,7 @@ def rms(values: Any) -> Any:
 
 def results_of(case: Case, bound: dense.Bound, runs: list[JsonDict]) -> list[JsonDict]:
     """Return the statistics of a case's runs at each of `TIMES`."""
-    error, nees = (np.array([run[name][places_of(run['time'])] for run in runs])
+    error, nees = (np.array([run[name][epochs_at_times(run['time'])] for run in runs])
                    for name in ('error_deg', 'nees'))
     [(scenario, grade)], results = case.motions, []
     for k, time in enumerate(TIMES):
@@ -151,7 +151,7 @@ def results_of(case: Case, bound: dense.Bound, runs: list[JsonDict]) -> list[Jso
 
 
 def target_row(title: str, results: list[JsonDict]) -> JsonDict:
-    """Return how many ratios of like cases meet their target."""
+    """Return the table row on how the cases of one title meet the targets."""
     row: JsonDict = {'case': title, 'figures': len(results)}
     for angle in ('tilt', 'heading'):
         ratios = [each[f'{angle}_ratio'] for each in results]
@@ -168,7 +168,7 @@ def target_row(title: str, results: list[JsonDict]) -> JsonDict:
 
 
 def result_row(result: JsonDict) -> JsonDict:
-    """Return the row of a case and time."""
+    """Return the table row of one case at one time."""
     row = {'case': '{title}, {scenario}, {grade}'.format(**result),
            't, s': f'{result["time"]:g}'}
     for angle in ('tilt', 'heading'):
@@ -180,10 +180,10 @@ def result_row(result: JsonDict) -> JsonDict:
 
 # The note
 
-SHOWN_FROM = 3.0                    # s, larger errors before may lie outside of the figure
+SHOWN_FROM = 3.0        # s; larger errors before this time may lie outside the figure
 LEVER, NO_LEVER = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
-LETTER = {'method': 'vif', 'free_start': False}
-# Name, lever arm of the vehicle, what the aligner is told beside its very model; with MEMS too?
+LETTER = {'method': 'vif', 'free_start': False}     # the note to the letter
+# Name, lever arm of the vehicle, configuration beside the exact model, whether with MEMS too.
 VARIANTS: tuple[tuple[str, tuple[float, ...], JsonDict, bool], ...] = (
     ('not compensated', LEVER, {**LETTER, 'lever_arm': NO_LEVER}, False),
     ('compensated', LEVER, LETTER, True), ('zero lever arm', NO_LEVER, LETTER, False),
@@ -191,16 +191,16 @@ VARIANTS: tuple[tuple[str, tuple[float, ...], JsonDict, bool], ...] = (
     ('compensated, free start', LEVER, {'method': 'vif'}, True),
     ('bank', LEVER, {'method': 'bank'}, True))
 NOTE_CASES = tuple(
-    case_of(f'{grade}: {name}', 'flight', grade, {'hold_time': Config().hold_time, **told},
+    case_of(f'{grade}: {name}', 'flight', grade, {'hold_time': Config().hold_time, **config},
             duration=100.0, lever_arm=lever)
-    for grade in ('navigation', 'mems') for name, lever, told, too in VARIANTS
-    if too or grade == 'navigation')
-# Those of the figure, as in the note.
+    for grade in ('navigation', 'mems') for name, lever, config, mems_too in VARIANTS
+    if mems_too or grade == 'navigation')
+# The variants in the figure, which are those of the note, and their colours.
 SHOWN = {'not compensated': '#D55E00', 'compensated': '#0072B2', 'zero lever arm': '#009E73'}
 
 
 def run_note(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
-    """Run ``note``: all variants, navigation grade; some of them with MEMS too."""
+    """Run ``note``: all variants with an IMU of navigation grade, some with MEMS too."""
     report.text(
         'Scenario `flight` (100 m/s, S-turns with 40 s period, oscillation of 2 to 3 deg about '
         f'all axes), IMU 100 Hz, GNSS velocity 5 Hz, 0.1 m/s; lever arm {list(LEVER)} m; {runs} '
@@ -208,7 +208,7 @@ def run_note(report: Report, runs: int, jobs: int | None, data: Path | None) -> 
     results = run_cases(run_exact, NOTE_CASES, runs, jobs)
     time = results[0][1][0]['time']
     errors = {name: np.array([each['rpy_deg'] for each in found]) for name, found in results}
-    heading = {name: rms(each[:, places_of(time), 2]) for name, each in errors.items()}
+    heading = {name: rms(each[:, epochs_at_times(time), 2]) for name, each in errors.items()}
     for case in NOTE_CASES:
         if case.name.endswith('bank'):
             limit = bound_of(case)
@@ -226,7 +226,7 @@ def run_note(report: Report, runs: int, jobs: int | None, data: Path | None) -> 
 
 
 def mean_figure(errors: dict[str, Array], time: Array) -> Any:
-    """Draw mean errors over time."""
+    """Draw the mean errors (runs, K, 3) of `SHOWN` over time (K,)."""
     means = {name: np.mean(errors[f'navigation: {name}'], axis=0) for name in SHOWN}
     figure = new_figure(8.0, 8.0)
     panels = figure.subplots(3, 1, sharex=True)

@@ -14,9 +14,9 @@
 """
 What the experiments share: cases and their runs, errors against truth, tables and pages.
 
-A case is a simulated vehicle whose messages are spoilt, aligned and judged against the truth. Each
-experiment has a table of cases or draws them from numbers; all are prepared and followed in the
-same way, and tables have a row for all runs of a name.
+A case describes a simulation, what spoils its messages, and the configuration of an aligner. A run
+is a case with a seed: the aligner takes the messages, and its attitudes are compared with the
+truth. An experiment lists its cases or draws them; a table has a row for all runs of a name.
 """
 
 from __future__ import annotations
@@ -39,26 +39,27 @@ from ins_align.report import format_table
 from ins_align.simulation.simulate import give, noise_parameters, simulate, Simulation
 import numpy as np
 
-# Of simulated data nothing comes late, but an unknown delay wants IMU samples beyond the stamp.
+# s; simulated messages are not late, but an unknown delay needs IMU samples beyond the stamp.
 LATENESS = 0.5
 GRADES = ('navigation', 'tactical', 'mems')
-BINS = (3.0, 5.0)       # sigmas that are counted
-UPDATE_EVERY = 5.0      # s
-LONGEST = 5.0           # s that an epoch stands for
+SIGMA_LIMITS = (3.0, 5.0)   # errors above these are counted
+UPDATE_EVERY = 5.0          # s between updates of the aligner
+LONGEST = 5.0               # s for which the state of an epoch counts at most
 ANGLES = ('tilt', 'heading')
 
 JsonDict = dict[str, Any]
-Truth = Callable[[list[int]], Sequence[Any]]    # ``C_nb`` at stamps, None where it is not known
-Groups = list[tuple[str, list[JsonDict]]]       # names and their runs
+Truth = Callable[[list[int]], Sequence[Any]]    # stamps -> true ``C_nb``, None where unknown
+Groups = list[tuple[str, list[JsonDict]]]       # a name and its runs, for each row of a table
 
 
 def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jobs: int | None,
              name: str = '') -> list[list[Any]]:
     """
-    Map a function of a module over groups of tasks, as `run_all`; whoever fails ends it.
+    Apply a function to the tasks of several groups in parallel; return the results by group.
 
-    Tasks that share a trajectory should be neighbours: a process keeps the last few. The name is
-    shown with the progress on a terminal.
+    Works as `run_all` does, but raises the first exception. Tasks that share a trajectory should
+    follow each other, because a process caches the last few. On a terminal a progress bar shows
+    the name.
     """
     from tqdm import tqdm
 
@@ -74,33 +75,33 @@ def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jo
 # Runs
 
 class Case(NamedTuple):
-    """A row of a table: what is simulated, how its messages are spoilt, what is configured."""
+    """What is simulated, what spoils its messages, and how the aligner is configured."""
 
     name: str
-    motions: tuple[tuple[str, str], ...]    # scenario and grade of IMU, of the seeds in turn
-    spoil: Callable[[Stream, Random], Any] | None = None
+    motions: tuple[tuple[str, str], ...]    # scenarios with IMU grades; seeds take them in turn
+    spoil: Callable[[Stream, Random], Any] | None = None    # changes the messages in place
     simulate: JsonDict = {}         # further arguments of `simulate`
-    config: JsonDict = {}           # parameters of `Config` in place of the truth
-    part: int = 1                   # there is one run for so many of those asked for
-    between: bool = False           # attitudes between epochs are judged, instead of those there
-    exact: bool = False             # the aligner knows the very model: noise, lever arm, delay
-    drawn: Callable[[int], JsonDict] | None = None      # arguments that the seed draws
+    config: JsonDict = {}           # parameters of `Config` that replace those of the simulation
+    part: int = 1                   # one run for this many of those asked for, as it takes long
+    between: bool = False           # judge attitudes between epochs instead of those at epochs
+    exact: bool = False             # the aligner knows noise, lever arm and delay exactly
+    drawn: Callable[[int], JsonDict] | None = None  # seed -> further arguments of `simulate`
 
 
 def run_cases(function: Callable[[Any], Any], cases: Sequence[Case], runs: int, jobs: int | None,
               ) -> Groups:
-    """Map a function of a case and a seed over the runs of every case."""
+    """Apply a function to each case with each of its seeds; return the results by name."""
     return list(zip((case.name for case in cases), parallel(function, [
         [(case, seed) for seed in range(max(1, runs // case.part))] for case in cases], jobs,
         'runs')))
 
 
 def combination(index: int, seed: Sequence[int], *axes: Iterable[Any]) -> Any:
-    """Return one of the combinations of `axes`; each comes once before any comes twice."""
+    """Return one combination of values of the axes; each is drawn once before any is twice."""
     combinations = list(itertools.product(*axes))
-    turn, place = divmod(index, len(combinations))
+    turn, position = divmod(index, len(combinations))
     order = np.random.default_rng([*seed, turn]).permutation(len(combinations))
-    return combinations[order[place]]
+    return combinations[order[position]]
 
 
 def setup(random: Random) -> JsonDict:
@@ -111,7 +112,7 @@ def setup(random: Random) -> JsonDict:
 
 
 def run_case(task: tuple[Case | Callable[[int], Case], int]) -> JsonDict:
-    """Run a case, or what a function draws, with a seed; judge it."""
+    """Run a case, or the one that a function draws from the seed, and judge it."""
     case, seed = task
     if not isinstance(case, Case):
         case = case(seed)
@@ -121,36 +122,36 @@ def run_case(task: tuple[Case | Callable[[int], Case], int]) -> JsonDict:
 
 
 def simulated(case: Case, seed: int = 0) -> Simulation:
-    """Simulate a case."""
+    """Simulate a case with a seed, without what spoils it."""
     scenario, grade = case.motions[seed % len(case.motions)]
     drawn = case.drawn(seed) if case.drawn else {}
     return simulate(scenario, **{'imu_grade': grade, 'seed': seed, **drawn, **case.simulate})
 
 
 def bound_of(case: Case) -> dense.Bound:
-    """Return the bound of a case, with what is unknown in it."""
+    """Return the Cramer-Rao bound of a case; what its configuration leaves open is unknown."""
     return dense.bound(
         simulated(case), not case.config.get('use_velocity', True),
         case.config.get('lever_arm_std', 0.0), case.config.get('gnss_delay_std', 0.0))
 
 
 def prepare(case: Case, seed: int) -> tuple[Simulation, Stream, Aligner]:
-    """Simulate, spoil the messages, and configure an aligner for what is left of the truth."""
+    """Simulate a case, spoil its messages, and create the aligner for them."""
     simulation = simulated(case, seed)
     stream = stream_of(simulation, case.between)
     if case.spoil is not None:
         case.spoil(stream, np.random.default_rng([6, seed]))
-    configured = exact_config_for if case.exact else config_for
-    return simulation, stream, Aligner(configured(simulation, **{**stream.config, **case.config}))
+    configure = exact_config_for if case.exact else config_for
+    return simulation, stream, Aligner(configure(simulation, **{**stream.config, **case.config}))
 
 
 def follow(aligner: Aligner, stream: Stream) -> Iterator[list[Epoch]]:
     """
-    Give an aligner messages in the order of arrival, and yield the epochs of each update.
+    Give a stream to an aligner in the order of arrival, and yield the epochs of each update.
 
-    An update without epochs yields what the status says, as an epoch without GNSS, so that silence
-    counts; so does each where attitudes between epochs are wanted. Updates come at a reset, at the
-    end, and when the stream says, by default every `UPDATE_EVERY`.
+    The aligner is updated at each reset, at the end, and at `updates` of the stream or, if it has
+    none, every `UPDATE_EVERY`; with `between` after every message. Then, and if there are no new
+    epochs, it yields the status as one epoch without GNSS, so that times without GNSS count.
     """
     due = 0.0
     for now, kind, payload in stream.messages(aligner.config):
@@ -168,6 +169,7 @@ def follow(aligner: Aligner, stream: Stream) -> Iterator[list[Epoch]]:
 
 
 def _epochs(aligner: Aligner, epochs: list[Epoch], between: bool) -> list[Epoch]:
+    """Return the epochs of an update, or the status as one epoch, as `follow` says."""
     stamp_ns = aligner.newest_imu_ns
     if stamp_ns is None or (epochs and not between):
         return epochs
@@ -178,26 +180,28 @@ def _epochs(aligner: Aligner, epochs: list[Epoch], between: bool) -> list[Epoch]
 
 
 def config_for(simulation: Simulation, **changes: Any) -> Config:
-    """Return the defaults with a simulation's IMU grade and lever arm."""
+    """Return the default configuration with the IMU grade and lever arm of a simulation."""
     return Config(**{'lever_arm': tuple(simulation.lever_arm.tolist()), 'gnss_lateness': LATENESS,
                      'imu_grade': simulation.meta['imu_grade'], **changes})
 
 
 def exact_config_for(simulation: Simulation, **changes: Any) -> Config:
-    """Return the very model of a simulation; lever arm and delay are known."""
+    """Return a configuration with the noise of a simulation and known lever arm and delay."""
     return config_for(simulation, **{
         'imu_grade': 'custom', **noise_parameters(simulation.imu_noise), 'lever_arm_std': 0.0,
         'gnss_delay_std': 0.0, **changes})
 
 
-# How they are judged
+# Errors against the truth
 
 def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Any = 0.0) -> JsonDict:
     """
-    Compare an attitude with ``C_nb``, whose own sigma (3,), if any, is added in quadrature.
+    Compare an attitude with the true ``C_nb``.
 
-    ``angles_deg`` (3,) about east, north, up; ``nees``, their normalised squared error; tilt and
-    heading in degrees and in stated sigmas, of the tilt the larger one of two axes.
+    `extra_std_deg` (3,), the sigma of the truth itself about east, north and up, is added in
+    quadrature. The result has the errors about these axes as ``angles_deg`` (3,), their normalised
+    squared error ``nees``, and tilt and heading in degrees and in stated sigmas; the sigmas of the
+    tilt are those of the worse of its two axes.
     """
     phi = log_so3(C_true @ attitude.C_nb.T)
     covariance = attitude.covariance + np.diag(np.radians(np.broadcast_to(extra_std_deg, 3)) ** 2)
@@ -209,7 +213,7 @@ def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Any = 0.0) -> Jso
 
 def outcome(name: str, simulation: Simulation, stream: Stream, aligner: Aligner,
             epochs: list[Epoch]) -> JsonDict:
-    """Return which run it was, how it ended, and how right it was."""
+    """Return which run it was, how it ended, and how large its errors were."""
     status = aligner.status()
 
     def true(stamps: list[int]) -> Array:
@@ -218,7 +222,7 @@ def outcome(name: str, simulation: Simulation, stream: Stream, aligner: Aligner,
     return {'name': name, 'scenario': simulation.meta['scenario'],
             'imu': aligner.config.imu_grade, 'seed': simulation.meta['seed'],
             'state': status.state.value, 'reason': status.reason,
-            'counts': {name: count for name, count in status.counts.items() if count},
+            'counts': {counter: count for counter, count in status.counts.items() if count},
             'least_heading_sigma_deg': min((epoch.initial.sigma_deg[2] for epoch in epochs
                                             if epoch.initial is not None), default=None),
             **moments(epochs, true), **while_aligned(epochs, stream.start_ns, true)}
@@ -226,10 +230,10 @@ def outcome(name: str, simulation: Simulation, stream: Stream, aligner: Aligner,
 
 def moments(epochs: Iterable[Epoch], true: Truth) -> JsonDict:
     """
-    Judge the first epoch that is levelled, every declaration, the last epoch if it is aligned.
+    Judge the first levelled epoch, each declaration, and the last epoch if it is aligned.
 
-    The errors are the larger ones of the attitude at t0 and the current one. Lists, empty where
-    there was none.
+    Of the attitude at t0 and the current one the larger errors count. Each entry is a list, which
+    is empty if there is no such epoch.
     """
     epochs = [epoch for epoch in epochs if not epoch.dry]
     aligned = [epoch.state is State.ALIGNED for epoch in epochs]
@@ -238,14 +242,14 @@ def moments(epochs: Iterable[Epoch], true: Truth) -> JsonDict:
                      if epoch.state in (State.LEVELLED, State.ALIGNED)][:1],
         'declared': [epoch for epoch, before, now in zip(epochs, [False, *aligned], aligned)
                      if now and not before],
-        'final': epochs[-1:] if any(aligned[-1:]) else []}
+        'final': [epoch for epoch in epochs[-1:] if epoch.state is State.ALIGNED]}
     return {name: [moment(epoch.t_s, errors_of([epoch.initial, epoch.current], true))
                    for epoch in each if epoch.initial is not None and epoch.current is not None]
             for name, each in chosen.items()}
 
 
 def moment(t_s: float, errors: list[JsonDict]) -> JsonDict:
-    """Return a time, s since t0, and the largest errors of tilt and heading."""
+    """Return a time, s since t0, with the largest tilt and heading among several errors."""
     return {'t_s': t_s, **{name: max(error[name] for error in errors) for name in (
         'tilt_sigmas', 'heading_sigmas', 'tilt_deg', 'heading_deg')}}
 
@@ -253,12 +257,16 @@ def moment(t_s: float, errors: list[JsonDict]) -> JsonDict:
 def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth,
                   std_deg: Any = 0.0) -> JsonDict:
     """
-    Judge the current attitude whenever it is called aligned.
+    Judge the current attitude in all epochs that are aligned.
 
-    `std_deg` (3,) says how well the truth is known; `start_ns` is the stamp of the first sample.
+    `start_ns` is the stamp of the first IMU sample; `std_deg` (3,) is the sigma of the truth about
+    east, north and up. The result has errors at the first declaration (``first``, a list) and its
+    time in s (``declared_s``), the number of epochs with known truth, the largest errors, how many
+    epochs are ``beyond`` each of `SIGMA_LIMITS`, the time beyond the last of these, and the part
+    of the time that is aligned.
     """
     stamps = np.array([epoch.stamp_ns for epoch in epochs], np.int64)
-    held = np.clip(np.diff(stamps, append=stamps[-1:]) / SECOND, 0.0, LONGEST)
+    lasts_s = np.clip(np.diff(stamps, append=stamps[-1:]) / SECOND, 0.0, LONGEST)
     aligned = [k for k, epoch in enumerate(epochs)
                if epoch.state is State.ALIGNED and epoch.current is not None]
     errors = {k: error for k, error in zip(aligned, errors_of(
@@ -266,15 +274,16 @@ def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth,
     sigmas = {k: worst([error]) for k, error in errors.items()}
     return {'first': [moment(epochs[k].t_s, [errors[k]]) for k in [*errors][:1]],
             'declared_s': next(((stamps[k] - start_ns) / SECOND for k in errors), None),
-            'epochs': len(errors), 'worst_sigmas': most(sigmas.values()),
-            'worst_heading_deg': most(error['heading_deg'] for error in errors.values()),
-            'beyond': [beyond(sigmas.values(), limit) for limit in BINS],
-            'beyond_s': np.sum(held[[k for k in errors if sigmas[k] > BINS[1]]]),
-            'aligned_part': np.sum(held[aligned]) / max(np.sum(held), 1e-9)}
+            'epochs': len(errors), 'worst_sigmas': max(sigmas.values(), default=None),
+            'worst_heading_deg': max((error['heading_deg'] for error in errors.values()),
+                                     default=None),
+            'beyond': [beyond(sigmas.values(), limit) for limit in SIGMA_LIMITS],
+            'beyond_s': np.sum(lasts_s[[k for k in errors if sigmas[k] > SIGMA_LIMITS[-1]]]),
+            'aligned_part': np.sum(lasts_s[aligned]) / max(np.sum(lasts_s), 1e-9)}
 
 
 def errors_of(attitudes: list[Any], true: Truth, std_deg: Any = 0.0) -> list[Any]:
-    """Compare attitudes with the truth; None where that is not known."""
+    """Compare attitudes with the truth as `error_of` does; None where it is not known."""
     truths = true([attitude.stamp_ns for attitude in attitudes]) if attitudes else ()
     return [None if C_true is None else error_of(attitude, C_true, std_deg)
             for attitude, C_true in zip(attitudes, truths)]
@@ -282,26 +291,21 @@ def errors_of(attitudes: list[Any], true: Truth, std_deg: Any = 0.0) -> list[Any
 
 # Tables and pages; a row of a table is a dictionary of titles and cells
 
-def most(values: Iterable[float]) -> float | None:
-    """Return the largest value, None if there is none."""
-    return max(values, default=None)
-
-
 def cell(statistic: Callable[[Any], Any], values: Iterable[float], digits: str) -> str | None:
-    """Return a statistic as text, None of no values."""
+    """Return a statistic of values as text, None if there are no values."""
     values = [*values]
     return format(statistic(values), digits) if values else None
 
 
 def groups_of(runs: list[JsonDict], names: Iterable[str]) -> Groups:
-    """Group runs by name; the last group is all."""
+    """Return the runs of each name, and last all runs."""
     return [*((name, [run for run in runs if run['name'] == name]) for name in names),
             ('all', runs)]
 
 
-def worst(moments: Iterable[JsonDict]) -> float | None:
-    """Return the largest error of judged moments in sigmas, of tilt and heading."""
-    return most(moment[f'{angle}_sigmas'] for moment in moments for angle in ANGLES)
+def worst(errors: Iterable[JsonDict]) -> float | None:
+    """Return the largest error of tilt and heading in sigmas, None if there are no errors."""
+    return max((error[f'{angle}_sigmas'] for error in errors for angle in ANGLES), default=None)
 
 
 def beyond(values: Iterable[Any], limit: float) -> int:
@@ -310,13 +314,13 @@ def beyond(values: Iterable[Any], limit: float) -> int:
 
 
 def moment_row(name: str, runs: list[JsonDict], kind: str) -> JsonDict:
-    """Return how many runs came to a moment, when, and how wrong each angle was."""
+    """Return how many runs have an entry of `moments`, when, and how large the errors were."""
     found = [run[kind][0] for run in runs if run[kind]]
     row = {'case': name, 'runs': len(runs), 'declared': len(found),
            'median, s': cell(np.median, (moment['t_s'] for moment in found), '.1f')}
     for angle in ANGLES:
         sigmas = [moment[f'{angle}_sigmas'] for moment in found]
-        for limit in BINS:
+        for limit in SIGMA_LIMITS:
             wrong = beyond(sigmas, limit)
             row[f'{angle} beyond {limit:g}'] = (
                 f'{wrong} ({100 * wrong / len(found):.1f} %)' if found else None)
@@ -326,13 +330,13 @@ def moment_row(name: str, runs: list[JsonDict], kind: str) -> JsonDict:
 
 
 def aligned_row(name: str, runs: list[JsonDict]) -> JsonDict:
-    """Return how many runs were called aligned, when, for how long, and how wrong they were."""
+    """Return how many runs were aligned, when, for how long, and how large the errors were."""
     declared = [run for run in runs if run['first']]
     sigmas = [run['worst_sigmas'] for run in declared]
     return {'case': name, 'runs': len(runs), 'declared': len(declared),
             'at the end': sum(run['state'] == State.ALIGNED.value for run in runs),
-            'declared beyond 3': beyond((worst(run['first']) for run in declared), BINS[0]),
-            **{f'beyond {limit:g}': beyond(sigmas, limit) for limit in BINS},
+            'declared beyond 3': beyond((worst(run['first']) for run in declared), 3.0),
+            **{f'beyond {limit:g}': beyond(sigmas, limit) for limit in SIGMA_LIMITS},
             'beyond 5, s': cell(max, (run['beyond_s'] for run in declared), '.1f'),
             'worst, sigma': cell(max, sigmas, '.1f'),
             'heading, deg': cell(max, (run['worst_heading_deg'] for run in declared), '.2g'),
@@ -341,10 +345,10 @@ def aligned_row(name: str, runs: list[JsonDict]) -> JsonDict:
 
 
 class Report:
-    """Collects the page of an experiment, then prints and writes it, with its numbers beside."""
+    """The page of an experiment: it collects the parts, then prints and writes them."""
 
     def __init__(self, name: str, title: str, out: Path, command: str = '') -> None:
-        """Start with the title and the command that makes it."""
+        """Begin the page with its title and its command; `command` has the further options."""
         self._name, self._out = name, out
         self._parts = [f'# {title}', f'`ins_align experiment {name} --out DIR{command}`']
 
@@ -353,19 +357,19 @@ class Report:
         self._parts.append(text)
 
     def table(self, title: str, rows: Iterable[JsonDict]) -> None:
-        """Add a table of rows with the same titles; None is a dash."""
+        """Add a table; the rows have the same keys, the titles of its columns. None is a dash."""
         rows = list(rows)
         table = format_table([[*row.values()] for row in rows], [*rows[0]])
         self._parts.append(f'{title}\n\n```text\n{table}\n```')
 
     def figure(self, figure: Any, caption: str) -> None:
-        """Write a figure as PNG and refer to it."""
+        """Write a figure as PNG and add it with its caption."""
         file = f'{self._name}.png'
         write_whole(self._out / file, lambda png: figure.savefig(png, format='png', dpi=110))
         self._parts.append(f'![{caption}]({file})\n\n{caption}')
 
     def write(self, numbers: Any) -> None:
-        """Print the page, and write it and the numbers."""
+        """Print the page, write it, and write the numbers as JSON."""
         page = '\n\n'.join(self._parts)
         print(page)
         for suffix, text in (('md', page), ('json', json.dumps(_plain(numbers), indent=1))):
@@ -374,7 +378,7 @@ class Report:
 
 
 def _plain(value: Any) -> Any:
-    """Return what JSON can hold; numbers that are not finite become None."""
+    """Return a value as JSON can hold it; numbers that are not finite become None."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (np.ndarray, np.generic)):

@@ -14,11 +14,11 @@
 """
 Experiments ``declare``, ``declare-worse`` and ``settings``: whether what is declared is right.
 
-Simulated vehicles of every kind with every fault that a user can make: is the attitude right
-when the aligner says that it is aligned? Does it keep silent where heading cannot be observed? How
-long does it wait beyond the time that the data need? ``declare-worse`` has IMUs and receivers
-worse than configured, ``settings`` everything as it is configured, but rates, noises, lever arms
-and mountings of all sizes.
+``declare`` simulates all scenarios with all faults that a user can make. Is the attitude right
+when ALIGNED is declared? Is nothing declared where the heading cannot be observed? How much longer
+does a declaration take than the data require? In ``declare-worse`` IMUs and receivers are worse
+than configured. In ``settings`` everything is as configured, with rates, noises, lever arms and
+mountings of all sizes.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
 
 DURATION = 100.0
-STAND_STILL = 20.0      # s, of every other run of declare-worse
+STAND_STILL = 20.0      # s at rest at the start of half the runs of declare-worse
 SILENT_DURATION = 600.0
-HORIZON = 120.0         # s; within this the bound has to cross the threshold
+HORIZON = 120.0         # s within which the bound has to cross the threshold
 THRESHOLD_DEG = 1.0
-WAIT_LIMIT = 1.5        # median over bound, the target
-# Seeds of the three parts do not meet.
+WAIT_LIMIT = 1.5        # target: median time to a declaration over that of the bound, at most
+# First seeds of the second and third part; the three parts share none.
 SILENT_SEED, TIME_SEED = 100_000, 200_000
-# A run of the second and the third part for so many of the first.
+# One run of the second and third part for this many of the first.
 SILENT_PART, TIME_PART = 80, 10
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
-    """Run ``declare``, all three parts; `runs` is that of the first, the others have a part."""
+    """Run the three parts of ``declare``; `runs` is for the first, the others have fewer."""
     silent_seeds = range(SILENT_SEED, SILENT_SEED + max(runs // SILENT_PART, 1))
     [found, *silent] = parallel(run_case, [
         [(draw, index) for index in range(runs)],
@@ -101,7 +101,7 @@ def _lever(random: Random) -> JsonDict:
                           / np.linalg.norm(direction)).tolist()}
 
 
-# What each draws to change of the arguments of `simulate`.
+# Each fault draws arguments of `simulate`.
 FAULTS: dict[str, Callable[[Random], JsonDict]] = {
     'none': lambda random: {}, 'outliers': _outliers, 'outages': _outages,
     'delay': lambda random: {'gnss_delay': random.uniform(0.02, 0.2)},
@@ -133,7 +133,7 @@ def _mount(seed: int) -> JsonDict:
     return {'mount_rpy_deg': np.random.default_rng([2, seed]).uniform(-20, 20, 3)}
 
 
-# Ten minutes of motion that does not show the heading.
+# Motions in which the heading cannot be observed.
 SILENT = tuple(Case(scenario, ((scenario, 'mems'),), None, {'duration': SILENT_DURATION},
                     drawn=_mount) for scenario in ('straight', 'static'))
 
@@ -141,7 +141,7 @@ SILENT = tuple(Case(scenario, ((scenario, 'mems'),), None, {'duration': SILENT_D
 # Part 3: time
 
 def time_to_heading(runs: int, jobs: int | None) -> list[JsonDict]:
-    """Time to a declared heading, where the bound crosses the threshold, and when it does."""
+    """Return the times to a declared heading, where and when its bound meets the threshold."""
     cases = [time_case(*kind)
              for kind in itertools.product((*SCENARIOS, 'robot'), GRADES, (True, False))]
     [crossings] = parallel(crossing_time, [cases], jobs, 'bounds')
@@ -151,7 +151,7 @@ def time_to_heading(runs: int, jobs: int | None) -> list[JsonDict]:
                      'times')
     waits = []
     for (case, bound_s), declared_s in zip(reachable, times):
-        # What was not declared took for ever.
+        # A run that is not declared counts as infinitely long.
         median_s = float(np.median([np.inf if t is None else t for t in declared_s]))
         [(scenario, grade)] = case.motions
         waits.append({'scenario': scenario, 'imu': grade, 'exact': case.exact,
@@ -161,29 +161,29 @@ def time_to_heading(runs: int, jobs: int | None) -> list[JsonDict]:
 
 
 def time_case(scenario: str, grade: str, exact: bool) -> Case:
-    """Return a case with everything known, or with the defaults."""
-    # The heading is to be what is waited for, not the tilt.
+    """Return a case with noise, lever arm and delay known, or with the default configuration."""
+    # The declaration is to wait for the heading, not for the tilt.
     config = {'tilt_std_threshold': THRESHOLD_DEG} if exact else {
         'lever_arm_std': Config.lever_arm_std, 'gnss_delay_std': Config.gnss_delay_std}
     return Case('time', ((scenario, grade),), None, {'duration': HORIZON}, config, exact=exact)
 
 
 def crossing_time(case: Case) -> float | None:
-    """Return when the bound of the heading crosses the threshold, None if it does not."""
+    """Return when the bound of the heading crosses the threshold, s, None if it does not."""
     limit = bound_of(case)
     good = np.degrees(np.sqrt(limit.covariance[:, 2, 2])) <= THRESHOLD_DEG
     return float(limit.time[np.argmax(good)]) if good.any() else None
 
 
 def run_time(task: tuple[Case, int]) -> float | None:
-    """Seconds until the heading of a case with a seed is declared, None if it is not."""
+    """Return when a case with a seed is declared, s, None if it is not."""
     _, stream, aligner = prepare(*task)
     return next((epoch.t_s for epoch in itertools.chain.from_iterable(follow(aligner, stream))
                  if epoch.state is State.ALIGNED and not epoch.dry), None)
 
 
 def time_table(report: Report, waits: list[JsonDict]) -> None:
-    """Print the waits."""
+    """Add the table of what `time_to_heading` returns."""
     default = Config()
     met = [wait['ratio'] <= WAIT_LIMIT for wait in waits if wait['exact']]
     report.table(
@@ -203,30 +203,30 @@ def time_table(report: Report, waits: list[JsonDict]) -> None:
 
 PAIR = ' and '
 _MEMS = PRESETS['mems']
-# The estimator takes misalignment and the errors of the accelerometers for 3 tenths of the gyros'
-# scale factor errors.
-_AXES = 3 * 0.3 * _MEMS.gyro_scale_std
-# What each changes of the arguments of `simulate`.
+# Three times what the estimator assumes of misalignments and of the accelerometers' scale factors:
+# 0.3 times the sigma of the gyros' scale factors.
+_MATRIX_STD = 3 * 0.3 * _MEMS.gyro_scale_std
+# Each fault sets arguments of `simulate`.
 WORSE: dict[str, JsonDict] = {
     'accelerometer bias x 10': {'accel_bias_std': 10 * _MEMS.accel_bias_std},
     'scale, misalignment x 3': {
-        'gyro_scale_std': 3 * _MEMS.gyro_scale_std, 'gyro_misalignment_std': _AXES,
-        'accel_scale_std': _AXES, 'accel_misalignment_std': _AXES},
+        'gyro_scale_std': 3 * _MEMS.gyro_scale_std, 'gyro_misalignment_std': _MATRIX_STD,
+        'accel_scale_std': _MATRIX_STD, 'accel_misalignment_std': _MATRIX_STD},
     'noise x 3': {'imu_grade': _MEMS._replace(
         angle_random_walk=3 * _MEMS.angle_random_walk,
         velocity_random_walk=3 * _MEMS.velocity_random_walk)},
     'quantum 0.57 deg/s': {'quantum': (math.radians(0.57), 0.0)},
     'dead band 0.5 deg/s': {'dead_band': (math.radians(0.5), 0.0)},
-    # Receivers with filters: 0.3 to 0.9 m/s in a turn where 0.07 is stated.
+    # As of receivers that filter: errors of 0.3 to 0.9 m/s in a turn where 0.07 is stated.
     'GNSS errors that last': {'velocity_drift_std': 0.3, 'gnss_correlation': 3.0},
 }
-# Nothing wrong, each, and pairs.
+# No fault, each fault alone, and all pairs.
 COMBINATIONS: tuple[tuple[str, ...], ...] = (
     (), *((name,) for name in WORSE), *itertools.combinations(WORSE, 2))
 
 
 def run_worse(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
-    """Run ``declare-worse``, seeds 0 to `runs`."""
+    """Run ``declare-worse``."""
     [found] = parallel(run_case, [[(draw_worse, seed) for seed in range(runs)]],
                        jobs, 'declare-worse')
     report.text(
@@ -256,10 +256,10 @@ def draw_worse(seed: int) -> Case:
                 {'imu_grade': 'mems'})
 
 
-# settings: everything is as it is configured
+# settings: everything is as configured
 
 MOVING = tuple(name for name in SCENARIOS if name not in ('straight', 'static'))
-# Parameters of what the GNSS measures.
+# What the GNSS measures, and the parameters that say so.
 HORIZONTAL = 'horizontal velocities'
 MEASURED: dict[str, JsonDict] = {
     'velocities': {}, HORIZONTAL: {'velocity_vertical': 'absent'},
@@ -267,7 +267,7 @@ MEASURED: dict[str, JsonDict] = {
 
 
 def run_settings(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
-    """Run ``settings``, seeds 0 to `runs`."""
+    """Run ``settings``."""
     [found] = parallel(run_case, [[(draw_settings, seed) for seed in range(runs)]], jobs,
                        'settings')
     report.text(
@@ -312,6 +312,7 @@ def draw_settings(seed: int) -> Case:
 
 
 def _send(stream: Stream, random: Random, stated: bool, vertical: bool) -> None:
+    """Remove the stated covariances, or the vertical velocities, unless they are to be sent."""
     if not stated:
         stream.velocity['covariance'] = stream.fix['covariance'] = 0.0
         stream.fix['covariance_type'] = 0

@@ -12,15 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-The estimation problem solved in one go, all noise covariances written out: the reference.
+The reference: the estimation problem as one least-squares problem with a dense noise covariance.
 
 It shares neither integration nor recursion with the package: attitude, velocity and position are
-integrated by plain sums at the IMU's instants, the Earth is python-ins', and the covariance of
-the random-walk errors of all epochs is one dense matrix. On the true motion its inverse
-information is the Cramer-Rao bound; the tests solve the measured data with the same pieces. Cost
-grows with the cube of the number of epochs: 500 take about a second.
+integrated by the trapezoidal rule over the IMU samples, the Earth model is that of python-ins, and
+the covariance of the random-walk errors of all epochs is one dense matrix. On the true motion the
+inverse of the information matrix is the Cramer-Rao bound; the tests solve measured data with the
+same functions. The cost grows with the cube of the number of epochs: 500 take about a second.
 
-An IMU has white noise and constant biases here, no scale factor errors and no rate random walk.
+Here an IMU has white noise and constant biases, but no scale factor errors or rate random walk.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import cholesky, solve_triangular
 from scipy.spatial.transform import Rotation
 
-# Places of the unknowns.
+# Columns of the unknowns.
 ATTITUDE, GYRO_BIAS, ACCEL_BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
 START_VELOCITY, START_POSITION = slice(9, 12), slice(12, 15)
 LEVER_ARM, DELAY = slice(15, 18), slice(18, 19)
 SIZE = 19
-# Nothing more than "somewhere on the circle" is known of an angle (rad): keeps the information
-# regular where the motion shows no heading.
+# Sigma of an angle that is uniform on the circle (rad); this prior keeps the information matrix
+# regular where the motion does not show the heading.
 _ATTITUDE_STD = math.pi / math.sqrt(3)
-SWING_STEP = 0.1        # s, of the differences that give the angular acceleration
+SWING_STEP = 0.1        # s, step of the differences that give the angular acceleration
 
 
 @dataclass(frozen=True)
@@ -64,15 +64,15 @@ class Bound:
 def bound(simulation: Simulation, positions: bool = False, lever_arm_std: float = 0.0,
           delay_std: float = 0.0) -> Bound:
     """
-    Cramer-Rao bound on the true motion of a simulation: its noise is not used, what it states is.
+    Return the Cramer-Rao bound on the true motion of a simulation, with its stated noise.
 
-    GNSS measures velocities, or positions instead. Lever arm (m per axis) and delay (s) are
-    unknowns too where their sigma is above 0.
+    GNSS measures velocities, or with `positions` these instead. Lever arm (sigma in m per axis)
+    and delay (s) are unknowns too if their sigma is above 0.
     """
     noise = simulation.imu_noise
     if noise.gyro_scale_std > 0 or noise.rate_random_walk > 0:
         raise ValueError('the bound knows only noise and constant biases of an IMU')
-    # Measurements may be older than their stamps.
+    # Stamps of GNSS are later than the measurements by the delay.
     epochs = simulation.gnss_stamps_ns - round(simulation.meta['gnss_delay'] * 1e9)
     path = _true_path(simulation, epochs)
     columns, prior = prior_of(noise, positions, lever_arm_std, delay_std)
@@ -89,9 +89,10 @@ class Path:
     """
     Integrals over the motion at K epochs, in n0 axes.
 
-    U and P are the first and second integral of the specific force, Theta that of C. H_v and H_p,
-    shape (K, 3, 15), derive velocity and position of the IMU by all unknowns but lever arm and
-    delay; M holds the integrals of z z^T, z = (1, U, t U - P).
+    U and P are the first and second integral of the specific force, Theta is that of C. H_v and
+    H_p, shape (K, 3, 15), are the derivatives of the IMU's velocity and position with respect to
+    all unknowns but lever arm and delay. M, shape (K, 7, 7), holds the integrals of z z^T with
+    z = (1, U, t U - P).
     """
 
     time: Array
@@ -102,7 +103,7 @@ class Path:
     H_v: Array
     H_p: Array
     M: Array
-    omega: Array          # of the body to inertial space, body axes
+    omega: Array          # of the body with respect to inertial space, body axes
     omega_dot: Array
     acceleration: Array   # over ground
     v_ground: Array
@@ -110,13 +111,13 @@ class Path:
 
 
 def cumulative(time: Array, values: Array) -> Array:
-    """Integral by the trapezoidal rule along the first axis."""
+    """Integrate by the trapezoidal rule along the first axis, from 0 on."""
     return np.asarray(cumulative_trapezoid(values, time, axis=0, initial=0))
 
 
 def path_along(time: Array, C: Array, omega: Array, f: Array, at: Array, C_n0n: Array,
                g_n: Array, v_n: Array) -> Path:
-    """Integrate along a grid of instants; `at` picks the epochs from it."""
+    """Integrate over a grid of instants (N,); `at` (K,) are the indices of the epochs in it."""
     force = np.einsum('nij,nj->ni', C, f)
     U = cumulative(time, force)
     P = cumulative(time, U)
@@ -135,7 +136,7 @@ def path_along(time: Array, C: Array, omega: Array, f: Array, at: Array, C_n0n: 
 
 
 def _rate_of_change(time: Array, omega: Array) -> Array:
-    """Derive the angular rate: second differences of its integral, which calm noise."""
+    """Return the angular acceleration: second differences of the angle, which smooth noise."""
     angle = cumulative(time, omega)
     middle = np.clip(time, time[0] + SWING_STEP, time[-1] - SWING_STEP)
     before, here, after = (
@@ -145,7 +146,7 @@ def _rate_of_change(time: Array, omega: Array) -> Array:
 
 
 def grid_of(imu_ns: np.ndarray, epochs_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Instants of the samples from the first epoch to the last with those of the epochs."""
+    """Return the times of the epochs and the samples between them, ns, and where epochs are."""
     inside = (imu_ns > epochs_ns[0]) & (imu_ns < epochs_ns[-1])
     grid = np.union1d(imu_ns[inside], epochs_ns)
     return grid, np.searchsorted(grid, epochs_ns)
@@ -195,12 +196,12 @@ def gravity_n(lla: Array) -> Array:
 
 
 def lever_velocity(path: Path, lever_b: Array) -> Array:
-    """Velocity of the antenna with respect to the IMU, in n0."""
+    """Return the velocity of the antenna with respect to the IMU, in n0."""
     return np.einsum('nij,nj->ni', path.C, np.cross(path.omega, lever_b))
 
 
 def design_of(path: Path, lever_b: Array, positions: bool = False) -> Array:
-    """Derive the measurements by the unknowns, shape (3 K, 19)."""
+    """Return the derivatives of the measurements with respect to the unknowns, (3 K, 19)."""
     H = np.zeros((len(path.time), 3, SIZE))
     if positions:
         H[..., :LEVER_ARM.start] = path.H_p
@@ -223,16 +224,17 @@ def design_of(path: Path, lever_b: Array, positions: bool = False) -> Array:
 def noise_covariance(path: Path, noise: ImuNoise, stated: Array,
                      positions: bool = False) -> Array:
     """
-    Covariance of all rows: random walks of the IMU and stated GNSS noise, shape (3 K, 3 K).
+    Return the covariance of all measurements from IMU random walks and GNSS noise, (3 K, 3 K).
 
-    An angle error at s turns a row by ``-[x x]`` with ``x = B z(s)``. Velocity: ``x = U(t) -
-    U(s)``; position: ``x = P(t) - P(s) - (t - s) U(s)``. The lever arm, centimetres of motion per
-    rad, is left out of the noise.
+    An angle error that arises at s changes the measurement at t by ``-[x x]`` times itself, with
+    ``x = B z(s)``: ``U(t) - U(s)`` for a velocity, ``P(t) - P(s) - (t - s) U(s)`` for a position.
+    Its effect through the lever arm, centimetres of motion per rad, is neglected.
     """
     n = len(path.time)
     early, late = path.time[:, None], path.time[None]
     B = np.zeros((n, 3, 7))
-    # An accelerometer error at s is worth 1 in a velocity, t - s in a position.
+    # `pushed` is the integral, up to the earlier epoch, of the product of what an acceleration
+    # error at s does to both epochs: 1 for a velocity, t - s for a position.
     if positions:
         B[..., 0] = path.P
         B[..., 1:4] = -path.time[:, None, None] * np.eye(3)
@@ -242,7 +244,7 @@ def noise_covariance(path: Path, noise: ImuNoise, stated: Array,
         B[..., 0] = path.U
         B[..., 1:4] = -np.eye(3)
         pushed = early
-    # X[i, a, j, b]: integral of x_i[a] x_j[b] up to the earlier one, i <= j.
+    # X[i, a, j, b]: integral of x_i[a] x_j[b] up to epoch i, which holds for i <= j.
     X = ((B @ path.M).reshape(3 * n, 7) @ B.reshape(3 * n, 7).T).reshape(n, 3, n, 3)
     trace = np.einsum('iaja->ij', X)
     V = -noise.angle_random_walk ** 2 * X.transpose(0, 3, 2, 1)
@@ -260,7 +262,7 @@ def noise_covariance(path: Path, noise: ImuNoise, stated: Array,
 
 def prior_of(noise: ImuNoise, positions: bool, lever_arm_std: float,
              delay_std: float) -> tuple[Index, Array]:
-    """Numbers of the unknowns that are estimated, and the prior's information about them."""
+    """Return the columns of the unknowns that are estimated, and their prior information."""
     std = np.zeros(SIZE)
     std[ATTITUDE] = _ATTITUDE_STD
     std[GYRO_BIAS], std[ACCEL_BIAS] = noise.gyro_bias_std, noise.accel_bias_std
@@ -273,19 +275,20 @@ def prior_of(noise: ImuNoise, positions: bool, lever_arm_std: float,
 
 def whiten(V: Array, columns: Array) -> Array:
     """
-    Solve with the Cholesky factor of V.
+    Multiply columns by the inverse of the lower Cholesky factor of V.
 
-    The first rows of the result depend on the first rows of the problem alone: sums over them are
-    those of the problem cut short.
+    The first rows of the result depend on the first rows of V and of the columns alone, so sums
+    over them belong to the problem that ends there.
     """
     return solve_triangular(cholesky(V, lower=True), columns, lower=True)
 
 
 def inverse_of(matrix: Array) -> Array:
     """
-    Inverse of a symmetric positive definite matrix whose rows differ widely in scale.
+    Invert a symmetric positive definite matrix whose rows differ widely in scale.
 
-    nan where there is no information about an unknown: one position says nothing of velocity.
+    The result is nan if there is no information about some unknown, as about the velocity after a
+    single position.
     """
     if not np.diag(matrix).all():
         return np.full(matrix.shape, math.nan)

@@ -12,10 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Experiment ``faults``: what real drivers get wrong, crossed with motions and grades of IMU.
+Experiment ``faults``: faults of real drivers, combined with all scenarios and grades of IMU.
 
-Nothing may break: no exception, no number that is not finite, no memory that grows, no message
-that is not counted; and what is declared all the same has to be right.
+Nothing may break: there must be no exception, no number that is not finite, no memory that grows
+and no message that is not counted. What is declared in spite of the fault has to be right.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ import warnings
 from ins_align.aligner import Aligner, Epoch
 from ins_align.config import Config
 from ins_align.experiments.common import (
-    beyond, BINS, Case, cell, combination, follow, GRADES, groups_of, JsonDict, outcome, parallel,
-    prepare, Report, setup, worst)
+    beyond, Case, cell, combination, follow, GRADES, groups_of, JsonDict, outcome, parallel,
+    prepare, Report, setup, SIGMA_LIMITS, worst)
 from ins_align.experiments.spoilt import FAULTS, Random, SECOND, SENSORS, Stream
 from ins_align.simulation.simulate import SCENARIOS
 import numpy as np
 
 DURATION = 60.0
 UPDATE_EVERY = 1.0  # s
-WEIGH_EVERY = 5     # updates
-# What an aligner may hold, pickled; the largest part does not depend on the data.
+WEIGH_EVERY = 5     # updates from one measurement of the size to the next
+# Largest size of a pickled aligner, bytes; most of it does not depend on the data.
 MAX_HELD = 8_000_000
-# Reasons for which a message is not used.
+# Ends of the counters of messages that are not used.
 REFUSED = {'fix': ('no_fix', 'nan', 'late', 'ahead', 'duplicate'),
            'velocity': ('nan', 'late', 'ahead', 'duplicate')}
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
-    """Run the campaign and write its table."""
+    """Run ``faults``."""
     [found] = parallel(run_watched, [range(runs)], jobs, 'faults')
     report.text(
         f'{runs} runs of {DURATION:g} s over {len(FAULTS)} faults, all scenarios '
@@ -63,7 +63,7 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
 
 
 def draw(index: int) -> Case:
-    """Draw a run; what spoils it draws too how its samples come, and when results are taken."""
+    """Draw a run; its `spoil` also draws the size of IMU batches and the times of updates."""
     fault, scenario, grade = combination(index, [3], FAULTS, SCENARIOS, GRADES)
     random = np.random.default_rng([4, index])
     arguments = {'duration': DURATION, **setup(random)}
@@ -75,14 +75,14 @@ def draw(index: int) -> Case:
         random = np.random.default_rng([5, index])
         stream.config['velocity_frame'] = arguments['velocity_frame']
         FAULTS[fault](stream, random)
-        stream.lot = 1 if random.random() < 0.5 else len(stream.imu) + 1
+        stream.batch = 1 if random.random() < 0.5 else len(stream.imu) + 1
         stream.updates = update_times(stream, random)
 
     return Case(fault, ((scenario, grade),), spoil, arguments, config)
 
 
 def update_times(stream: Stream, random: Random) -> np.ndarray:
-    """When somebody looks for results: regularly, or at random."""
+    """Return when the aligner is updated, ns: regularly, or at random if the fault says so."""
     end = max(int(getattr(stream, name)['arrival'].max(initial=stream.first)) for name in SENSORS)
     every = stream.update_every or UPDATE_EVERY
     number = (end - stream.first) / SECOND / every
@@ -92,7 +92,7 @@ def update_times(stream: Stream, random: Random) -> np.ndarray:
 
 
 def run_watched(index: int) -> JsonDict:
-    """Run what is drawn, and look at everything that comes out."""
+    """Run what `draw` draws from a seed, and check everything that the aligner returns."""
     case = draw(index)
     simulation, stream, aligner = prepare(case, index)
     epochs: list[Epoch] = []
@@ -105,9 +105,10 @@ def run_watched(index: int) -> JsonDict:
                 epochs += each
                 non_finite.update(broken(aligner, each))
                 aligner.take_events()
-                held = max(held, 0 if update % WEIGH_EVERY else weight(aligner))
+                if update % WEIGH_EVERY == 0:
+                    held = max(held, weight(aligner))
             held = max(held, weight(aligner))
-        except Exception:  # whatever it is, it is what this experiment looks for
+        except Exception:  # of whatever kind: this experiment looks for it
             exception = traceback.format_exc(limit=-3)
     result = {'name': case.name, 'seed': index, 'declared': [], 'final': [], 'beyond_s': 0.0,
               'exception': exception, 'non_finite': sorted(non_finite), 'held': held,
@@ -118,21 +119,21 @@ def run_watched(index: int) -> JsonDict:
     return result
 
 
-# What is looked at
+# Checks
 
 def weight(aligner: Aligner) -> int:
-    """Return how much an aligner holds, bytes, pickled."""
+    """Return the size of a pickled aligner, bytes."""
     return len(pickle.dumps(vars(aligner)))
 
 
 def broken(aligner: Aligner, epochs: list[Epoch]) -> list[str]:
-    """Return what is no number or no rotation, of epochs and of what can be asked for."""
+    """Return, in words, what of epochs and status is not finite, no rotation or no covariance."""
     status = aligner.status()
-    # An innovation that was not tested is nan by its definition, never infinite.
+    # An innovation that was not tested is nan by definition, but never infinite.
     numbers = [('epoch', value) for epoch in epochs for value in (
         0.0 if epoch.dry else epoch.t_s, epoch.gyro_bias, epoch.accel_bias,
         np.nan_to_num(epoch.innovation, posinf=np.inf, neginf=np.inf))]
-    numbers += [('status', value) for name, value in vars(status).items()
+    numbers += [('status', value) for value in vars(status).values()
                 if isinstance(value, (float, np.ndarray))]
     wrong = []
     for what, attitude in (
@@ -151,7 +152,7 @@ def broken(aligner: Aligner, epochs: list[Epoch]) -> list[str]:
 
 
 def miscounted(counts: dict[str, int], stream: Stream) -> list[str]:
-    """Compare counters with what was sent; return what does not fit, in words."""
+    """Compare counters with what was sent; return, in words, what does not fit."""
     wrong = [f'{name} is {count}' for name, count in counts.items() if count < 0]
     sent = {'fix': len(stream.fix),
             'velocity': len(stream.velocity) - counts.get('velocity_body_frame', 0)}
@@ -162,8 +163,8 @@ def miscounted(counts: dict[str, int], stream: Stream) -> list[str]:
         refused = sum(counts.get(f'{name}_{reason}', 0) for reason in REFUSED[name])
         if refused > number:
             wrong.append(f'{refused} of {number} {name} refused')
-    # A sample that is late when it comes is not looked at any more, one that is found late later
-    # is in both counters.
+    # A sample that is late on arrival is not in the counter `imu`; one that turns out to be late
+    # afterwards is in both.
     imu, samples = counts.get('imu', 0), len(stream.imu)
     left_out = counts.get('imu_late', 0) + counts.get('imu_ahead', 0)
     if not imu <= samples <= imu + left_out:
@@ -172,19 +173,19 @@ def miscounted(counts: dict[str, int], stream: Stream) -> list[str]:
 
 
 def error(run: JsonDict) -> float | None:
-    """Return the largest error in sigmas at any declaration and at the end, None without."""
+    """Return the largest error in sigmas at declarations and at the end, None without these."""
     return worst([*run['declared'], *run['final']])
 
 
 def row_of(name: str, runs: list[JsonDict]) -> JsonDict:
-    """Return what became of the runs of a fault."""
+    """Return the table row of the runs of a fault."""
     errors = [each for each in map(error, runs) if each is not None]
     row = {'case': name, 'runs': len(runs)}
     for title, what in (('exceptions', 'exception'), ('non-finite', 'non_finite'),
                         ('miscounted', 'miscounted'), ('warnings', 'warnings')):
         row[title] = sum(bool(run[what]) for run in runs)
     return {**row, 'declared': len(errors),
-            **{f'beyond {limit:g}': beyond(errors, limit) for limit in BINS},
+            **{f'beyond {limit:g}': beyond(errors, limit) for limit in SIGMA_LIMITS},
             'worst, sigma': cell(max, errors, '.1f'),
             'aligned beyond 5, s': cell(max, (run['beyond_s'] for run in runs), '.1f'),
             'held, MB': cell(max, (run['held'] * 1e-6 for run in runs), '.2f')}

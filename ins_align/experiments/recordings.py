@@ -12,10 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Experiment ``recordings``: real recordings, aligned from every tenth second on.
+Experiment ``recordings``: real recordings, with a new alignment every ten seconds.
 
-A recording is decoded once and stays in memory; each window of it is aligned by itself and
-compared with the recording's reference.
+Each process decodes a recording once and keeps it in memory; each window of it is aligned on its
+own and compared with the reference attitude of the recording.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from typing import Any, NamedTuple
 
 from ins_align.experiments import ExperimentError
 from ins_align.experiments.common import (
-    beyond, BINS, cell, errors_of, JsonDict, moment, parallel, Report, while_aligned, worst)
+    beyond, cell, errors_of, JsonDict, moment, parallel, Report, SIGMA_LIMITS, while_aligned,
+    worst)
 from ins_align.experiments.spoilt import SECOND
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.messages import Fix, Velocity
@@ -39,23 +40,23 @@ from ins_align.recordings.reader import read, REFERENCE_TOPIC
 from ins_align.results import Epoch, Reference
 import numpy as np
 
-# What is known beside the recording, by the beginning of its name: parameters, and how well its
-# reference is known (tilt, heading; degrees), where its stated sigma is too good to be true: the
-# UAV's differs from the on-board filter by 0.6 and 1.4 deg rms, the quadrotor's has a compass.
+# By the name of a recording up to the first dot: its parameters, and the least sigma of its
+# reference (tilt, heading; degrees), where the stated one is too good to be true: the UAV's
+# differs from the on-board filter by 0.6 and 1.4 deg rms, the quadrotor's has a compass.
 KNOWN: dict[str, tuple[JsonDict, float, float]] = {
     'uav_thor75': ({}, 0.6, 1.0), 'car_drive0708': ({'lever_arm': (0.0, 0.05, 0.0)}, 0.2, 0.5),
     'quad_dot08': ({}, 1.0, 2.0)}
-MOTION_SPEED, MOTION_TIME = 5.0, 60.0       # m/s of change within so many s is real motion
-STEP, LENGTH = 10.0, 120.0      # s
-SHORTEST = 10.0                 # s of data that a window has to have
-TIMES = (30.0, 60.0, 120.0)
+MOTION_SPEED, MOTION_TIME = 5.0, 60.0   # velocity change (m/s) in a time (s) that is real motion
+STEP, LENGTH = 10.0, 120.0      # s from window to window, and of a window
+SHORTEST = 10.0                 # s of data that a window has at least
+TIMES = (30.0, 60.0, 120.0)     # s since t0, when errors are tabulated
 
 
 class Recording(NamedTuple):
-    """Messages of a recording, and its reference."""
+    """Messages of a recording, and its reference attitude."""
 
     name: str
-    config: JsonDict                            # what is known of it
+    config: JsonDict                            # parameters of `Config` that are known
     imu: ImuSamples
     gnss: list[tuple[int, Fix | Velocity]]      # each with how many IMU samples came before it
     reference: Reference
@@ -63,15 +64,15 @@ class Recording(NamedTuple):
 
     @property
     def duration(self) -> float:
-        """Seconds."""
+        """Return the time from the first IMU sample to the last, s."""
         return float(self.imu.stamps_ns[-1] - self.imu.stamps_ns[0]) * 1e-9
 
     def attitudes_at(self, stamps_ns: list[int]) -> list[Array | None]:
-        """Return the reference's ``C_nb`` at stamps, None where there is none."""
+        """Return ``C_nb`` of the reference at stamps, None where it has none."""
         return [self.reference.attitude_at(stamp) for stamp in stamps_ns]
 
     def part(self, start_s: float, duration: float) -> JsonDict:
-        """Return the data that `align` takes, for so long from a time on, s."""
+        """Return the arguments of `align` for a window; start and duration in s."""
         stamps_ns = self.imu.stamps_ns
         first, last = np.searchsorted(stamps_ns, stamps_ns[0] + np.rint(np.array(
             [start_s, start_s + duration]) * SECOND).astype(np.int64)).tolist()
@@ -96,7 +97,7 @@ def recordings_in(folder: Path) -> list[Path]:
 
 @lru_cache(maxsize=3)
 def load(path: Path) -> Recording:
-    """Read and decode a recording; the last few are kept."""
+    """Read and decode a recording; the last three stay in memory."""
     parts = list(read(path))
     if parts[0].topics.reference is None:
         raise BagError(f'it has no reference attitude on {REFERENCE_TOPIC}')
@@ -114,16 +115,16 @@ def load(path: Path) -> Recording:
 
 
 def windows_of(path: Path, config: JsonDict) -> list[Any]:
-    """Return tasks for `run_window`, one every `STEP`."""
+    """Return the tasks for `run_window`, one every `STEP` seconds of a recording."""
     starts = np.arange(0.0, max(load(path).duration - SHORTEST, 0.0) + 1e-6, STEP)
     return [(path, start, LENGTH, config) for start in starts.tolist()]
 
 
 def run_window(task: tuple[Path, float, float, JsonDict]) -> JsonDict:
     """
-    Align a window of a recording.
+    Align a window of a recording and judge it.
 
-    The task: its path, from when on and how long, s, parameters of `Config`.
+    The task is the path, start and duration of the window (s), and parameters of `Config`.
     """
     path, start_s, duration, config = task
     recording = load(path)
@@ -139,7 +140,7 @@ def run_window(task: tuple[Path, float, float, JsonDict]) -> JsonDict:
 
 
 def _moves(stamps: np.ndarray, fixes: list[Fix], velocities: list[Velocity], **imu: Array) -> bool:
-    """Tell whether the horizontal velocity, or that of the positions, changes in a minute."""
+    """Return whether the horizontal velocity, or that of positions, changes much in a minute."""
     measured = [m for m in velocities if np.isfinite(m.velocity).all()]
     if measured:
         times = np.array([m.stamp_ns for m in measured])
@@ -151,19 +152,20 @@ def _moves(stamps: np.ndarray, fixes: list[Fix], velocities: list[Velocity], **i
         if len(rows) < 3:
             return False
         time, places = track(series_of(rows[:, 0] / SECOND, rows[:, 1:]))
-        # Over half a second, against the noise of a fix.
+        # Differences over half a second, because fixes are noisy.
         step = max(1, int(round(0.25 / np.median(np.diff(time)))))
         times = stamps[0] + np.rint(time[step:-step] * SECOND).astype(np.int64)
         v = ((places[2 * step:] - places[:-2 * step])[:, :2]
              / (time[2 * step:] - time[:-2 * step])[:, None])
     v = v[times <= times[:1] + round(MOTION_TIME * SECOND)]
-    angles = np.radians(np.arange(0.0, 180.0, 15.0))    # the largest difference to 1 %
+    # The extents in these directions contain the largest change to 1 %.
+    angles = np.radians(np.arange(0.0, 180.0, 15.0))
     extents = np.ptp(v @ [np.cos(angles), np.sin(angles)], axis=0) if len(v) else np.zeros(1)
     return bool(extents.max() >= MOTION_SPEED)
 
 
 def at_times(recording: Recording, epochs: list[Epoch]) -> dict[str, JsonDict]:
-    """Judge the last epochs up to `TIMES`, declared or not, of what lasts as long."""
+    """Judge the last epoch up to each of `TIMES` that the window reaches, declared or not."""
     shown = [epoch for epoch in epochs if epoch.current is not None]
     errors = errors_of([epoch.current for epoch in shown], recording.attitudes_at,
                        recording.reference_std_deg)
@@ -178,7 +180,7 @@ def at_times(recording: Recording, epochs: list[Epoch]) -> dict[str, JsonDict]:
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
-    """Run every window of every recording with every method."""
+    """Run ``recordings``: all windows of all recordings with all methods."""
     assert data is not None
     paths = recordings_in(data)
     if not paths:
@@ -210,22 +212,22 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
 
 
 def methods_of(path: Path) -> dict[str, JsonDict]:
-    """Return the parameters of each method: pif instead of vif where there is no velocity."""
+    """Return the parameters of each method, with pif instead of vif if there are no velocities."""
     measured = any(isinstance(message, Velocity) for _, message in load(path).gnss)
     note = {'method': 'vif' if measured else 'pif'}
     return {'note': {**note, 'free_start': False}, 'centred': note, 'bank': {'method': 'bank'}}
 
 
-# Rows of tables, of a name and the runs of its windows
+# Rows of tables, each from a name and the results of its windows
 
 def _both(moments: list[JsonDict], name: str) -> str | None:
-    """Return the median and the largest value of moments."""
+    """Return the median and the largest value of a named error."""
     values = [moment[name] for moment in moments]
     return f'{np.median(values):.2g} / {np.max(values):.2g}' if values else None
 
 
 def declared_row(name: str, runs: list[JsonDict]) -> JsonDict:
-    """Return when windows declare, how wrong they are then, and in all epochs while ALIGNED."""
+    """Return when windows declare, and the errors then and in all epochs while ALIGNED."""
     first = [run['first'][0] for run in runs if run['first']]
     moving = [run['first'] for run in runs if run['moves'] and run['covers_minute']]
     soon = sum(each[0]['t_s'] <= MOTION_TIME for each in moving if each)
@@ -236,17 +238,18 @@ def declared_row(name: str, runs: list[JsonDict]) -> JsonDict:
     for title, key in (('heading, deg', 'heading_deg'), ('heading, sigma', 'heading_sigmas'),
                        ('tilt, deg', 'tilt_deg'), ('tilt, sigma', 'tilt_sigmas')):
         row[title] = _both(first, key)
-    row |= {f'> {limit:g}': beyond((worst([each]) for each in first), limit) for limit in BINS}
+    row |= {f'> {limit:g}': beyond((worst([each]) for each in first), limit)
+            for limit in SIGMA_LIMITS}
     row |= {'at the end': sum(run['state'] == 'ALIGNED' for run in runs), 'epochs': epochs}
-    for place, limit in enumerate(BINS):
+    for k, limit in enumerate(SIGMA_LIMITS):
         row[f'> {limit:g} sigma, %'] = (
-            f"{100 * sum(run['beyond'][place] for run in runs) / epochs:.1f}" if epochs else None)
+            f"{100 * sum(run['beyond'][k] for run in runs) / epochs:.1f}" if epochs else None)
     return row | {'worst, sigma': cell(
         max, (run['worst_sigmas'] for run in runs if run['first']), '.1f')}
 
 
 def times_row(name: str, runs: list[JsonDict]) -> JsonDict:
-    """Return how wrong windows are at each of `TIMES`."""
+    """Return the errors of windows at each of `TIMES`."""
     row = {'case': name, 'runs': len(runs)}
     for time in map('{:g}'.format, TIMES):
         found = [run['at'][time] for run in runs if time in run['at']]

@@ -12,10 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Messages of a simulated vehicle as drivers send them, and what real drivers get wrong in them.
+Messages of a simulated vehicle as drivers send them, and the faults of real drivers in them.
 
-A fault changes a `Stream` in place: it drops, repeats, delays, restamps and spoils messages, and
-notes which counters of the aligner have to show it.
+A fault changes a `Stream` in place: it drops, repeats, delays, restamps or spoils messages, and
+notes the counters of the aligner that it determines.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ import numpy as np
 
 Random = np.random.Generator
 Window = tuple[int, int]            # ns
-Message = tuple[int, str, Any]      # when it arrives (ns), what it is, and itself
+Message = tuple[int, str, Any]      # arrival (ns), kind, content
 
 SECOND = 1_000_000_000
 HOUR = 3600 * SECOND
 LATENESS_NS = round(Config().gnss_lateness * SECOND)
-LOT = 100       # IMU samples given at once, in which the lateness of their stamps is taken for one
-BETWEEN_LOT = 7         # the same where attitudes between epochs are judged
+BATCH = 100             # IMU samples given at once, which have one offset in `Stream.clock`
+BETWEEN_BATCH = 7       # the same where attitudes between epochs are judged
 GNSS = 'fix', 'velocity'
 SENSORS = 'imu', *GNSS
 _IMU = np.dtype([('arrival', 'i8'), ('stamp', 'i8'), ('gyro', 'f8', 3), ('accel', 'f8', 3)])
@@ -54,24 +54,24 @@ _VELOCITY = np.dtype([('arrival', 'i8'), ('stamp', 'i8'), ('velocity', 'f8', 3),
 @dataclass
 class Stream:
     """
-    What the drivers send: a row a message, with ``arrival`` and ``stamp`` in ns.
+    What the drivers send: arrays with a row per message, ``arrival`` and ``stamp`` in ns.
 
-    Everything else is as in the ROS messages, in the frame that the configuration names.
+    The other fields are as in the ROS messages, in the frame that the configuration names.
     """
 
     imu: np.ndarray
     fix: np.ndarray
     velocity: np.ndarray
-    first: int              # stamps between which the vehicle is simulated
+    first: int              # first and last stamp of the simulation, ns
     last: int
-    lot: int = LOT          # IMU samples given at once
-    config: dict[str, Any] = field(default_factory=dict)        # what else is configured
-    resets: list[int] = field(default_factory=list)     # when somebody asks for a new start
-    updates: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))  # or for results
-    update_every: float = 0.0       # s, in the mean, where they are asked for at random
-    between: bool = False           # or after every message, for the attitude now
+    batch: int = BATCH      # IMU samples given at once
+    config: dict[str, Any] = field(default_factory=dict)        # further parameters of `Config`
+    resets: list[int] = field(default_factory=list)     # times of resets, ns
+    updates: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))  # of updates, ns
+    update_every: float = 0.0       # mean interval of updates at random, s; 0: they are regular
+    between: bool = False           # update after every message, to judge the attitude then
     expected: dict[str, int] = field(default_factory=dict)      # counters known beforehand
-    # Stamps behind each of the former are off by one of the latter, of which there is one more.
+    # Stamps at which the clock's offset changes, and the offsets before, between and after, ns.
     clock: tuple[Any, Any] = (), (0,)
 
     @property
@@ -80,56 +80,56 @@ class Stream:
         return int(next(iter(self.imu['stamp']), self.first))
 
     def true_stamps(self, stamps: Any) -> Any:
-        """When what bears these stamps has been, by the simulation's clock."""
+        """Return the times of the simulation, ns, that belong to stamps."""
         edges, offsets = map(np.asarray, self.clock)
         return np.clip(stamps - offsets[np.searchsorted(edges, stamps)], self.first, self.last)
 
     def stamp_imu(self, stamps: np.ndarray) -> None:
-        """Stamp IMU samples otherwise than when they are measured, which is when they arrive."""
+        """Stamp IMU samples anew; they still arrive when they are measured."""
         self.imu['stamp'] = stamps
         late = stamps - self.imu['arrival']
-        self.clock = stamps[::LOT][1:], [int(np.median(late[k:k + LOT]))
-                                         for k in range(0, len(late), LOT)]
+        self.clock = stamps[::BATCH][1:], [int(np.median(late[k:k + BATCH]))
+                                           for k in range(0, len(late), BATCH)]
 
     def moment(self, random: Random, low: float = 0.1, high: float = 0.9) -> int:
-        """Draw an instant from a part of the recording."""
+        """Draw a time, ns; `low` and `high` are parts of the duration."""
         return self.first + int(random.uniform(low, high) * (self.last - self.first))
 
     def windows(self, random: Random, number: int, shortest: float,
                 longest: float) -> list[Window]:
-        """Draw windows with a length within limits, in seconds."""
+        """Draw windows whose lengths are within limits, s."""
         starts = [self.moment(random) for _ in range(number)]
         return [(start, start + int(random.uniform(shortest, longest) * SECOND))
                 for start in starts]
 
     def seconds(self, name: str) -> Array:
-        """Return when messages were sent or samples taken, s since the start."""
-        return np.asarray((getattr(self, name)['arrival'] - self.first) / SECOND)
+        """Return the arrivals of messages, s since the start."""
+        return (getattr(self, name)['arrival'] - self.first) / SECOND
 
     def keep(self, name: str, chosen: np.ndarray) -> None:
-        """Lose all but the chosen messages."""
+        """Drop all messages but the chosen ones."""
         setattr(self, name, getattr(self, name)[chosen])
 
     def lose(self, names: Iterable[str], windows: Iterable[Window]) -> None:
-        """Lose the messages with stamps within windows."""
+        """Drop the messages with stamps within windows."""
         for window in windows:
             for name in names:
                 self.keep(name, ~within(getattr(self, name), window))
 
-    def put_off(self, name: str, chosen: np.ndarray, away: Array) -> None:
-        """Add ENU errors to positions (m) or velocities (m/s), or one to all that are chosen."""
+    def add_error(self, name: str, chosen: np.ndarray, error: Array) -> None:
+        """Add ENU errors, one each or one for all, to chosen positions (m) or velocities (m/s)."""
         if name == 'velocity':
-            self.velocity['velocity'][chosen] += away
+            self.velocity['velocity'][chosen] += error
         else:
-            here = self.fix['lla'][chosen]
-            self.fix['lla'][chosen] = displaced(here, np.broadcast_to(away, here.shape))
+            lla = self.fix['lla'][chosen]
+            self.fix['lla'][chosen] = displaced(lla, np.broadcast_to(error, lla.shape))
 
     def messages(self, config: Config) -> Iterator[Message]:
         """
-        Yield what an aligner is given, in the order of arrival; IMU samples in lots.
+        Yield the messages in the order of arrival, IMU samples in batches.
 
-        Kinds are the names of the arrays, 'update', 'reset', and 'reject' with the reason for a
-        message that cannot be used.
+        Kinds are the names of the arrays, 'update', 'reset', and 'reject', whose content is the
+        reason why a message cannot be used.
         """
         fix = self.fix
         payloads = {'fix': fixes(*(fix[name] for name in fix.dtype.names[1:])),
@@ -137,22 +137,22 @@ class Stream:
                     'update': [None] * len(self.updates), 'reset': [None] * len(self.resets)}
         arrivals = {**{name: getattr(self, name)['arrival'] for name in SENSORS},
                     'update': self.updates, 'reset': self.resets}
-        events = sorted(((int(time), kind, place) for kind, times in arrivals.items()
-                         for place, time in enumerate(times)), key=itemgetter(0))
+        events = sorted(((int(time), kind, index) for kind, times in arrivals.items()
+                         for index, time in enumerate(times)), key=itemgetter(0))
         for kind, block in itertools.groupby(events, itemgetter(1)):
-            times, _, places = zip(*block)
+            times, _, indices = zip(*block)
             if kind == 'imu':
-                for start in range(0, len(places), self.lot):
-                    lot = self.imu[list(places[start:start + self.lot])]
-                    yield (int(lot['arrival'][-1]), kind,
-                           (lot['stamp'], lot['gyro'], lot['accel']))
+                for start in range(0, len(indices), self.batch):
+                    batch = self.imu[list(indices[start:start + self.batch])]
+                    yield (int(batch['arrival'][-1]), kind,
+                           (batch['stamp'], batch['gyro'], batch['accel']))
                 continue
-            for time, place in zip(times, places):
-                payload = payloads[kind][place]
+            for time, index in zip(times, indices):
+                payload = payloads[kind][index]
                 yield time, 'reject' if isinstance(payload, str) else kind, payload
 
     def _velocities(self, config: Config) -> list[Any]:
-        """Return velocities, or why each cannot be used."""
+        """Return the velocities, or instead of each the reason why it cannot be used."""
         rows = self.velocity
         stated = None if config.velocity_type == 'TwistStamped' else rows['covariance']
         try:
@@ -163,7 +163,7 @@ class Stream:
 
 
 def stream_of(simulation: Simulation, between: bool = False) -> Stream:
-    """Return the messages of a simulation, its velocities taken for ENU."""
+    """Return the messages of a simulation; its velocities are configured as ENU."""
     imu = np.zeros(len(simulation.imu_stamps_ns), _IMU)
     imu['arrival'] = imu['stamp'] = simulation.imu_stamps_ns
     imu['gyro'], imu['accel'] = simulation.gyro, simulation.accel
@@ -176,17 +176,17 @@ def stream_of(simulation: Simulation, between: bool = False) -> Stream:
     velocity['velocity'] = simulation.velocity
     velocity['covariance'] = simulation.velocity_covariance
     return Stream(imu, fix, velocity, int(simulation.imu_stamps_ns[0]),
-                  int(simulation.imu_stamps_ns[-1]), BETWEEN_LOT if between else LOT,
+                  int(simulation.imu_stamps_ns[-1]), BETWEEN_BATCH if between else BATCH,
                   {'velocity_frame': 'enu'}, between=between)
 
 
 def within(rows: np.ndarray, window: Window) -> np.ndarray:
-    """Whether messages have stamps within a window."""
+    """Return which messages have stamps within a window."""
     return (rows['stamp'] >= window[0]) & (rows['stamp'] < window[1])
 
 
-def some(random: Random, rows: np.ndarray, least: float, most: float) -> Array:
-    """Choose a part of the rows, one at least."""
+def choose_rows(random: Random, rows: np.ndarray, least: float, most: float) -> Array:
+    """Draw the indices of a part of the rows, sorted; `least` to `most` of them, at least one."""
     number = max(1, round(random.uniform(least, most) * len(rows)))
     return np.sort(random.choice(len(rows), number, replace=False))
 
@@ -194,32 +194,32 @@ def some(random: Random, rows: np.ndarray, least: float, most: float) -> Array:
 def directions(random: Random, number: int) -> Array:
     """Draw unit vectors, shape (number, 3)."""
     vectors = random.standard_normal((number, 3))
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1)[:, None])
+    return vectors / np.linalg.norm(vectors, axis=1)[:, None]
 
 
 # Faults of GNSS
 
 def _outliers(stream: Stream, random: Random) -> None:
     for name, least, most in ('fix', 10.0, 100.0), ('velocity', 0.5, 10.0):
-        chosen = some(random, getattr(stream, name), 0.01, 0.1)
-        stream.put_off(name, chosen, random.uniform(least, most, (len(chosen), 1))
-                       * directions(random, len(chosen)))
+        chosen = choose_rows(random, getattr(stream, name), 0.01, 0.1)
+        stream.add_error(name, chosen, random.uniform(least, most, (len(chosen), 1))
+                         * directions(random, len(chosen)))
 
 
 def _position_jump(stream: Stream, random: Random) -> None:
     later = stream.fix['stamp'] >= stream.moment(random)
-    stream.put_off('fix', later, 10 ** random.uniform(1.3, 3.3) * directions(random, 1))
+    stream.add_error('fix', later, 10 ** random.uniform(1.3, 3.3) * directions(random, 1))
 
 
 def _null_island(stream: Stream, random: Random) -> None:
-    chosen = some(random, stream.fix, 0.02, 0.5)
+    chosen = choose_rows(random, stream.fix, 0.02, 0.5)
     stream.fix['lla'][chosen, :2] = 0.0
     stream.expected['fix_no_fix'] = len(chosen)
 
 
 def _no_fix(stream: Stream, random: Random) -> None:
-    """Say that there is no fix, with an old position or none in the message."""
-    chosen = some(random, stream.fix, 0.02, 0.9)
+    """Set the status to no fix; every other such message has no position."""
+    chosen = choose_rows(random, stream.fix, 0.02, 0.9)
     stream.fix['status'][chosen] = -1
     stream.fix['lla'][chosen[::2]] = np.nan
     stream.expected['fix_no_fix'] = len(chosen)
@@ -231,38 +231,38 @@ def _unknown_status(stream: Stream, random: Random) -> None:
 
 
 def _broken_gnss(stream: Stream, random: Random) -> None:
-    """Send nan, inf and what is nowhere."""
+    """Send nan, inf and values that are impossible."""
     missing = {}
     for name, vector in ('fix', 'lla'), ('velocity', 'velocity'):
         rows = getattr(stream, name)
-        chosen = some(random, rows, 0.02, 0.5)
+        chosen = choose_rows(random, rows, 0.02, 0.5)
         values = random.choice(np.array([np.nan, np.inf, -np.inf, 1e300, -1e7]), len(chosen))
         axes = random.integers(0, 3, len(chosen))
         rows[vector][chosen, axes] = values
-        # The vertical alone may be missing: the rest is used.
+        # A message whose vertical component alone is nan is used.
         missing[name] = np.count_nonzero((axes == 2) & np.isnan(values))
         stream.expected[f'{name}_nan'] = len(chosen) - missing[name]
     stream.expected['fix_no_altitude'] = missing['fix']
 
 
 def _unknown_covariance(stream: Stream, random: Random) -> None:
-    """Mark covariances as unknown in the ways in which drivers do."""
+    """Mark covariances as unknown in the various ways of drivers."""
     for rows in stream.fix, stream.velocity:
-        chosen = some(random, rows, 0.5, 1.0)
+        chosen = choose_rows(random, rows, 0.5, 1.0)
         mark = random.choice(np.array([0.0, -1.0, np.nan]))
         rows['covariance'][chosen] = 0.0
         for axis in range(random.integers(1, 4)):
             rows['covariance'][chosen, axis, axis] = mark
-    stream.fix['covariance_type'][some(random, stream.fix, 0.0, 1.0)] = 0
+    stream.fix['covariance_type'][choose_rows(random, stream.fix, 0.0, 1.0)] = 0
 
 
 def _nonsense_covariance(stream: Stream, random: Random) -> None:
-    """Send covariances that are none, or that no receiver can mean."""
+    """Send covariances with impossible elements."""
     values = np.array([1e-300, 1e-30, 1e-12, 1e12, 1e30, 1e300, np.inf, -np.inf, -1e300])
     for rows in stream.fix, stream.velocity:
-        chosen = some(random, rows, 0.02, 0.3)
-        places = random.integers(0, 3, (2, len(chosen)))
-        rows['covariance'][chosen, places[0], places[1]] = random.choice(values, len(chosen))
+        chosen = choose_rows(random, rows, 0.02, 0.3)
+        i, j = random.integers(0, 3, (2, len(chosen)))
+        rows['covariance'][chosen, i, j] = random.choice(values, len(chosen))
 
 
 def _small_covariance(stream: Stream, random: Random) -> None:
@@ -271,23 +271,23 @@ def _small_covariance(stream: Stream, random: Random) -> None:
 
 
 def _one_stamp(stream: Stream, random: Random) -> None:
-    """Give one stamp to several messages: what is sent again, or whole seconds."""
+    """Give one stamp to several messages: send them again, or have stamps of whole seconds."""
     again = random.random() < 0.5
     for name in GNSS:
         rows = getattr(stream, name)
-        places = np.arange(len(rows))
+        indices = np.arange(len(rows))
         if again:
-            group = np.repeat(places, random.integers(1, 4, len(rows)))
-            stream.keep(name, group)
-            stream.expected[f'{name}_duplicate'] = len(group) - len(rows)
+            source = np.repeat(indices, random.integers(1, 4, len(rows)))
+            stream.keep(name, source)
+            stream.expected[f'{name}_duplicate'] = len(source) - len(rows)
         else:
-            group = places // 5 * 5
-            rows['stamp'] = rows['stamp'][group]
-            stream.expected[f'{name}_duplicate'] = int(np.sum(group != places))
+            source = indices // 5 * 5
+            rows['stamp'] = rows['stamp'][source]
+            stream.expected[f'{name}_duplicate'] = int(np.sum(source != indices))
 
 
 def _late_gnss(stream: Stream, random: Random) -> None:
-    """Send GNSS late, and out of order, but within what is allowed."""
+    """Send GNSS late and out of order, but within `gnss_lateness`."""
     for name in GNSS:
         rows = getattr(stream, name)
         rows['arrival'] += random.integers(0, LATENESS_NS, len(rows))
@@ -298,7 +298,7 @@ def _too_late_gnss(stream: Stream, random: Random) -> None:
     part = random.uniform(0.1, 1.0)
     for name in GNSS:
         rows = getattr(stream, name)
-        chosen = some(random, rows, 0.1 * part, part)
+        chosen = choose_rows(random, rows, 0.1 * part, part)
         rows['arrival'][chosen] += random.integers(LATENESS_NS + SECOND // 20, 5 * SECOND,
                                                    len(chosen))
         newest = np.minimum(rows['arrival'], stream.imu['stamp'][-1])
@@ -331,33 +331,33 @@ def _imu_jitter(stream: Stream, random: Random) -> None:
 
 
 def _imu_duplicates(stream: Stream, random: Random) -> None:
-    chosen = some(random, stream.imu, 0.01, 0.5)
+    chosen = choose_rows(random, stream.imu, 0.01, 0.5)
     stream.imu = np.insert(stream.imu, chosen, stream.imu[chosen])
     stream.expected['imu_duplicate'] = len(chosen)
 
 
 def _imu_out_of_order(stream: Stream, random: Random) -> None:
-    chosen = some(random, stream.imu, 0.01, 0.2)
+    chosen = choose_rows(random, stream.imu, 0.01, 0.2)
     stream.imu['arrival'][chosen] += random.integers(0, SECOND // 10, len(chosen))
     arrived = stream.imu['stamp'][np.argsort(stream.imu['arrival'], kind='stable')]
     stream.expected['imu_out_of_order'] = int(np.sum(arrived < np.maximum.accumulate(arrived)))
 
 
 def _imu_missing(stream: Stream, random: Random) -> None:
-    """Lose samples, single ones and many in a row."""
-    stream.imu = np.delete(stream.imu, some(random, stream.imu, 0.01, 0.2))
+    """Drop single samples, and many in a row."""
+    stream.imu = np.delete(stream.imu, choose_rows(random, stream.imu, 0.01, 0.2))
     stream.lose(['imu'], stream.windows(random, random.integers(0, 4), 0.05, 1.5))
 
 
 def _imu_silent(stream: Stream, random: Random) -> None:
-    """Send no sample from some moment on, or none at all."""
+    """Send no samples from some time on, or none at all."""
     end = stream.first if random.random() < 0.1 else stream.moment(random, 0.3, 0.95)
     stream.keep('imu', stream.imu['stamp'] < end)
 
 
 def _imu_broken(stream: Stream, random: Random) -> None:
-    """Send nan, inf and what no sensor measures."""
-    chosen = some(random, stream.imu, 0.001, 0.05)
+    """Send nan, inf and values beyond the range of any sensor."""
+    chosen = choose_rows(random, stream.imu, 0.001, 0.05)
     values = random.choice(np.array([np.nan, np.inf, -np.inf, 1e300, -3e3]), len(chosen))
     axes = random.integers(0, 3, len(chosen))
     half = len(chosen) // 2
@@ -367,15 +367,15 @@ def _imu_broken(stream: Stream, random: Random) -> None:
 
 
 def _imu_spikes(stream: Stream, random: Random) -> None:
-    """Spoil single samples by what a sensor could measure."""
+    """Add spikes to single samples, within the range of sensors."""
     for name, size in ('gyro', 150.0), ('accel', 1500.0):
-        chosen = some(random, stream.imu, 0.0, 0.002)
+        chosen = choose_rows(random, stream.imu, 0.0, 0.002)
         stream.imu[name][chosen] += (10 ** random.uniform(-2, 0, (len(chosen), 1)) * size
                                      * directions(random, len(chosen)))
 
 
 def _freeze(stream: Stream, windows: list[Window], *fields: str) -> None:
-    """Let IMU samples repeat what the first of a window has."""
+    """Let fields of IMU samples repeat those of the first sample in each window."""
     for window in windows:
         chosen = np.flatnonzero(within(stream.imu, window))
         for name in fields:
@@ -383,17 +383,17 @@ def _freeze(stream: Stream, windows: list[Window], *fields: str) -> None:
 
 
 def _imu_wild_stamps(stream: Stream, random: Random) -> None:
-    """Stamp single samples with what was never set or overflowed."""
+    """Give single samples stamps that are 0, overflowed or far off."""
     for index in random.choice(len(stream.imu), random.integers(1, 4), replace=False):
         stream.imu['stamp'][index] = random.choice([
             0, stream.first - HOUR, stream.last + HOUR, (1 << 31) * SECOND,
             int(stream.imu['stamp'][index]) + 5 * SECOND])
 
 
-# Faults of clocks and callers
+# Faults of clocks, and resets and updates
 
 def _clock_loop(stream: Stream, random: Random) -> None:
-    """Play the beginning, then everything: a bag that loops."""
+    """Send the beginning of the recording, then all of it, as a bag that loops."""
     end = stream.moment(random, 0.2, 0.6)
     for name in SENSORS:
         rows = getattr(stream, name)
@@ -404,7 +404,7 @@ def _clock_loop(stream: Stream, random: Random) -> None:
 
 
 def _set_clock(stream: Stream, moment: int, shift: int, **expected: int) -> None:
-    """Put all stamps from a moment on off by something."""
+    """Shift all stamps from `moment` on by `shift`, both in ns."""
     for rows in stream.imu, stream.fix, stream.velocity:
         rows['stamp'][rows['stamp'] >= moment] += shift
     stream.clock = [moment + shift, stream.last + shift + SECOND], [0, shift, 0]
@@ -412,7 +412,7 @@ def _set_clock(stream: Stream, moment: int, shift: int, **expected: int) -> None
 
 
 def _clock_step(stream: Stream, random: Random) -> None:
-    """Set the clock by less than what counts as lateness or silence."""
+    """Set the clock by less than counts as late or as an outage."""
     shift = int(random.choice([-1, 1]) * random.uniform(0.02, 0.9) * SECOND)
     _set_clock(stream, stream.moment(random, 0.2, 0.8), shift)
 
@@ -423,13 +423,13 @@ def _resets(stream: Stream, random: Random) -> None:
 
 
 def _random_updates(stream: Stream, random: Random) -> None:
-    """Look for results at random times, seldom or all the time."""
+    """Update at random times, between rarely and very often."""
     stream.update_every = float(10 ** random.uniform(-1.5, 1.3))
 
 
 def _several(stream: Stream, random: Random) -> None:
-    """Put three of the others together; what they count is not known any more."""
-    with np.errstate(invalid='ignore'):         # a position that is infinite may be displaced
+    """Combine three other faults; the counters cannot be told beforehand any more."""
+    with np.errstate(invalid='ignore'):         # outliers may be added to infinite positions
         for index in random.choice(len(TOGETHER), 3, replace=False):
             FAULTS[TOGETHER[index]](stream, random)
     stream.expected.clear()
@@ -445,7 +445,7 @@ FAULTS: dict[str, Callable[[Stream, Random], Any]] = {
     'covariance 0, -1, nan': _unknown_covariance, 'covariance nonsense': _nonsense_covariance,
     'covariance too small': _small_covariance, 'several with one stamp': _one_stamp,
     'GNSS up to 1 s late': _late_gnss, 'GNSS later': _too_late_gnss,
-    # Leap seconds, hours, since the start.
+    # By leap seconds, an hour, a day, or to time since the start.
     'GNSS clock far off': lambda stream, random: _gnss_clock(stream, int(random.choice(
         [18 * SECOND, -HOUR, HOUR, -stream.first, 24 * HOUR]))),
     'GNSS clock seconds off': lambda stream, random: _gnss_clock(stream, int(
@@ -476,7 +476,7 @@ FAULTS: dict[str, Callable[[Stream, Random], Any]] = {
         stream, stream.moment(random, 0.2, 0.6), HOUR, clock_jumps=0),
     'clock steps': _clock_step, 'resets': _resets, 'updates at random': _random_updates,
     'three of these': _several}
-# Faults that leave the clock and the units alone.
+# Faults that can be combined: they do not change the clock or units.
 TOGETHER = ('outliers', 'outages', 'fix at 0, 0', 'no fix', 'status unknown', 'GNSS nan, inf',
             'covariance 0, -1, nan', 'covariance nonsense', 'covariance too small',
             'several with one stamp', 'GNSS up to 1 s late', 'GNSS later', 'IMU twice',

@@ -12,11 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Experiments ``weak-spots`` and ``vehicle``: where an alignment is easily wrong and sure of itself.
+Experiments ``weak-spots`` and ``vehicle``: where an alignment is easily wrong with small sigmas.
 
 Searches have found the weak spots one by one; here each is a row of one table, so that versions
-can be compared. ``vehicle`` has a car that goes straight on, and motions that are not what the
-parameter ``vehicle`` says, and the recorded car if it is there.
+can be compared. ``vehicle`` simulates cars on straight roads and in streets, and motions that
+contradict the parameter ``vehicle``; if there are recordings it aligns the recorded car too.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ import numpy as np
 
 DURATION = 90.0         # s, unless a case says otherwise
 RECORDING = 'car_drive0708'
-MOUNT_STD_DEG = 1.0
+MOUNT_STD_DEG = 1.0     # of pitch and yaw
 
 
-# What spoils a stream; the arrival of an IMU sample stays, which is when it was measured.
+# What spoils a stream. IMU samples keep their arrival, which is when they were measured.
 
 def _spells(random: Random, time: Array, length: tuple[float, float],
             apart: tuple[float, float]) -> Iterator[np.ndarray]:
-    """Yield the places of what lies in each of the windows of such lengths, so far apart."""
+    """Yield the indices of times (s) in windows; their lengths and distances are from ranges."""
     start = random.uniform(*apart)
     while start < time[-1]:
         end = start + random.uniform(*length)
@@ -54,35 +54,37 @@ def _spells(random: Random, time: Array, length: tuple[float, float],
 
 
 def _told_lever(stream: Stream, random: Random, off: float) -> None:
+    """Configure a lever arm that is `off` m away from the true one, [1 1 1] m."""
     stream.config['lever_arm'] = tuple(1.0 + off * directions(random, 1)[0])
 
 
 def _states(stream: Stream, random: Random, std: float) -> None:
-    """State another noise of the velocities than they have."""
+    """State a wrong sigma of the velocities, m/s."""
     stream.velocity['covariance'] = std ** 2 * np.eye(3)
 
 
 def _lasting(stream: Stream, random: Random, time_s: float) -> None:
-    """Add to velocities without noise one of first order, and state its size."""
+    """Add first-order Gauss-Markov errors of 0.1 m/s to velocities, and state that sigma."""
     _states(stream, random, 0.1)
     stream.velocity['velocity'] += gauss_markov(stream.seconds('velocity'), 0.1, time_s, random)
 
 
 def _stepping(stream: Stream, random: Random) -> None:
-    """Add to velocities without noise one of steps of 10 to 60 s, and state the middle one."""
+    """Add noise to velocities whose sigma changes every 10 to 60 s; state the middle one."""
     _states(stream, random, 0.1)
     for chosen in _spells(random, stream.seconds('velocity'), (10.0, 60.0), (0.0, 0.0)):
-        stream.put_off('velocity', chosen, random.choice([0.03, 0.1, 0.5])
-                       * random.standard_normal((len(chosen), 3)))
+        stream.add_error('velocity', chosen, random.choice([0.03, 0.1, 0.5])
+                         * random.standard_normal((len(chosen), 3)))
 
 
 def _multipath(stream: Stream, random: Random, size: float, name: str = 'velocity') -> None:
+    """Add an error of one size and random direction for 5 to 15 s, every 20 to 100 s."""
     for chosen in _spells(random, stream.seconds(name), (5.0, 15.0), (20.0, 100.0)):
-        stream.put_off(name, chosen, size * directions(random, 1))
+        stream.add_error(name, chosen, size * directions(random, 1))
 
 
 def _positions(stream: Stream, random: Random, offsets: float = 0.0, stated: float = 0.0) -> None:
-    """Send no velocities; state another noise of the positions, put them off in spells."""
+    """Send no velocities; state another sigma of positions (m), or add errors (m) at times."""
     stream.velocity = stream.velocity[:0]
     if stated:
         stream.fix['covariance'] = np.diag([stated, stated, 2 * stated]) ** 2
@@ -91,12 +93,14 @@ def _positions(stream: Stream, random: Random, offsets: float = 0.0, stated: flo
 
 
 def _resent(stream: Stream, random: Random) -> None:
-    slow = np.arange(len(stream.fix)) // 5 * 5
-    stream.fix['lla'] = stream.fix['lla'][slow]
-    stream.velocity['velocity'] = stream.velocity['velocity'][slow]
+    """Measure at every fifth epoch only, and repeat that measurement at the others."""
+    measured = np.arange(len(stream.fix)) // 5 * 5
+    stream.fix['lla'] = stream.fix['lla'][measured]
+    stream.velocity['velocity'] = stream.velocity['velocity'][measured]
 
 
 def _tunnels(stream: Stream, random: Random) -> None:
+    """Lose the fix for 60 to 150 s at a time, and repeat the last position and velocity."""
     for chosen in _spells(random, stream.seconds('fix'), (60.0, 150.0), (30.0, 90.0)):
         stream.fix['status'][chosen] = -1
         stream.fix['lla'][chosen] = stream.fix['lla'][chosen[:1]]
@@ -104,26 +108,27 @@ def _tunnels(stream: Stream, random: Random) -> None:
 
 
 def _looking(stream: Stream, random: Random) -> None:
-    """Look for satellites for 20 s: no fix at 0, 0, which stands still."""
+    """Have no fix for 20 s: the position is 0, 0 and the velocity 0."""
     early = stream.seconds('fix') < 20.0
     stream.fix['status'][early] = -1
     stream.fix['lla'][early] = stream.velocity['velocity'][early] = 0.0
 
 
 def _bunches(stream: Stream, random: Random) -> None:
-    """Stamp IMU samples when the last of a bunch is read, 60 us apart."""
+    """Stamp the IMU samples of a bunch when they are read: from its last one on, 60 us apart."""
     size, k = random.integers(2, 6), np.arange(len(stream.imu))
     last = np.minimum(k // size * size + size - 1, len(k) - 1)
     stream.stamp_imu(stream.imu['stamp'][last] + k % size * 60_000)
 
 
 def _late_stamps(stream: Stream, random: Random, mean_s: float) -> None:
+    """Stamp IMU samples late by exponentially distributed times, without reordering them."""
     late = np.rint(random.exponential(mean_s * SECOND, len(stream.imu))).astype(np.int64)
     stream.stamp_imu(np.maximum.accumulate(stream.imu['stamp'] + late) + np.arange(len(late)))
 
 
 def _one_stamp(stream: Stream, random: Random, at_s: float, wild_s: float = 0.0) -> None:
-    """Put one IMU stamp into the future; or let all be the same from some time on."""
+    """Set the IMU stamp at a time ahead by `wild_s`; if that is 0, all later ones repeat it."""
     k, stamps = int(np.searchsorted(stream.seconds('imu'), at_s)), stream.imu['stamp'].copy()
     stamps[k:k + 1 if wild_s else None] = stamps[k] + round(wild_s * SECOND)
     stream.stamp_imu(stamps)
@@ -131,7 +136,7 @@ def _one_stamp(stream: Stream, random: Random, at_s: float, wild_s: float = 0.0)
 
 def _gnss_clock(stream: Stream, random: Random, at_s: float = 0.0, by_s: float = 0.0,
                 part: float = 0.0) -> None:
-    """Stamp GNSS later, and send it later, from a time on; let its clock run fast."""
+    """Shift stamps and arrivals of GNSS by `by_s` from `at_s` on, and let them drift by `part`."""
     for rows in stream.fix, stream.velocity:
         since = rows['arrival'] - stream.first
         late = np.where(since >= at_s * SECOND, round(by_s * SECOND), 0)
@@ -140,28 +145,30 @@ def _gnss_clock(stream: Stream, random: Random, at_s: float = 0.0, by_s: float =
 
 
 def _parked(stream: Stream, random: Random, at_s: float, hours: float) -> None:
-    """Let the clock go on for hours without a message; biases walk as the preset says."""
+    """Let hours pass without messages; gyro biases drift by the random walk of the preset."""
     for name in 'imu', *GNSS:
         getattr(stream, name)['stamp'][stream.seconds(name) >= at_s] += round(
             3600 * hours) * SECOND
     stream.stamp_imu(stream.imu['stamp'])
-    walked = PRESETS['mems'].rate_random_walk * math.sqrt(3600 * hours)
-    stream.imu['gyro'][stream.seconds('imu') >= at_s] += walked * random.standard_normal(3)
+    drift_std = PRESETS['mems'].rate_random_walk * math.sqrt(3600 * hours)
+    stream.imu['gyro'][stream.seconds('imu') >= at_s] += drift_std * random.standard_normal(3)
 
 
 def _gaps(stream: Stream, random: Random, length: tuple[float, float]) -> None:
+    """Drop IMU samples every 10 s; the lengths of the gaps are from a range (s)."""
     lost = _spells(random, stream.seconds('imu'), length, (10.0, 10.0))
     stream.imu = np.delete(stream.imu, np.concatenate([np.zeros(0, np.intp), *lost]))
 
 
 def _warm_up(stream: Stream, random: Random) -> None:
+    """Let gyro biases approach 0.5 deg/s with a time constant of 60 s."""
     drift = math.radians(0.5) * (1.0 - np.exp(-stream.seconds('imu') / 60.0))
     stream.imu['gyro'] += drift[:, None] * random.choice([-1.0, 1.0], 3)
 
 
 def _vibration(stream: Stream, random: Random, start_s: float = 0.0, force: float = 1.0,
                rate_deg: float = 3.0, tone_hz: float = 0.0) -> None:
-    """Shake the IMU from a time on, white or with one tone; sizes are 1 sigma."""
+    """Add vibration (rms in m/s^2 and deg/s) from a time on, white or of one frequency."""
     time = stream.seconds('imu')[:, None]
     for name, size in ('gyro', math.radians(rate_deg)), ('accel', force):
         wave = random.standard_normal((len(time), 3))
@@ -172,6 +179,7 @@ def _vibration(stream: Stream, random: Random, start_s: float = 0.0, force: floa
 
 def _bias_jump(stream: Stream, random: Random, sensor: str, size: float, at_s: float,
                axes: int = 1) -> None:
+    """Change the bias of a sensor at a time by plus or minus `size`, on some of its axes."""
     later = np.flatnonzero(stream.seconds('imu') >= at_s)
     chosen = random.permutation(3)[:axes]
     stream.imu[sensor][np.ix_(later, chosen)] += size * random.choice([-1.0, 1.0], axes)
@@ -182,8 +190,8 @@ def _velocities_within(stream: Stream, random: Random, start_s: float, end_s: fl
     stream.keep('velocity', (time >= start_s) & (time < end_s))
 
 
-def _no_numbers(stream: Stream, random: Random, name: str, field: str, axis: int,
-                start_s: float = 0.0) -> None:
+def _send_nan(stream: Stream, random: Random, name: str, field: str, axis: int,
+              start_s: float = 0.0) -> None:
     getattr(stream, name)[field][stream.seconds(name) >= start_s, axis] = np.nan
 
 
@@ -200,9 +208,9 @@ CAR, FLIGHT, HOVER, LAUNCH = (((scenario, 'mems'),)
 MIXED = tuple(product(('flight', 'car', 'hover'), ('mems', 'tactical')))
 CHIPS = tuple((scenario, 'chip') for scenario in ('car', 'flight', 'launch', 'hover'))
 OF_CHIPS = {'imu_grade': 'chip', **CHIP_THRESHOLDS}
-TOLD = {'gnss_delay_std': 0.0, 'lever_arm_std': 0.05}
-LONG, LATER, HOURS = {'duration': 120.0}, {'duration': 150.0}, {'duration': 900.0}
-EXACT = {'velocity_std': 0.0}           # noise is added by what spoils it
+TOLD = {'gnss_delay_std': 0.0, 'lever_arm_std': 0.05}   # configured as known
+LONG, LONGER, QUARTER_HOUR = {'duration': 120.0}, {'duration': 150.0}, {'duration': 900.0}
+NOISELESS = {'velocity_std': 0.0}       # what spoils the messages adds the noise
 RTK, WANDERING = {'position_std': 0.05}, {'position_std': 0.5, 'position_drift_std': 1.5}
 AWAY = {'duration': 300.0, 'outages': ((60.0, 300.0),)}
 GARAGE = {'duration': 2040.0, 'stand_still': 1980.0, 'outages': ((0.55, 1980.0),)}
@@ -215,7 +223,7 @@ SPOTS = tuple(case._replace(simulate={'duration': DURATION, **case.simulate}) fo
     *(Case(f'a chip, {rest:g} s at rest before', CHIPS, None,
            {'duration': rest + 90.0, 'stand_still': rest}, OF_CHIPS, part=part)
       for rest, part in ((20.0, 1), (120.0, 2))),
-    # Told wrongly
+    # Wrong configurations
     Case('told for certain, and right', MIXED, config=TOLD),
     *(Case(f'told for certain, delay {by:g} s off', MIXED, simulate={'gnss_delay': by},
            config=TOLD) for by in (0.05, 0.1, 0.2)),
@@ -226,13 +234,13 @@ SPOTS = tuple(case._replace(simulate={'duration': DURATION, **case.simulate}) fo
          LONG, {'imu_grade': 'navigation'}),
     # Noise of GNSS
     *(Case(f'velocity errors that last {time:g} s', MIXED, partial(_lasting, time_s=time),
-           EXACT) for time in (1.0, 2.0)),
+           NOISELESS) for time in (1.0, 2.0)),
     Case('velocity errors that last 1 s, at 20 Hz', MIXED, partial(_lasting, time_s=1.0),
-         {**EXACT, 'gnss_rate': 20.0}),
+         {**NOISELESS, 'gnss_rate': 20.0}),
     Case('multipath: 0.5 m/s for 5 to 15 s, every 20 to 100 s', CAR,
-         partial(_multipath, size=0.5), HOURS, part=4),
+         partial(_multipath, size=0.5), QUARTER_HOUR, part=4),
     Case('velocities of 0.03, 0.1, 0.5 m/s in turn, stated 0.1', CAR, _stepping,
-         {**HOURS, **EXACT}, part=4),
+         {**QUARTER_HOUR, **NOISELESS}, part=4),
     Case('vertical velocity 10 times as noisy as stated', CAR, partial(_states, std=0.1),
          {'velocity_std_vertical': 1.0}),
     *(Case(f'{rest / 60:g} min at rest, noise {factor:g} times as stated', CAR + LAUNCH,
@@ -259,11 +267,11 @@ SPOTS = tuple(case._replace(simulate={'duration': DURATION, **case.simulate}) fo
     Case('no fix at 0, 0 for 20 s', CAR + FLIGHT, _looking),
     Case('three epochs, then 33 min in a garage', CAR, None, GARAGE, part=12),
     Case('velocities stop after 30 s, positions 1 m', CAR,
-         partial(_velocities_within, start_s=0.0, end_s=30.0), {**LATER, 'position_std': 1.0}),
+         partial(_velocities_within, start_s=0.0, end_s=30.0), {**LONGER, 'position_std': 1.0}),
     Case('velocities from 5 s on, positions wander', HOVER,
          partial(_velocities_within, start_s=5.0, end_s=math.inf), WANDERING),
     Case('vertical velocity is no number', CAR + FLIGHT,
-         partial(_no_numbers, name='velocity', field='velocity', axis=2)),
+         partial(_send_nan, name='velocity', field='velocity', axis=2)),
     # Clocks
     Case('IMU stamped in bunches of 2 to 5', CAR + FLIGHT, _bunches),
     Case('IMU stamped late by 4 ms, exponential', CAR + FLIGHT,
@@ -273,10 +281,10 @@ SPOTS = tuple(case._replace(simulate={'duration': DURATION, **case.simulate}) fo
     Case('delay steps by 80 ms at 60 s', HOVER, partial(_gnss_clock, at_s=60.0, by_s=0.08),
          LONG),
     Case('clocks drift apart by 100 ppm', CAR + FLIGHT, partial(_gnss_clock, part=1e-4),
-         HOURS, part=4),
+         QUARTER_HOUR, part=4),
     # The IMU
     Case('IMU sends no numbers after 60 s', CAR + FLIGHT,
-         partial(_no_numbers, name='imu', field='gyro', axis=1, start_s=60.0)),
+         partial(_send_nan, name='imu', field='gyro', axis=1, start_s=60.0)),
     Case('parked for 3 h, IMU silent, biases walked', FLIGHT,
          partial(_parked, at_s=60.0, hours=3.0), LONG),
     Case('IMU losses of 50 to 450 ms every 10 s', CAR, partial(_gaps, length=(0.05, 0.45)),
@@ -287,7 +295,7 @@ SPOTS = tuple(case._replace(simulate={'duration': DURATION, **case.simulate}) fo
     *(Case(f'gyros warm up by 0.5 deg/s in 60 s, {motions[0][0]}', motions, _warm_up, LONG)
       for motions in (CAR, FLIGHT)),
     *(Case(f'white vibration, 1 m/s^2 and 3 deg/s, from {start:g} s on', CAR + FLIGHT,
-           partial(_vibration, start_s=start), LATER) for start in (0.0, 25.0, 85.0)),
+           partial(_vibration, start_s=start), LONGER) for start in (0.0, 25.0, 85.0)),
     Case('vibration at 27 Hz, IMU at 25 Hz', CAR + FLIGHT, partial(_vibration, tone_hz=27.0),
          {'imu_rate': 25.0}),
     Case('5 min at rest, vibration 0.2 m/s^2 and 0.3 deg/s, delay 0.15 s', CAR + LAUNCH,
@@ -307,7 +315,7 @@ SPOTS = tuple(case._replace(simulate={'duration': DURATION, **case.simulate}) fo
 # What a vehicle knows of its motion
 
 def _mounted(seed: int, mount_deg: tuple[float, ...] = ()) -> JsonDict:
-    """Draw the course and, unless it is given, the error of the mounting."""
+    """Draw the course and, unless it is given, the mounting error (roll, pitch, yaw; deg)."""
     random = np.random.default_rng([8, seed])
     drawn = MOUNT_STD_DEG * random.standard_normal(3) * [0.0, 1.0, 1.0]
     return {'heading_deg': float(random.uniform(-180.0, 180.0)),
@@ -316,6 +324,7 @@ def _mounted(seed: int, mount_deg: tuple[float, ...] = ()) -> JsonDict:
 
 def _vehicle(name: str, scenario: str, arguments: JsonDict, vehicle: str = 'car',
              mount_deg: tuple[float, ...] = (), trust: bool = True) -> Case:
+    """Return a case of `vehicle`; the sigma of the mounting error is configured."""
     return Case(name, ((scenario, 'mems'),), None, arguments, {
         'vehicle': vehicle, 'mount_yaw_std': MOUNT_STD_DEG, 'trust_imu_axes': trust,
         'heading_std_threshold': 2.0}, drawn=partial(_mounted, mount_deg=mount_deg))
@@ -334,7 +343,7 @@ VEHICLE_SPOTS = (
     _vehicle('flight with 8 deg of crab, aeroplane', 'flight', {**STREETS, 'crab_deg': 8.0},
              'aeroplane'),
     _vehicle('boat that yaws by 20 deg, boat', 'swing', STREETS, 'boat'),
-    # Not what `vehicle` says
+    # Motions and mountings that contradict the configuration
     _vehicle('streets, mounted 5 deg off', 'car', STREETS, mount_deg=OFF),
     _vehicle('straight road, mounted 5 deg off', 'highway', ROAD, mount_deg=OFF),
     _vehicle('streets backwards', 'car', {**STREETS, 'crab_deg': 180.0}),
@@ -342,6 +351,7 @@ VEHICLE_SPOTS = (
     _vehicle('towed 70 deg across', 'car', {**STREETS, 'crab_deg': 70.0}),
     _vehicle('on a ferry, 70 deg across, in waves', 'swing', {**STREETS, 'crab_deg': 70.0}),
 )
+# Configurations with which the recorded car is aligned.
 RECORDED: dict[str, JsonDict] = {
     'none': {}, 'vehicle: car': {'vehicle': 'car'},
     'vehicle: car, heading_std_threshold: 2': {'vehicle': 'car', 'heading_std_threshold': 2.0}}
@@ -361,7 +371,7 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
 
 
 def run_vehicle(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
-    """Run ``vehicle``, and the recorded car if it is there."""
+    """Run ``vehicle``, with the recorded car if `data` has it."""
     from ins_align.experiments.recordings import declared_row, run_window, STEP, windows_of
 
     found = run_cases(run_case, VEHICLE_SPOTS, runs, jobs)

@@ -12,10 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-The Earth: WGS-84 ellipsoid, normal gravity, and how the local level turns (C_n0n).
+The Earth: WGS-84 ellipsoid, normal gravity, and the rotation of the local level (C_n0n).
 
-Latitude and longitude are radians, altitude is metres above the ellipsoid; every function but
-`dead_reckon` and `enu_offset` works over leading axes.
+Latitude and longitude are radians, altitude is metres above the ellipsoid. All functions except
+`dead_reckon` and `enu_offset` take arrays and work over leading axes.
 """
 
 import math
@@ -55,9 +55,9 @@ def normal_gravity(latitude: ArrayLike, altitude: ArrayLike) -> Array:
 
 def dead_reckon(place: Place, v_n: Array, dt: float) -> Place:
     """
-    Return where a velocity (ENU, m/s) leads in `dt` seconds, of either sign.
+    Return the place after `dt` seconds, of either sign, at a velocity (ENU, m/s).
 
-    The Earth is taken as a sphere: good to 1 % of the way.
+    The Earth is taken as a sphere, which is good to 1 % of the distance.
     """
     latitude, longitude, altitude = place
     east, north, up = v_n.tolist()
@@ -67,7 +67,7 @@ def dead_reckon(place: Place, v_n: Array, dt: float) -> Place:
 
 
 def enu_offset(start: Place, end: Place) -> tuple[float, float, float]:
-    """Return how far east, north and up one place is of another, metres, on the same sphere."""
+    """Return the way from start to end in metres east, north and up, on the same sphere."""
     east = math.remainder(end[1] - start[1], 2 * math.pi) * max(math.cos(start[0]), 1e-3)
     return SEMI_MAJOR_AXIS * east, SEMI_MAJOR_AXIS * (end[0] - start[0]), end[2] - start[2]
 
@@ -89,7 +89,7 @@ def matrix_en(latitude: ArrayLike, longitude: ArrayLike) -> Array:
 
 
 def matrix_earth_turned(time: ArrayLike) -> Array:
-    """Return ``Rz(W t)``: from the Earth-fixed frame to what it was `time` seconds before."""
+    """Return ``Rz(W t)``: from the Earth-fixed frame now to that of `time` seconds before."""
     angle = EARTH_RATE * np.asarray(time, dtype=float)
     matrix = np.zeros(angle.shape + (3, 3))
     matrix[..., 0, 0] = matrix[..., 1, 1] = np.cos(angle)
@@ -133,7 +133,7 @@ def gravitation_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
 
 
 def ground_velocity_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
-    """Return the inertial velocity ``omega_ie x r`` of what rests on the Earth, ENU, m/s."""
+    """Return ``omega_ie x r``, the inertial velocity of a point at rest on the Earth, ENU, m/s."""
     return cross(earth_rate_n(latitude), position_n(latitude, altitude))
 
 

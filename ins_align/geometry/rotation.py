@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Rotations: vectors, matrices, quaternions, over leading axes; transforms between fixed frames.
+Rotation vectors, matrices and quaternions, over leading axes; transforms between fixed frames.
 
 Matrices are ``C_xy`` (components in y to components in x), quaternions are (x, y, z, w) of the
 same rotation with w >= 0, angles are radians.
@@ -30,14 +30,15 @@ Index = NDArray[np.integer[Any]]
 
 # Below this angle (rad) four terms of the Taylor series of (x - sin x)/x^3 are exact to rounding.
 _SERIES_ANGLE = 0.05
-_TINY = 1e-300          # an angle that may be divided by, and is none
+_TINY = 1e-300          # added to an angle, so that it can be a divisor
 
 
 def apply(matrix: Array, vectors: Array) -> Array:
     """
     Return ``matrix @ vector``, shapes (..., m, n) and (..., n), with leading axes that broadcast.
 
-    Each on its own: the last bit of a product of one matrix with many vectors depends on how many.
+    Each product is computed separately: in one of a matrix with many vectors, the last bit depends
+    on their number.
     """
     return (matrix @ vectors[..., None])[..., 0]
 
@@ -46,7 +47,7 @@ def product(left: Array, right: Array) -> Array:
     """
     Return ``left @ right``, shapes (..., m, n) and (..., n, k), in Fortran order.
 
-    Written out, which for many small matrices in Fortran order is quicker.
+    Written out term by term, which is faster for many small matrices in Fortran order.
     """
     terms = (np.multiply(left[..., k:k + 1], right[..., k:k + 1, :], order='F')
              for k in range(left.shape[-1]))
@@ -60,7 +61,7 @@ def by_row(matrix: Array, vectors: Array) -> Array:
     """
     Return the derivative of ``matrix @ X @ vector`` to X, row by row, shape (..., 3, 9).
 
-    Shapes (..., 3, 3) and (..., 3).
+    The matrix has the shape (..., 3, 3), the vector (..., 3).
     """
     return (matrix[..., None] * vectors[..., None, None, :]).reshape(matrix.shape[:-1] + (9,))
 
@@ -82,8 +83,8 @@ def cross(a: ArrayLike, b: ArrayLike) -> Array:
     """
     Return the cross product over the last axis; leading axes broadcast.
 
-    On small arrays this is several times faster than numpy.cross. The result lies in memory as
-    the larger one does.
+    On small arrays this is several times faster than numpy.cross. The result has the memory order
+    of the larger argument.
     """
     a = np.asarray(a, dtype=float)
     b = np.asarray(b, dtype=float)
@@ -95,11 +96,11 @@ def cross(a: ArrayLike, b: ArrayLike) -> Array:
 
 
 _EYE = np.eye(3)
-_SKEWS = skew(_EYE).reshape(3, 9)       # row i: that of unit vector i
+_SKEWS = skew(_EYE).reshape(3, 9)       # row i: the skew matrix of unit vector i
 
 
 def _trigonometric_factors(angle2: Array) -> tuple[Array, Array]:
-    """Return sin(x)/x and (1 - cos x)/x^2 of x^2, from half the angle: exact to rounding."""
+    """Return sin(x)/x and (1 - cos x)/x^2 for x^2, exact to rounding by half-angle formulas."""
     half = 0.5 * np.sqrt(angle2) + _TINY
     ratio = np.sin(half) / half
     return ratio * np.cos(half), 0.5 * ratio * ratio
@@ -109,7 +110,7 @@ def exp_and_left_jacobian(vector: ArrayLike) -> tuple[Array, Array]:
     """
     Return `exp_so3` of rotation vectors, shape (..., 3), and the left Jacobian of SO(3).
 
-    The latter says what a change of a rotation vector does to its rotation:
+    The latter is the effect of a change of a rotation vector on its rotation:
     ``exp_so3(v + d) ~ exp_so3(left_jacobian d) exp_so3(v)``.
     """
     v = np.asarray(vector, dtype=float)
@@ -128,7 +129,8 @@ def _squared_norm(v: Array) -> Array:
 
 def _rodrigues(v: Array, angle2: Array, odd: Array, even: Array) -> Array:
     """Return ``I + odd [v x] + even [v x]^2``, shape (..., 3, 3)."""
-    # Few calls: most arrays are small. Each entry of the skew matrix is one product and zeros.
+    # Few numpy calls, because most arrays are small. The product with _SKEWS is exact: all terms
+    # of each of its entries are zero but one.
     matrix: Array = (even[..., None] * v)[..., :, None] * v[..., None, :]
     matrix += ((odd[..., None] * v) @ _SKEWS).reshape(matrix.shape)
     matrix += (1.0 - even * angle2)[..., None, None] * _EYE
@@ -153,24 +155,25 @@ def log_so3(matrix: ArrayLike) -> Array:
     """
     Return rotation vectors, shape (..., 3), of rotation matrices, angle in [0, pi].
 
-    Up to a right angle they come from sine and cosine, beyond it from the quaternion, which keeps
-    full precision near pi.
+    If all angles are below a right angle they are computed from sine and cosine, otherwise from
+    quaternions, which keep full precision near pi.
     """
     m = np.asarray(matrix, dtype=float)
     cosine = 0.5 * (np.einsum('...ii', m) - 1.0)
     if (cosine > 0).all():
-        # Half of m_32 - m_23, m_13 - m_31, m_21 - m_12; of the angle, whose sine the axis has.
-        axis, part = 0.5 * (m.reshape(m.shape[:-2] + (9,)) @ _SKEWS.T), 1.0
+        # Half of m_32 - m_23, m_13 - m_31, m_21 - m_12: the axis times the sine of the angle.
+        axis, times = 0.5 * (m.reshape(m.shape[:-2] + (9,)) @ _SKEWS.T), 1.0
     else:
+        # The axis times the sine of half the angle.
         q = quaternion_from_matrix(m)
-        axis, cosine, part = q[..., :3], q[..., 3], 2.0
+        axis, cosine, times = q[..., :3], q[..., 3], 2.0
     sine = np.sqrt(np.einsum('...i,...i', axis, axis)) + _TINY
-    angle: Array = part * _arctan2(sine, cosine) / sine
-    return axis * angle[..., None]
+    angle_over_sine: Array = times * _arctan2(sine, cosine) / sine
+    return axis * angle_over_sine[..., None]
 
 
 def _arctan2(y: Array, x: Array) -> Array:
-    """Of packed copies: the last bit of others depends, with numpy 1.26, on where they lie."""
+    """Return arctan2 of contiguous copies: with numpy 1.26 the last bit depends on strides."""
     angle: Array = np.arctan2(np.array(y), np.array(x))
     return angle
 
@@ -180,7 +183,7 @@ def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
     q = np.asarray(quaternion, dtype=float)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     s = skew(q[..., :3])
-    return np.eye(3) + 2 * (q[..., 3, None, None] * s + s @ s)
+    return _EYE + 2 * (q[..., 3, None, None] * s + s @ s)
 
 
 def quaternion_from_matrix(matrix: ArrayLike) -> Array:
@@ -216,7 +219,7 @@ def matrix_from_rpy(rpy: ArrayLike) -> Array:
     Yaw is counter-clockwise from east.
     """
     rpy = np.asarray(rpy, dtype=float)
-    x, y, z = np.eye(3)
+    x, y, z = _EYE
     return (exp_so3(rpy[..., 2, None] * z) @ exp_so3(rpy[..., 1, None] * y)
             @ exp_so3(rpy[..., 0, None] * x))
 
@@ -234,15 +237,15 @@ def roll_pitch_yaw(matrix: ArrayLike) -> Array:
 
 
 def nearest_rotation(matrix: Array) -> Array:
-    """Return the rotations nearest to matrices, shape (..., 3, 3), in the sum of squares."""
+    """Return the rotations nearest to matrices, shape (..., 3, 3), by least squares."""
     U, _, V = np.linalg.svd(matrix)
-    U[..., 2] *= np.sign(np.linalg.det(U @ V))[..., None]      # or it is a reflection
+    U[..., 2] *= np.sign(np.linalg.det(U @ V))[..., None]      # no reflection
     nearest: Array = U @ V
     return nearest
 
 
 def orthonormalized(matrix: Array) -> Array:
-    """Return the nearest rotation to first order, against the rounding of long products."""
+    """Return the nearest rotation, to first order, of a product that rounding has distorted."""
     return 1.5 * matrix - 0.5 * matrix @ (matrix.swapaxes(-1, -2) @ matrix)
 
 
@@ -250,7 +253,7 @@ def cumulative_rotations(steps: Array) -> Array:
     """
     Return ``steps[0] @ steps[1] @ ... @ steps[k]`` for every k, shape (..., n, 3, 3).
 
-    To the last bit a run's products do not depend on what else is worked out with it.
+    No bit of the products depends on the other leading axes.
     """
     steps = np.ascontiguousarray(np.moveaxis(steps, -3, 0))
     total = steps.copy()
@@ -260,18 +263,18 @@ def cumulative_rotations(steps: Array) -> Array:
 
 
 def running_sum(start: Array, steps: Array) -> Array:
-    """Return ``start + steps[0] + ... + steps[k]`` for every k, to the bit as one by one."""
+    """Return ``start + steps[0] + ... + steps[k]`` for every k, added one after the other."""
     return np.cumsum(np.concatenate([start[None], steps]), axis=0)[1:]
 
 
 class Transform(NamedTuple):
-    """Takes vectors of a source frame to a target frame: rotate, then add."""
+    """Takes vectors from a source frame to a target frame: rotate, then add the translation."""
 
     rotation: Array  # (3, 3)
     translation: Array  # (3,), m
 
     def after(self, other: Transform) -> Transform:
-        """Return the transform that does the other one first."""
+        """Return the transform that applies the other one first."""
         return Transform(self.rotation @ other.rotation,
                          self.rotation @ other.translation + self.translation)
 

@@ -11,4 +11,4 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""GNSS messages: put in order, paired, turned into where the antenna is."""
+"""GNSS messages: read, queued, paired, and turned into epochs of the antenna."""

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Where the GNSS antenna is: GNSS messages put together to the epochs that a method takes."""
+"""The place of the GNSS antenna: paired GNSS messages become the epochs that a method takes."""
 
 from __future__ import annotations
 
@@ -26,27 +26,26 @@ from ins_align.gnss.buffer import GnssEpoch
 from ins_align.gnss.messages import AntennaEpoch, Fix, UNKNOWN_ALTITUDE_STD
 import numpy as np
 
-# A fix this far (m) from where the last one and the velocity lead, and as much again for every
-# second since then, is not believed at first.
+# A fix further from the predicted place than this (m), and as much again for every second since
+# the last fix, is not believed until there are this many in a row.
 MAX_FIX_JUMP = 300.0
 FIX_JUMPS_BELIEVED = 5
-# A place this old (s) is not carried on with the velocity.
+# A place older than this (s) is not carried on with the velocity.
 MAX_CARRIED = 60.0
 _UNKNOWN_VERTICAL_STD = 1e3     # m/s
-# A variance this many times smaller than what the receiver usually states, the median of so many
-# epochs, is not believed: a receiver that is ten times better than it was will say so again. One
-# that was worse than the configuration expects need not. In the first epoch any is believed that a
-# good receiver can mean, from 1 mm (1 mm/s) on.
+# A variance this many times smaller than the usual one, which is the median of this many epochs
+# or the configured variance if that is less, is not believed: a receiver whose sigma is ten times
+# better will repeat it. In the first epoch 1 mm (1 mm/s) and more is believed.
 BETTER_THAN_USUAL, USUAL_EPOCHS = 100.0, 11
 BEST_VARIANCE = 1e-6
-# Distance over which velocity and position are compared: at least this, and so many sigmas.
+# Velocity and position are compared over this distance (m), and at least so many sigmas.
 MIN_DISTANCE = 10.0
 DISTANCE_SIGMAS = 8.0
-# Mismatch, as a share of the distance, that no noise explains, and how many in a row convict; of
-# those that fit with north and east exchanged fewer do.
+# A mismatch of more than this share of the distance is not noise. This many in a row are a fault,
+# and fewer where all would fit with east and north exchanged.
 MAX_MISMATCH = 0.5
-CONVICTING, CONVICTING_AS_NED = 4, 3
-# So many fixes in a row have to agree, to within the same share of the distance, at its end.
+FAULT_MISMATCHES, FAULT_MISMATCHES_AS_NED = 4, 3
+# At the end of the distance this many fixes in a row have to agree to within the same share of it.
 AGREEING = 3
 
 
@@ -54,7 +53,7 @@ class Antenna:
     """
     Follows the antenna from epoch to epoch, with or without a fix in each.
 
-    What is not believed is counted: ``fix_jump``, ``fix_covariance``, ``velocity_covariance``,
+    Counts what is not believed: ``fix_jump``, ``fix_covariance``, ``velocity_covariance``,
     ``velocity_no_vertical``.
     """
 
@@ -64,12 +63,14 @@ class Antenna:
         self._counts = counts
         self._place: Place | None = None
         self._altitude_known = False
-        self._place_ns = self._fix_ns = self._seen_ns = 0
-        self._v_n: Array | None = None
+        # Stamps of the place, of the last fix believed, and of the last epoch with a measurement.
+        self._place_ns = self._fix_ns = self._measured_ns = 0
+        self._v_n: Array | None = None  # the last velocity, unless it is too old
+        self._velocity_ns = 0
         self._speed = 0.0
-        self._jumps = 0
+        self._jumps = 0     # in a row
         self._vertical = config.velocity_vertical == 'measured'
-        self._vertical_seen = False
+        self._vertical_seen = False     # whether a vertical velocity was ever other than 0
         self._check = VelocityCheck()
         self._velocity_noise = StatedNoise(
             config.velocity_std, config.velocity_std_vertical, _UNKNOWN_VERTICAL_STD, counts,
@@ -80,23 +81,25 @@ class Antenna:
 
     @property
     def jumped(self) -> bool:
-        """Whether fix after fix says that the antenna is somewhere else altogether."""
+        """Whether so many fixes in a row were far away that the antenna must be there."""
         return self._jumps >= FIX_JUMPS_BELIEVED
 
     def gravity_drift(self, stamp_ns: int) -> float:
         """
-        Return what the way since the last GNSS does to gravity, as a noise density, m/s/sqrt(s).
+        Return the uncertainty of gravity since the last GNSS as a noise density, m/s/sqrt(s).
 
-        Gravity turns with the place. A way of v t that nobody knows turns it by v t / R, which
-        adds g v t^2 / 2 R to the velocity: as much as white noise of this density does.
+        The direction of gravity depends on the place. An unknown motion of v t turns it by
+        v t / R, which adds g v t^2 / 2 R to the velocity: as much as white noise of this density.
         """
-        silent = max(stamp_ns - self._seen_ns, 0) * 1e-9
+        silent = max(stamp_ns - self._measured_ns, 0) * 1e-9
         return GRAVITY_EQUATOR / SEMI_MAJOR_AXIS * self._speed * silent ** 1.5
 
     def epoch(self, message: GnssEpoch) -> AntennaEpoch | None:
-        """Take what the receiver said at an epoch; None while the place is not known."""
+        """Return the epoch of the antenna from GNSS messages; None while the place is unknown."""
         velocity, fix = message.velocity, message.fix
         v_n = None if velocity is None else np.asarray(velocity.velocity, float)
+        if message.stamp_ns - self._velocity_ns > MAX_CARRIED * 1e9:
+            self._v_n = None
         believed = self._locate(message.stamp_ns, fix, self._v_n if v_n is None else v_n)
         if self._place is None or self.jumped:
             return None
@@ -104,9 +107,10 @@ class Antenna:
             fix.covariance if fix is not None and believed else None,
             fix is None or fix.vertical)
         if v_n is not None or believed:
-            self._seen_ns = message.stamp_ns
+            self._measured_ns = message.stamp_ns
         if v_n is not None:
-            self._v_n, self._speed = v_n, math.hypot(*v_n.tolist())
+            self._v_n, self._velocity_ns = v_n, message.stamp_ns
+            self._speed = math.hypot(*v_n.tolist())
             self._look_for_vertical(v_n, velocity is not None and velocity.vertical)
             if believed:
                 variances = position_covariance.diagonal().tolist()
@@ -117,12 +121,12 @@ class Antenna:
             self._vertical and (velocity is None or velocity.vertical))
         return AntennaEpoch(message.stamp_ns, *self._place, v_n, velocity_covariance, believed,
                             position_covariance, self.gravity_drift(message.stamp_ns),
-                            self._check.fault, fix is None and velocity is None,
-                            (velocity is None or velocity.covariance is not None,
-                             fix is None or fix.covariance is not None))
+                            fault=self._check.fault, dry=fix is None and velocity is None,
+                            stated=(velocity is None or velocity.covariance is not None,
+                                    fix is None or fix.covariance is not None))
 
     def _look_for_vertical(self, v_n: Array, measured: bool) -> None:
-        """Notice a receiver that moves and never says anything but 0 of the vertical."""
+        """Detect a receiver that does not measure the vertical: it moves and states only 0."""
         east, north, up = v_n.tolist()
         if not measured:
             self._counts['velocity_no_vertical'] += 1
@@ -134,7 +138,7 @@ class Antenna:
             self._counts['velocity_no_vertical'] += 1
 
     def _locate(self, stamp_ns: int, fix: Fix | None, v_n: Array | None) -> bool:
-        """Bring the place to an epoch; return whether there is a fix that is believed."""
+        """Carry the place on to an epoch; return whether there is a fix that is believed."""
         dt = (stamp_ns - self._place_ns) * 1e-9
         if (fix is not None and fix.vertical and self._place is not None
                 and not self._altitude_known):
@@ -163,10 +167,11 @@ class Antenna:
 
 class StatedNoise:
     """
-    What a receiver states about its noise, as far as it can be believed.
+    Covariances of a receiver: those stated, as far as they are believed, or those configured.
 
-    For a receiver that states nothing, 1 sigma is what is configured; `unknown_std` is that of a
-    vertical that is not measured. What is not believed is counted by the name `counter`.
+    `std` and `std_vertical` are the configured sigmas, for messages without a covariance;
+    `unknown_std` is that of a vertical that is not measured. `counter` is the name that counts
+    covariances which are not believed.
     """
 
     def __init__(self, std: float, std_vertical: float, unknown_std: float, counts: Counter[str],
@@ -178,7 +183,7 @@ class StatedNoise:
         self._recent: list[deque[float]] = [deque(maxlen=USUAL_EPOCHS) for _ in self._variances]
 
     def covariance(self, stated: Array | None, vertical: bool = True) -> Array:
-        """Return the covariance to work with, (3, 3), ENU: the stated one if it is believed."""
+        """Return the covariance to use, (3, 3), ENU; `vertical`: the vertical is measured."""
         covariance = self._default if stated is None else self._believed(stated)
         if not vertical:
             covariance = covariance.copy()
@@ -187,12 +192,12 @@ class StatedNoise:
         return covariance
 
     def _believed(self, covariance: Array) -> Array:
+        """Return a stated covariance with variances that are too small replaced by usual ones."""
         factors = []
         for variance, recent, default in zip(covariance.diagonal().tolist(), self._recent,
                                              self._variances):
             recent.append(variance)
             usual = default
-            # The most that is usual is the default.
             if (default > BETTER_THAN_USUAL * variance
                     and (len(recent) > 1 or variance >= BEST_VARIANCE)):
                 usual = min(sorted(recent)[len(recent) // 2], default)
@@ -205,22 +210,22 @@ class StatedNoise:
 
 
 class VelocityCheck:
-    """Whether the receiver's velocity is the derivative of its position: frame and axes."""
+    """Checks the frame and the axes of the velocity against the change of position."""
 
     def __init__(self) -> None:
         """Start with nothing compared."""
         self._origin: Place | None = None
-        # Of places, ways and velocities east is the real part, north the imaginary one.
-        self._path = 0j
-        # The fix and what the velocity makes of the way, since the origin.
+        # Horizontal vectors are complex numbers: east is the real part, north the imaginary one.
+        self._path = 0j                     # integral of the velocity since the origin
+        # Position and path since the origin: at the latest epochs, and where the distance begins.
         self._recent: deque[tuple[complex, complex]] = deque(maxlen=AGREEING)
         self._anchor: tuple[complex, complex] | None = None
-        self._last: tuple[float, complex] | None = None
+        self._last: tuple[float, complex] | None = None     # time and velocity
         self.bad_in_a_row = 0
         self._as_ned_in_a_row = 0
 
     def add(self, time: float, place: Place, v_n: Array, position_std: float) -> None:
-        """Take an epoch that has both; seconds, radians, metres, ENU."""
+        """Take an epoch with position and velocity (ENU); seconds, radians, metres."""
         velocity = complex(*v_n[:2].tolist())
         if self._last is not None and 0 < time - self._last[0] < 2.5:
             self._path += (time - self._last[0]) / 2 * (self._last[1] + velocity)
@@ -240,25 +245,25 @@ class VelocityCheck:
         moved, travelled = (now - then for now, then in zip(here, self._anchor))
         distance = max(abs(moved), abs(travelled))
         tolerance = MAX_MISMATCH * distance
-        # A wild fix is no journey, and one after the other they do not agree.
+        # A wild fix does not count as motion, and several of them do not agree.
         if (distance < max(MIN_DISTANCE, DISTANCE_SIGMAS * position_std)
                 or any(abs(other - here[0]) > tolerance for other, _ in self._recent)):
             return
         bad = abs(moved - travelled) > tolerance
         as_ned = abs(moved - 1j * travelled.conjugate()) < tolerance    # east and north exchanged
-        self._origin = None                   # the next journey begins here
+        self._origin = None                   # the next distance begins here
         if as_ned and not bad:
-            return                            # to north-east both frames say the same
+            return                            # towards north-east both frames are the same
         self.bad_in_a_row = self.bad_in_a_row + 1 if bad else 0
         self._as_ned_in_a_row = self._as_ned_in_a_row + 1 if as_ned else 0
 
     @property
     def fault(self) -> str:
-        """Fault in words; empty when nothing is known to be wrong."""
-        if self._as_ned_in_a_row >= CONVICTING_AS_NED:        # all of them bad
+        """Fault in words; '' when none is known."""
+        if self._as_ned_in_a_row >= FAULT_MISMATCHES_AS_NED:
             return ('the GNSS velocity contradicts the change of position, and would fit it with '
                     'north and east exchanged: set velocity_frame to the other one (enu, ned)')
-        if self.bad_in_a_row < CONVICTING:
+        if self.bad_in_a_row < FAULT_MISMATCHES:
             return ''
         return ('the GNSS velocity contradicts the change of position: check that it is given in '
                 'a world frame (velocity_frame) and in m/s')

@@ -12,11 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-GNSS messages that have arrived and are not used up yet, put in order and paired.
+The queue of GNSS messages: sorted by stamp and paired.
 
-Messages arrive late, twice, out of order or broken. What cannot be used is counted by reason; an
-epoch is released once the IMU is far enough ahead of it, so that results depend on what arrived
-and not on when somebody looked.
+Messages may arrive late, twice, out of order or invalid. Those that cannot be used are counted by
+reason. An epoch is released once the IMU is far enough ahead of it, so that results depend on the
+messages and not on when the queue is read.
 """
 
 from collections import Counter
@@ -26,20 +26,20 @@ from typing import NamedTuple
 from ins_align.geometry.earth import dead_reckon
 from ins_align.gnss.messages import Fix, NO_FIX, sound_covariance, usable, Velocity
 
-# A GNSS stamp this far ahead of the IMU comes from another clock (ns).
+# A GNSS stamp further than this (ns) ahead of the IMU is of another clock.
 MAX_AHEAD_NS = 10_000_000_000
 MAX_PENDING = 10_000
-# A fix and a velocity that are no further apart than this are of one epoch: many drivers stamp
-# each message when it arrives (ns).
+# A fix and a velocity that are no further apart than this (ns) are of one epoch: many drivers
+# stamp each message when it arrives.
 PAIR_NS = 50_000_000
 STATUS_UNKNOWN = -2
-# A receiver without a fix does not know its velocity either, whatever it sends: none is taken
+# A receiver without a fix has no valid velocity, even if it sends one: velocities are ignored
 # until the next fix, or for this long (ns).
 NO_FIX_NS = 2_000_000_000
 
 
 class GnssEpoch(NamedTuple):
-    """What the receiver said at one stamp."""
+    """The fix and the velocity of one stamp."""
 
     stamp_ns: int
     fix: Fix | None = None
@@ -47,7 +47,7 @@ class GnssEpoch(NamedTuple):
 
     @property
     def is_half(self) -> bool:
-        """Whether there is a fix or a velocity alone."""
+        """Whether there is a fix alone or a velocity alone."""
         return (self.fix is None) != (self.velocity is None)
 
 
@@ -55,24 +55,24 @@ class GnssBuffer:
     """
     GNSS messages that are not used yet, by stamp.
 
-    They are counted, and so are epochs that only repeat the one before (``gnss_repeated``) or are
-    behind the end of the IMU (``gnss_after_imu``), and velocities of a receiver that has no fix
-    (``velocity_no_fix``).
+    `counts` counts them, and also epochs that only repeat the one before (``gnss_repeated``) or
+    are later than the last IMU sample (``gnss_after_imu``), and velocities of a receiver that has
+    no fix (``velocity_no_fix``).
     """
 
     def __init__(self, lateness_ns: int, counts: Counter[str], earliness_ns: int = 0) -> None:
-        """Start empty; stamps may be so far behind the IMU, and ahead by more than usual."""
+        """Start empty; `earliness_ns` adds to the time that stamps may be ahead of the IMU."""
         self._lateness_ns, self._ahead_ns = lateness_ns, MAX_AHEAD_NS + earliness_ns
         self._counts = counts
         self._pending: dict[int, GnssEpoch] = {}
-        self._said: tuple[float, ...] = ()          # position and velocity, released last
-        # When the receiver said last that it has no fix; None: it has one since.
+        self._last_values: tuple[float, ...] = ()   # position and velocity of the last epoch
+        # Stamp of the last message without a fix; None: there was a fix since.
         self._no_fix_ns: int | None = None
-        # By the name that counts them, how far the last one was from the newest IMU sample.
+        # How far the last late or early message was from the newest IMU sample, by its count.
         self.off_ns: dict[str, int] = {}
 
     def add(self, message: Fix | Velocity, imu_newest_ns: int | None) -> None:
-        """Put a message into the epoch of its stamp, or count why not; of two the first counts."""
+        """Add a message to the epoch of its stamp, if usable and the first of its kind there."""
         kind = 'fix' if isinstance(message, Fix) else 'velocity'
         self._counts[kind] += 1
         message, fault = usable(message)
@@ -83,7 +83,7 @@ class GnssBuffer:
             self._counts[f'{kind}_{fault}'] += 1
             if fault == 'nan' or off:
                 return
-            message = Fix(stamp_ns, 0.0, 0.0, 0.0, None, NO_FIX)    # what else it says is nothing
+            message = Fix(stamp_ns, 0.0, 0.0, 0.0, None, NO_FIX)    # without its other numbers
         elif isinstance(message, Fix) and message.status == STATUS_UNKNOWN:
             self._counts['fix_status_unknown'] += 1
         if isinstance(message, Fix) and not message.vertical:
@@ -106,15 +106,15 @@ class GnssBuffer:
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp of the oldest message that waits."""
+        """Stamp of the oldest message in the queue; None: it is empty."""
         return min(self._pending, default=None)
 
     def release(self, upto_ns: int, last: bool = False) -> list[GnssEpoch]:
         """
-        Return and forget the epochs up to a stamp, in order.
+        Return the epochs up to a stamp, in order, and remove them from the queue.
 
-        A fix or a velocity alone waits for its other half, if that may still come, and what is
-        behind it waits too; `last`: nothing comes any more, what is behind that stamp is left out.
+        A fix or a velocity alone waits while its other half may still come, and so do all later
+        ones. `last`: no more messages will come; those after the stamp are dropped.
         """
         stamps = sorted(self._pending)
         released = []
@@ -129,7 +129,7 @@ class GnssBuffer:
                 break
             parts = [first] if epoch is first else [first, *close]
             place += len(parts)
-            fix = parts[0].fix or parts[-1].fix
+            fix = parts[0].fix or parts[-1].fix     # as it was sent, at its own stamp
             if fix is not None:
                 self._no_fix_ns = epoch.stamp_ns if fix.status == NO_FIX else None
             if self._no_fix_ns is not None and epoch.stamp_ns - self._no_fix_ns <= NO_FIX_NS:
@@ -148,20 +148,20 @@ class GnssBuffer:
 
     def _repeats(self, fix: Fix | None, velocity: Velocity | None) -> bool:
         """
-        Whether an epoch says to the last bit what the one before said, and that it moves.
+        Return whether a moving epoch has the values of the one before, to the last bit.
 
         No receiver measures that: a driver sends its last message again.
         """
-        before, self._said = self._said, ()
+        before, self._last_values = self._last_values, ()
         if fix is not None and velocity is not None:
             v_n = velocity.velocity.tolist()
             if any(v_n):
-                self._said = fix.latitude_deg, fix.longitude_deg, fix.altitude_m, *v_n
-        return bool(self._said) and self._said == before
+                self._last_values = fix.latitude_deg, fix.longitude_deg, fix.altitude_m, *v_n
+        return bool(self._last_values) and self._last_values == before
 
 
 def _joined(first: GnssEpoch, close: GnssEpoch | None = None) -> GnssEpoch:
-    """Return a fix and a velocity as one epoch at the velocity's stamp, or else the first."""
+    """Return a fix and a velocity as one epoch at the velocity's stamp; otherwise the first."""
     if close is None or not (first.is_half and close.is_half):
         return first
     fix, velocity = first.fix or close.fix, first.velocity or close.velocity

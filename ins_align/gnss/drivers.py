@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Messages of receivers and autopilots that are no sensor_msgs: a table says how to read them."""
+"""Messages of receivers and autopilots that are not sensor_msgs, read according to a table."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ins_align.gnss.messages import Fix, fixes, MessageError, stamp_from_msg, ve
 import numpy as np
 
 FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
-UTC_KNOWN = 3  # UBX-NAV-PVT, valid: bits of date and time
+UTC_KNOWN = 3  # bits of date and time in the field valid of UBX-NAV-PVT
 
 
 class NoTimeError(MessageError):
@@ -34,7 +34,7 @@ class NoTimeError(MessageError):
 
 
 def _utc_ns(msg: Any) -> int:
-    """Return the time of UBX-NAV-PVT."""
+    """Return the time of a UBX-NAV-PVT message, ns."""
     if msg.valid & UTC_KNOWN != UTC_KNOWN:
         raise NoTimeError('the receiver does not know date and time yet')
     seconds = calendar.timegm((msg.year, msg.month, msg.day, msg.hour, msg.min, msg.sec))
@@ -47,30 +47,31 @@ def _microseconds_ns(msg: Any) -> int:
 
 class Receiver(NamedTuple):
     """
-    How to read position and velocity in one message.
+    How to read position and velocity in a message of one type.
 
-    Numbers are fields with what one unit of each is. Standard deviations: horizontal per axis,
-    then vertical; one stands for both, none is the configured one.
+    Each value is a field of the message, with the factor to the unit stated here. Standard
+    deviations are horizontal, per axis, then vertical; a single one is for both, and without any
+    the configured ones are used.
     """
 
     stamp: Callable[[Any], int]  # ns
     has_fix: Callable[[Any], bool]
     position: Mapping[str, float]  # latitude and longitude, degrees; altitude, m
-    position_std: Mapping[str, float]  # m; or a covariance with its type as in NavSatFix
+    position_std: Mapping[str, float]  # m; or a covariance, m^2, with its type as in NavSatFix
     velocity: Mapping[str, float]  # m/s
-    frame: str  # of the velocity: enu, ned, or track: speed, course from north, degrees, climb
+    frame: str  # of the velocity: enu, ned, or track (speed, course from north in degrees, climb)
     velocity_std: Mapping[str, float]  # m/s
     has_velocity: Callable[[Any], bool] = lambda msg: True
-    unknown: tuple[float, ...] = ()  # what stands for a number that is not known
+    unknown: tuple[float, ...] = ()  # values that mean "unknown"
 
 
 RECEIVERS = {
-    # github.com/swri-robotics/gps_umd: what is stated as an error is 95 percent.
+    # github.com/swri-robotics/gps_umd: errors are stated as 95 percent bounds.
     'gps_msgs/msg/GPSFix': Receiver(
         stamp_from_msg, lambda msg: msg.status.status >= 0,
         {'latitude': 1.0, 'longitude': 1.0, 'altitude': 1.0}, {'position_covariance': 1.0},
         {'speed': 1.0, 'track': 1.0, 'climb': 1.0}, 'track', {'err_speed': 0.5, 'err_climb': 0.5}),
-    # github.com/KumarRobotics/ublox: 2D, 3D and 3D with dead reckoning, within the masks.
+    # github.com/KumarRobotics/ublox: fixes of 2D, 3D and 3D with dead reckoning that are valid.
     'ublox_msgs/msg/NavPVT': Receiver(
         _utc_ns, lambda msg: msg.fix_type in (2, 3, 4) and bool(msg.flags & 1),
         {'lat': 1e-7, 'lon': 1e-7, 'height': 1e-3}, {'h_acc': 1e-3, 'v_acc': 1e-3},
@@ -89,7 +90,7 @@ RECEIVERS = {
         {'s_variance_m_s': 1.0}, has_velocity=lambda msg: bool(msg.vel_ned_valid)),
 }
 INERTIAL_UNITS = ('px4_msgs/msg/SensorCombined',)
-# Of those which the node can read, by the parameter fix_type.
+# The types which the node can read, by the parameter fix_type.
 LIVE_TYPES = {name.rsplit('/', 1)[-1]: name
               for name in ('gps_msgs/msg/GPSFix', 'ublox_msgs/msg/NavPVT')}
 DRIVER_TYPES = (*RECEIVERS, *INERTIAL_UNITS)
@@ -97,10 +98,10 @@ DRIVER_TYPES = (*RECEIVERS, *INERTIAL_UNITS)
 
 def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velocity]:
     """
-    Convert a message of one of RECEIVERS, which say what axes they have.
+    Convert a message of one of `RECEIVERS`.
 
-    `config` has the standard deviations that are not stated. A NoTimeError says that the receiver
-    does not know the time yet, another MessageError that a field is missing or in other units.
+    `config` has the standard deviations that are not stated. Raises NoTimeError if the receiver
+    does not know the time yet, and MessageError if a field is missing or in another unit.
     """
     row = RECEIVERS[msgtype]
     try:
@@ -132,7 +133,7 @@ def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velo
 
 
 def imu_from_driver(msg: Any, msgtype: str) -> tuple[int, np.ndarray, np.ndarray]:
-    """Convert px4_msgs/SensorCombined to ns, rad/s and m/s^2; MessageError: a field is missing."""
+    """Return ns, rad/s and m/s^2 of px4_msgs/SensorCombined; MessageError: a field is missing."""
     try:
         return (_microseconds_ns(msg), FLU_FROM_FRD * np.asarray(msg.gyro_rad, float),
                 FLU_FROM_FRD * np.asarray(msg.accelerometer_m_s2, float))
@@ -141,7 +142,7 @@ def imu_from_driver(msg: Any, msgtype: str) -> tuple[int, np.ndarray, np.ndarray
 
 
 def type_in_words(msgtype: str) -> str:
-    """Return a message type as users know it: sensor_msgs/Imu."""
+    """Return a message type as users know it, such as sensor_msgs/Imu."""
     return msgtype.replace('/msg/', '/')
 
 
@@ -151,13 +152,14 @@ def _no_field(msgtype: str, error: AttributeError) -> MessageError:
 
 
 def _numbers(msg: Any, row: Receiver, fields: Mapping[str, float]) -> list[Any]:
+    """Return the fields, numbers or arrays, in the units of `Receiver`; nan where unknown."""
     values = [getattr(msg, field) for field in fields]
     return [math.nan if np.ndim(value) == 0 and value in row.unknown else np.multiply(value, unit)
             for value, unit in zip(values, fields.values())]
 
 
 def _covariance(std: list[Any]) -> np.ndarray:
-    """Return a covariance, shape (1, 3, 3), of a horizontal and a vertical sigma, or as sent."""
+    """Return a covariance, shape (1, 3, 3), from sigmas (horizontal, vertical) or as sent."""
     if np.ndim(std[0]):
         return np.reshape(std[0], (1, 3, 3))
     return np.diag([std[0], std[0], std[-1]])[None] ** 2

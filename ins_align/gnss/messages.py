@@ -12,9 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-ROS messages as numbers, what of them can be used, and the epochs that a method takes.
+ROS messages as numbers, checks of whether they can be used, and the epochs that a method takes.
 
-Works on anything with the fields of the ROS message.
+Objects with the fields of the ROS message are as good as messages.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ from numpy.typing import ArrayLike
 
 
 def enu_from_ned(vectors: Array) -> Array:
-    """Turn vectors, (..., 3), without products: what is not finite spoils nothing else."""
+    """Return vectors, (..., 3), in ENU, without matrix products, so that nan stays in its axis."""
     return vectors[..., [1, 0, 2]] * [1.0, 1.0, -1.0]
 
 
 ENU_FROM_NED = enu_from_ned(np.eye(3))
 
-# Names of the customary body frames (REP-105 and what drivers call the rest), as a whole word of
-# the frame_id. A GNSS driver puts "gps", "gnss", "antenna" or a world frame instead.
+# Names of body frames, from REP-105 and drivers, as a whole word of the frame_id. A GNSS driver
+# has "gps", "gnss", "antenna" or a world frame there.
 _BODY_FRAME = re.compile(r'(?:^|[_\-/.])(?:base|body|chassis|footprint|imu|ins|vehicle)\d*'
                          r'(?:$|[_\-/.])', re.IGNORECASE)
 
-# Variances (m^2 or m^2/s^2): below a micrometre a receiver means nothing. What it does mean is
-# brought between a tenth of a millimetre and a kilometre, or matrices of it have no inverse.
+# Variances (m^2 or m^2/s^2) below that of a micrometre are placeholders. Others are limited to
+# those of a tenth of a millimetre and of a kilometre, so that matrices can be inverted.
 SMALLEST_VARIANCE = 1e-12
 MIN_VARIANCE, MAX_VARIANCE = 1e-8, 1e6
-MIN_EIGENVALUE = 1e-9  # of possible correlations: less is rounding
-# Beyond these no receiver measures; such values would overflow the integrals (m/s, m).
+MIN_EIGENVALUE = 1e-9  # of a correlation matrix; less may be rounding of an impossible one
+# No receiver measures more than this; such values would overflow the integrals (m/s, m).
 MAX_SPEED, MAX_ALTITUDE = 2000.0, 1e6
 NO_FIX = -1  # status
-# Sigma of an altitude that a fix does not have (m), and what that means without a velocity.
+# Sigma of an altitude that a fix does not have (m), and the reason when there is no velocity.
 UNKNOWN_ALTITUDE_STD = 1e4
 NO_VERTICAL = 'positions have no altitude, and there is no velocity: one of the two is needed'
 
@@ -78,38 +78,38 @@ class Velocity(NamedTuple):
     stamp_ns: int
     velocity: np.ndarray  # (3,), ENU, m/s
     covariance: np.ndarray | None  # (3, 3), ENU, m^2/s^2; None: not known
-    vertical: bool = True  # whether it is measured
+    vertical: bool = True  # whether the vertical velocity is measured
 
 
 @dataclass(frozen=True)
 class AntennaEpoch:
-    """Where the antenna is and how it moves at a GNSS epoch, as a method takes it."""
+    """Position and velocity of the antenna at a GNSS epoch, as a method takes them."""
 
     stamp_ns: int
-    latitude: float  # of the antenna, radians; always there
+    latitude: float  # radians; dead reckoned when it is not measured
     longitude: float
     altitude: float  # m
-    v_n: Array | None  # (3,), antenna velocity, ENU, m/s
-    velocity_covariance: Array  # (3, 3), ENU
+    v_n: Array | None  # (3,), ENU, m/s; None: not measured
+    velocity_covariance: Array  # (3, 3), ENU, m^2/s^2
     position_measured: bool  # whether the position is a measurement to align with
-    position_covariance: Array
-    gravity_drift: float = 0.0  # noise of gravity for want of a place, m/s/sqrt(s)
+    position_covariance: Array  # (3, 3), ENU, m^2
+    gravity_drift: float = 0.0  # noise of gravity at an unknown place, m/s/sqrt(s)
     fault: str = ''  # of the velocities up to here, in words; '' when none is known
-    dry: bool = False  # whether no GNSS message is there: an epoch that divides an outage
-    stated: tuple[bool, bool] = (True, True)  # is the noise of velocity and position stated?
+    dry: bool = False  # whether there is no GNSS message: an epoch that divides an outage
+    stated: tuple[bool, bool] = (True, True)  # whether noise of velocity and position is stated
 
 
 def velocities_of(epochs: Sequence[AntennaEpoch]) -> Array:
-    """Return the velocities of K epochs, shape (K, 3), zero where there is none."""
+    """Return the velocities of K epochs, shape (K, 3), zero where none is measured."""
     return np.array([np.zeros(3) if epoch.v_n is None else epoch.v_n for epoch in epochs])
 
 
 def usable(message: Fix | Velocity) -> tuple[Fix | Velocity, str]:
     """
-    Return what can be used of a message, and as what it is counted if nothing can be.
+    Return a message and why it cannot be used: ``no_fix``, ``nan`` or, if it can, ''.
 
-    That is ``no_fix``, ``nan`` or ''. A vertical that is nan, as in a 2D fix, becomes 0 and is
-    then not measured. The covariance is not looked at.
+    If only the vertical is nan, as in a 2D fix, it becomes 0 and counts as not measured. The
+    covariance is not checked.
     """
     if isinstance(message, Velocity):
         east, north, up = message.velocity.tolist()
@@ -123,18 +123,18 @@ def usable(message: Fix | Velocity) -> tuple[Fix | Velocity, str]:
     _, latitude, longitude, altitude, *_ = message
     if message.status == NO_FIX or latitude == longitude == 0.0:
         return message, 'no_fix'
-    # What is not finite is not within a bound either.
+    # nan and infinity are not within the bounds either.
     good = abs(latitude) <= 90.0 and abs(longitude) <= 360.0 and abs(altitude) < MAX_ALTITUDE
     return message, '' if good else 'nan'
 
 
 def sound_covariance(sent: Array | None, default_std: Sequence[float] = ()) -> Array | None:
     """
-    Return a covariance, (3, 3), that is symmetric and positive definite; None: nothing is known.
+    Return a covariance, (3, 3), that is symmetric and positive definite; None: it is unknown.
 
     A variance that is 0 (or less than that of any sensor), negative (-1 marks "unknown") or not
-    finite is unknown. The default stands in for it unless all three are unknown; without a
-    default one makes all unknown. Impossible correlations are dropped.
+    finite is unknown. The default sigma replaces it unless all three are unknown; without default
+    sigmas a single unknown one makes all unknown. Impossible correlations are dropped.
     """
     if sent is None:
         return None
@@ -145,7 +145,7 @@ def sound_covariance(sent: Array | None, default_std: Sequence[float] = ()) -> A
         return None
     used = [min(max(variance, MIN_VARIANCE), MAX_VARIANCE) if is_known else std ** 2
             for variance, is_known, std in zip(variances, known, default_std or variances)]
-    # Impossible correlations must not turn into a negative variance in some direction.
+    # With impossible correlations the variance in some direction would be negative.
     if used == variances and any(covariances) and all(
             abs(covariance) <= MAX_VARIANCE for covariance in covariances):
         symmetric: Array = 0.5 * sent + 0.5 * sent.T
@@ -156,7 +156,7 @@ def sound_covariance(sent: Array | None, default_std: Sequence[float] = ()) -> A
 
 
 def numbers_of(message: Fix | Velocity) -> list[float]:
-    """Return position or velocity of a message."""
+    """Return the position (degrees, degrees, m) or the velocity (ENU, m/s) of a message."""
     return message.velocity.tolist() if isinstance(message, Velocity) else list(message[1:4])
 
 
@@ -174,7 +174,7 @@ def imu_from_msg(msg: Any) -> tuple[int, np.ndarray, np.ndarray]:
 
 
 def fixes_from_msgs(msgs: Sequence[Any]) -> list[Fix]:
-    """Convert sensor_msgs/NavSatFix; a covariance of unknown type or without sense is None."""
+    """Convert sensor_msgs/NavSatFix; a covariance of unknown type or without meaning is None."""
     return fixes([stamp_from_msg(msg) for msg in msgs],
                  [[msg.latitude, msg.longitude, msg.altitude] for msg in msgs],
                  np.array([msg.position_covariance for msg in msgs], float).reshape(-1, 3, 3),
@@ -185,10 +185,10 @@ def fixes_from_msgs(msgs: Sequence[Any]) -> list[Fix]:
 def fixes(stamps_ns: ArrayLike, places: ArrayLike, covariances: np.ndarray,
           covariance_types: ArrayLike, status: ArrayLike) -> list[Fix]:
     """
-    Make fixes of the columns of N messages, types and status as in sensor_msgs/NavSatFix.
+    Return fixes from the columns of N messages, with types and status as in sensor_msgs/NavSatFix.
 
     Places, (N, 3), are latitude and longitude, degrees, and altitude, m; covariances, (N, 3, 3),
-    as sent, m^2.
+    m^2, are as sent.
     """
     columns = (stamps_ns, *np.asarray(places, float).T, covariance_types, status)
     return [Fix(stamp, latitude, longitude, altitude,
@@ -198,7 +198,7 @@ def fixes(stamps_ns: ArrayLike, places: ArrayLike, covariances: np.ndarray,
 
 
 def velocities_from_msgs(msgs: Sequence[Any], config: Config) -> list[Velocity]:
-    """Convert messages of ``config.velocity_type`` and of one frame like `velocities`."""
+    """Convert messages of ``config.velocity_type``, all in one frame, as `velocities` does."""
     covariances = None
     if config.velocity_type == 'Vector3Stamped':
         linear = [msg.vector for msg in msgs]
@@ -213,7 +213,7 @@ def velocities_from_msgs(msgs: Sequence[Any], config: Config) -> list[Velocity]:
 
 
 def frame_of_velocity(msg: Any, velocity_type: str) -> str:
-    """Return the frame that a message says its velocity is in."""
+    """Return the frame_id of the velocity in a message."""
     frame: str = msg.child_frame_id if velocity_type == 'Odometry' else msg.header.frame_id
     return frame
 
@@ -221,11 +221,12 @@ def frame_of_velocity(msg: Any, velocity_type: str) -> str:
 def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
                covariances: np.ndarray | None, config: Config) -> list[Velocity]:
     """
-    Make velocities of the columns of N messages that say that they are in a frame.
+    Return velocities from the columns of N messages with the same frame_id, `frame`.
 
-    `linear`, (N, 3), m/s, is east, north, up or as ``config.velocity_frame`` says; covariances,
-    (N, 6, 6), are those of twists: see `sound_covariance`. The frame of a body is a MessageError,
-    unless ``config.velocity_frame`` says otherwise.
+    `linear`, (N, 3), m/s, is ENU unless ``config.velocity_frame`` is ned. Of covariances, which
+    may be those of twists, (N, 6, 6), the first three rows and columns are used, as in
+    `sound_covariance`. Raises MessageError if `frame` is a body frame and
+    ``config.velocity_frame`` is auto.
     """
     if config.velocity_frame == 'auto' and _BODY_FRAME.search(frame):
         raise MessageError(

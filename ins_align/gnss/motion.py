@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Motion as GNSS shows it: tracks, the frame of a velocity, manoeuvres."""
+"""Motion from GNSS: tracks, the frame of a velocity, manoeuvres."""
 
 from __future__ import annotations
 
@@ -23,11 +23,13 @@ from ins_align.geometry.rotation import Array
 import numpy as np
 
 EARTH_RADIUS = 6_371_000.0  # m, mean sphere: distances to 0.5 percent
-GRID = 0.5  # s, spacing on which velocities are compared
+GRID = 0.5  # s, spacing of velocities that are compared
 MAX_GAP = 3.0  # s without GNSS over which nothing is interpolated
-MANOEUVRE_SPEED, MANOEUVRE_TIME = 5.0, 20.0  # m/s of change within so many s
-MIN_DISTANCE, DISTANCE_SIGMAS = 10.0, 10.0  # m, or so many sigmas of a position, to compare over
-SPANS = 2.0, 4.0, 8.0, 16.0, 30.0  # s in which a vehicle may cover that distance
+MANOEUVRE_SPEED, MANOEUVRE_TIME = 5.0, 20.0  # change of velocity, m/s, within so many s
+# Distance over which velocity and position are compared: m, and at least so many sigmas of a
+# position; times, s, in which a vehicle may cover it, and how many distances it takes.
+MIN_DISTANCE, DISTANCE_SIGMAS = 10.0, 10.0
+SPANS = 2.0, 4.0, 8.0, 16.0, 30.0
 MIN_WINDOWS = 4
 MAX_FRAME_ANGLE = math.radians(20.0)
 MIN_CONCENTRATION = 0.9  # mean length of unit vectors above which directions agree
@@ -48,9 +50,9 @@ class VelocityFrame:
     """How a velocity compares with the change of position."""
 
     frame: str  # enu, ned, turned, body, contradiction or unknown
-    windows: int  # distances that were compared
+    windows: int  # number of distances that were compared
     angle_deg: float | None = None  # of a turned frame against ENU, counter-clockwise
-    speed_ratio: float | None = None  # velocity over change of position
+    speed_ratio: float | None = None  # integral of velocity over change of position
 
 
 def series_of(times: Array, vectors: Array) -> Series:
@@ -61,9 +63,9 @@ def series_of(times: Array, vectors: Array) -> Series:
 
 def track(positions_deg: Series) -> Series:
     """
-    Return positions in metres from the first, of latitude and longitude, degrees, and altitude.
+    Return positions, latitude and longitude, degrees, and altitude, as ENU metres from the first.
 
-    Source: each step on a sphere, east and north where it is made.
+    Each step east or north is that on a sphere at the latitude where it is made.
     """
     latitude, longitude = np.radians(positions_deg.vectors[:, :2]).T
     metres = positions_deg.vectors - positions_deg.vectors[:1]
@@ -86,9 +88,9 @@ def without_wild_positions(positions: Series) -> Series:
     """
     Leave out positions that are far from the median of the five around them.
 
-    Far is half of a distance over which velocity and position are compared: less would turn it by
-    no more than noise does. A median keeps what goes one way, however fast. The first and the
-    last two positions have no five around them and stay.
+    Far is half of the distance over which velocity and position are compared: smaller errors
+    matter no more than noise does. The median follows steady motion of any speed. The first two
+    and the last two positions cannot be judged and stay.
     """
     vectors = positions.vectors
     if vectors.shape[0] < 5:
@@ -103,7 +105,7 @@ def without_wild_positions(positions: Series) -> Series:
 
 
 def velocity_from_positions(positions: Series) -> Series:
-    """Differentiate positions over a time that leaves 0.35 m/s of their noise, every GRID s."""
+    """Differentiate positions every GRID s, over a time that leaves about 0.35 m/s of noise."""
     if positions.times.size < 2:
         return EMPTY
     span = min(max(4.0 * position_noise(positions), 2.0), 20.0)
@@ -113,7 +115,7 @@ def velocity_from_positions(positions: Series) -> Series:
 
 
 def differences(positions: Series) -> Series:
-    """Return the velocity between each two positions."""
+    """Return the velocity between neighbouring positions."""
     times, vectors = positions
     return EMPTY if times.size < 2 else Series(
         0.5 * (times[1:] + times[:-1]), np.diff(vectors, axis=0) / np.diff(times)[:, None])
@@ -131,9 +133,9 @@ def on_grid(velocities: Series) -> Series:
 
 def velocity_frame(velocities: Series, positions: Series) -> VelocityFrame:
     """
-    Compare velocities, taken as ENU, m/s, with the change of position, ENU, m.
+    Find the frame of velocities, m/s, taken as ENU, from the change of position, ENU, m.
 
-    The frame is 'unknown' where the vehicle moved less than MIN_WINDOWS distances.
+    The frame is 'unknown' if the vehicle covered fewer than MIN_WINDOWS distances.
     """
     moved, travelled = _distances(velocities, positions)
     count = moved.shape[0]
@@ -141,29 +143,29 @@ def velocity_frame(velocities: Series, positions: Series) -> VelocityFrame:
         return VelocityFrame('unknown', count)
     moved_h, travelled_h = moved[:, 0] + 1j * moved[:, 1], travelled[:, 0] + 1j * travelled[:, 1]
     ratio = float(np.median(np.abs(travelled_h) / np.abs(moved_h)))
+    if not 0.7 < ratio < 1.4:
+        return VelocityFrame('contradiction', count, speed_ratio=ratio)
     as_enu = _mean_direction(moved_h * travelled_h.conj())
     as_ned = _mean_direction(moved_h * (1j * travelled_h.conj()).conj())
     frames = [(abs(mean), name) for name, mean in (('enu', as_enu), ('ned', as_ned))
               if abs(mean) > MIN_CONCENTRATION and abs(np.angle(mean)) < MAX_FRAME_ANGLE]
-    if not 0.7 < ratio < 1.4:
-        return VelocityFrame('contradiction', count, speed_ratio=ratio)
-    if not frames and abs(as_enu) > MIN_CONCENTRATION:
+    if frames:
+        return VelocityFrame(max(frames)[1], count, speed_ratio=ratio)
+    if abs(as_enu) > MIN_CONCENTRATION:
         return VelocityFrame('turned', count, float(np.degrees(-np.angle(as_enu))), ratio)
-    if not frames:
-        return VelocityFrame('body', count, speed_ratio=ratio)
-    return VelocityFrame(max(frames)[1], count, None, ratio)
+    return VelocityFrame('body', count, speed_ratio=ratio)
 
 
 def find_manoeuvres(velocities: Series) -> tuple[float, float | None]:
     """
-    Find changes of the horizontal velocity, which are what shows a heading.
+    Find changes of the horizontal velocity, which make a heading observable.
 
-    Of two velocities or more, as from `on_grid` or `velocity_from_positions`. Returns the largest
-    change within MANOEUVRE_TIME, m/s, and when the first one by MANOEUVRE_SPEED begins, s.
+    Takes two velocities or more, as from `on_grid` or `velocity_from_positions`. Returns the
+    largest change within MANOEUVRE_TIME, m/s, and when the first of MANOEUVRE_SPEED begins, s.
     """
     times, v = velocities.times, velocities.vectors[:, :2]
     largest = 0.0
-    until = np.full(times.size, math.inf)  # when a change from a time on exceeds MANOEUVRE_SPEED
+    until = np.full(times.size, math.inf)  # when the change since each time is MANOEUVRE_SPEED
     for lag in range(1, min(round(MANOEUVRE_TIME / GRID), times.size - 1) + 1):
         change = np.hypot(*(v[lag:] - v[:-lag]).T)
         change[times[lag:] - times[:-lag] > MANOEUVRE_TIME] = 0.0
@@ -171,17 +173,17 @@ def find_manoeuvres(velocities: Series) -> tuple[float, float | None]:
         np.minimum(until[:-lag], np.where(change >= MANOEUVRE_SPEED, times[lag:], math.inf),
                    out=until[:-lag])
     ends = until[np.isfinite(until)]
-    # Of all starts of the first change the latest: when it really begins.
+    # The latest of all times from which the first change counts is when it begins.
     return largest, float(times[until <= ends[0]][-1]) if ends.size else None
 
 
 def _distances(velocities: Series, positions: Series) -> tuple[Array, Array]:
-    """Return change of position and integral of velocity, shape (K, 3), over K distances."""
+    """Return the change of position and the integral of velocity, (K, 3), over K distances."""
     best = np.zeros((0, 3)), np.zeros((0, 3))
     if velocities.times.size < 2 or positions.times.size < 2:
         return best
     steps, v = np.diff(velocities.times), velocities.vectors
-    # The fourth column counts gaps.
+    # The fourth column is the number of gaps.
     integral = np.zeros((v.shape[0], 4))
     integral[1:] = np.cumsum(np.column_stack(
         [0.5 * (v[1:] + v[:-1]) * steps[:, None], steps > MAX_GAP]), axis=0)
@@ -202,19 +204,20 @@ def _compared_distance(positions: Series) -> float:
 
 
 def _mean_direction(numbers: np.ndarray) -> complex:
+    """Return the mean of complex numbers, each divided by its magnitude."""
     lengths = np.abs(numbers)
     return complex(np.sum(numbers / np.where(lengths > 0.0, lengths, np.inf)) / lengths.size)
 
 
 def _grid(times: Array) -> Array:
-    # Only around data: clocks may jump by years.
+    # Only near the data, because clocks may jump by years.
     cells = np.unique((times / GRID).astype(np.int64))
     cells = np.unique(cells[:, None] + np.arange(round(MAX_GAP / GRID)))
     return cells[(cells * GRID >= times[0]) & (cells * GRID <= times[-1])] * GRID
 
 
 def _at(series: Series, times: Array) -> Array:
-    """Interpolate; NaN outside and in gaps."""
+    """Interpolate at times; NaN outside the series and in its gaps."""
     after = np.clip(np.searchsorted(series.times, times), 1, series.times.size - 1)
     start, end = series.times[after - 1], series.times[after]
     values = np.column_stack([np.interp(times, series.times, column)

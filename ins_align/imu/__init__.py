@@ -11,4 +11,4 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""IMU samples: put in order, looked at, integrated between GNSS epochs, carried on."""
+"""IMU samples: queued, checked, preintegrated; prediction of the attitude between epochs."""

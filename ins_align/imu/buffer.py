@@ -12,11 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-IMU samples that have arrived, put in order, and cut into steps between GNSS epochs.
+The queue of IMU samples: sorted by stamp and cut into steps between GNSS epochs.
 
-The steps come with their white noise: what is stated, what is measured, and what makes the samples
-miss the motion (gaps, stamps that jitter, the end of the sensors' range, gravity at a place that
-is not known).
+Each step comes with its white noise: what is stated, what is measured beyond that, and what gaps,
+jitter of stamps, saturation and gravity at an unknown place add to it.
 """
 
 from collections import Counter
@@ -26,50 +25,51 @@ from typing import NamedTuple
 from ins_align.config import ImuNoise
 from ins_align.geometry.rotation import Array, Index
 from ins_align.imu.noise import (
-    gap_and_jitter, GAP_ANGULAR_ACCELERATION, GAP_JERK, IMU_BEFORE, RangeCheck, stuck, white_noise,
-    without_spikes)
+    gap_and_jitter, GAP_ANGULAR_ACCELERATION, GAP_JERK, RangeCheck, SPIKE_BEFORE, stuck,
+    white_noise, without_spikes)
 from ins_align.imu.preintegration import Noise, split_at_epochs, Steps
 from ins_align.imu.recent import AGES, Recent, recent_motion
 import numpy as np
 from numpy.typing import ArrayLike
 
-# Beyond these no sensor measures; such values would overflow the integrals (rad/s, m/s^2).
+# No sensor measures more than this; such values would overflow the integrals (rad/s, m/s^2).
 MAX_RATE, MAX_ACCELERATION = 200.0, 2000.0
 _LIMITS = np.repeat([MAX_RATE, MAX_ACCELERATION], 3)[:, None]
-# The IMU may be silent for this long; then the attitude is lost and alignment starts over (ns).
+# The IMU may be silent for this long (ns); then the attitude is lost and alignment starts over.
 MAX_GAP_NS = 500_000_000
 NO_SAMPLE = f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s'
 SAME_VALUES = 'the IMU sends the same values again and again'
-# IMU samples that are kept before those wanted: interpolation needs two, the checks the rest.
-KEPT_BEFORE = 2 + IMU_BEFORE
-# So many IMU samples in a row that go in order, behind the newest one, through a time that others
-# have gone through before them: not late, but of a clock that was set back.
+# Samples that are kept before those still wanted: two for interpolation, the others for the check
+# for spikes.
+KEPT_BEFORE = SPIKE_BEFORE + 4
+# The clock was set back once this many samples in a row are behind the newest one, increase, and
+# belong to a time of which other samples had already come.
 SET_BACK_SAMPLES = 8
-# Noise is measured over the interval and this long before it (ns); it counts when it is this
-# many times the stated one.
+# White noise is measured over the interval and this time (ns) before it; what is measured counts
+# when it is this many times the stated noise.
 NOISE_WINDOW_NS = 500_000_000
 NOISE_EXCESS = 1.25
-# Samples are kept for that, and for as long as a receiver may be late.
+# Samples are kept for the noise window and for the largest delay of a receiver (ns).
 KEPT_NS = max(NOISE_WINDOW_NS, round(1e9 * AGES[-1]))
-# How many IMU samples are cut at one go; those that an epoch looks back at count for a sixth.
-MAX_CUT_SAMPLES, LOOKED_AT = 6144, 6
+# Number of samples that are cut at once. Those that an epoch only looks back at count less.
+MAX_CUT_SAMPLES, LOOK_BACK_DIVISOR = 6144, 6
 
 
 class Silence(NamedTuple):
-    """A time in which the IMU says too little: stamps, the count's name, why in words."""
+    """A time from which an attitude cannot be carried on, because the IMU measured too little."""
 
     start_ns: int
     end_ns: int
-    counter: str
-    why: str
+    counter: str    # name of the count
+    why: str        # the reason in words
 
 
 class ImuBuffer:
     """
-    IMU samples that are not integrated yet, in the order of their stamps.
+    IMU samples that are not integrated yet, sorted by their stamps.
 
-    Samples may arrive out of order by `lateness_ns`. What becomes of them is counted by names
-    that begin with ``imu``; `stated` is the noise that the sensors have at least.
+    Samples may arrive out of order by up to `lateness_ns`. `counts` counts them, by names that
+    begin with ``imu``. `stated` is the least noise that the sensors are taken to have.
     """
 
     def __init__(self, lateness_ns: int, counts: Counter[str],
@@ -79,24 +79,24 @@ class ImuBuffer:
         self._reach_ns = max(lateness_ns, MAX_GAP_NS)
         self._counts = counts
         self._stated = np.array(stated[:2])
-        # What is sorted: stamps, (N,), strictly increasing, ns; angular rate, rad/s, and specific
-        # force, m/s^2, (N, 6), in Fortran order, so that each axis is contiguous in memory.
+        # The sorted samples: stamps, (N,), strictly increasing, ns; angular rate, rad/s, and
+        # specific force, m/s^2, (N, 6), in Fortran order so that each axis is contiguous.
         self.stamps = np.zeros(0, np.int64)
         self.samples = np.zeros((0, 6), order='F')
-        # What is not sorted into these yet: stamps and samples, of one sample or of many.
+        # Stamps and samples, one or many at a time, that are not sorted into these yet.
         self._new: list[tuple[ArrayLike, ArrayLike]] = []
-        self.newest_ns: int | None = None           # that has come
-        # Samples that may be of another clock, until those behind them tell: one far ahead of the
-        # newest, or some in a row behind it.
+        self.newest_ns: int | None = None           # stamp of the newest sample accepted
+        # Samples that wait until later ones show whether the clock has changed: one far ahead of
+        # the newest sample, or some in a row behind it.
         self.held: list[tuple[int, tuple[float, ...]]] = []
-        # Up to here samples are cut: what comes later and is older is late.
+        # Samples up to here have been cut; those that arrive after that are late.
         self.used_ns = -(1 << 62)
         self._range = RangeCheck()
-        self._checked_ns = 0                # up to where it has seen them
+        self._checked_ns = 0                # the range is checked up to here
         self._silences: list[Silence] = []
 
     def add(self, stamp_ns: int, gyro: Iterable[float], accel: Iterable[float]) -> bool:
-        """Take a sample; return False if the clock was set back: since then come those `held`."""
+        """Add a sample; return False if the clock was set back, with all samples since `held`."""
         sample = stamp_ns, (*gyro, *accel)
         if self.newest_ns is None:
             self._append(sample)
@@ -104,16 +104,16 @@ class ImuBuffer:
         if self.held and self.held[0][0] > self.newest_ns:
             ahead = self.held.pop()
             if stamp_ns >= ahead[0] - self._lateness_ns:
-                self._append(ahead)             # time goes on there
+                self._append(ahead)             # samples go on from there
             else:
                 self._counts['imu_ahead'] += 1
         behind_ns = self.newest_ns - stamp_ns
         if behind_ns > 0:
             if self.held and not 0 < stamp_ns - self.held[-1][0] < 1_000_000_000:
-                self._let_go()
+                self._release_held()
             self.held.append(sample)
             return not self._set_back(behind_ns > self._lateness_ns)
-        self._let_go()
+        self._release_held()
         if behind_ns < -self._reach_ns:
             self.held.append(sample)
         else:
@@ -122,9 +122,9 @@ class ImuBuffer:
 
     def add_in_order(self, stamps_ns: Index, gyro: Array, accel: Array) -> bool:
         """
-        Take samples, shapes (N,), (N, 3), (N, 3), if all of them go on from the newest one.
+        Add samples, shapes (N,), (N, 3), (N, 3), if they are in order and follow the newest one.
 
-        False: they do not, and none is taken.
+        Otherwise add none of them and return False.
         """
         newest_ns = stamps_ns[:1] - 1 if self.newest_ns is None else self.newest_ns
         gaps_ns = np.diff(stamps_ns, prepend=newest_ns)
@@ -142,23 +142,27 @@ class ImuBuffer:
             self.newest_ns = stamp_ns
 
     def _set_back(self, far: bool) -> bool:
-        """Whether the samples held, behind the newest one, are of a clock that was set back."""
+        """
+        Return whether the samples held behind the newest one are of a clock that was set back.
+
+        `far`: they are further behind than samples may arrive out of order.
+        """
         if far:
-            return len(self.held) > 1           # a single one from long ago is late
+            return len(self.held) > 1           # a single one is late
         if len(self.held) < SET_BACK_SAMPLES:
             return False
-        # Samples that were only late fill a hole; others of their time would stand beside them.
-        # Those with the very stamps of others cannot be told from samples sent twice.
+        # Samples that are only late fill a gap. After a clock was set back there are others of
+        # the same time, with other stamps: equal ones may be of samples that were sent twice.
         self.consolidate()
         behind = [stamp for stamp, _ in self.held]
         inside = slice(*np.searchsorted(self.stamps, [behind[0], behind[-1]]))
         if np.union1d(self.stamps[inside], behind).size > 1.5 * len(behind):
             return True
-        self._let_go()
+        self._release_held()
         return False
 
-    def _let_go(self) -> None:
-        """Take samples that were held behind the newest one, or count them: they were late."""
+    def _release_held(self) -> None:
+        """Add the samples held behind the newest one, or count those that are too late."""
         for sample in self.held:
             if self.newest_ns is not None and sample[0] < self.newest_ns - self._lateness_ns:
                 self._counts['imu_late'] += 1
@@ -169,15 +173,15 @@ class ImuBuffer:
 
     def consolidate(self, last: bool = False) -> None:
         """
-        Sort what is new into the arrays, without what is broken, late or there twice.
+        Sort the new samples into the arrays, without those that are invalid, late or duplicate.
 
-        `last`: nothing comes any more.
+        `last`: no more samples will come.
         """
         if last and self.held and self.newest_ns is not None:
             if self.held[0][0] > self.newest_ns:
                 self._counts['imu_ahead'] += 1
                 self.held.clear()
-            self._let_go()
+            self._release_held()
         if not self._new:
             return
         new, self._new = self._new, []
@@ -204,23 +208,22 @@ class ImuBuffer:
         """
         Return the stamp up to which epochs can be cut; None while there are too few samples.
 
-        Nothing late can precede it any more; `last`: nothing comes any more at all. Up to there
-        samples are checked, for `silence` and the noise of steps.
+        No late sample can precede it any more; `last`: no more samples will come at all. Checks
+        the samples up to there, for `silence` and the noise of steps.
         """
         self.consolidate(last)
         if self.newest_ns is None or self.stamps.size < 4:
             return None
         settled_ns = self.newest_ns - (0 if last else self._lateness_ns)
         settled = int(np.searchsorted(self.stamps, settled_ns, side='right'))
-        # Interpolation at an epoch wants two samples after it, and whether they are spikes shows
-        # in the next one.
+        # Interpolation at an epoch needs two samples after it, and the check for spikes a third.
         upto_ns = int(self.stamps[max(settled, 3) - 3])
         self._check(upto_ns)
         return upto_ns
 
     @property
     def silent(self) -> bool:
-        """Whether samples come, but for too long none that could be used."""
+        """Whether samples still come, but none has been usable for longer than the largest gap."""
         return (self.newest_ns is not None and self.stamps.size > 0
                 and self.newest_ns - self._lateness_ns - int(self.stamps[-1]) > MAX_GAP_NS)
 
@@ -228,7 +231,7 @@ class ImuBuffer:
         """
         Return the angular rates after a stamp, rad/s, without spikes.
 
-        Stamps, shape (N,), rates, (N, 3), the rate at the stamp itself, (3,), and the usual
+        Stamps, shape (N,), rates, (N, 3), the rate at the stamp itself, (3,), and the median
         interval between samples, s.
         """
         self.consolidate()
@@ -239,15 +242,16 @@ class ImuBuffer:
         return self.stamps[first:], rates[first:], rate, usual
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Drop samples that no epoch at or after a stamp looks back at."""
-        first = int(np.searchsorted(self.stamps, stamp_ns - KEPT_NS, side='right')) - KEPT_BEFORE
-        self.stamps, self.samples = self.stamps[max(first, 0):], self.samples[max(first, 0):]
+        """Drop the samples that no epoch at or after a stamp needs."""
+        after = int(np.searchsorted(self.stamps, stamp_ns - KEPT_NS, side='right'))
+        first = max(after - KEPT_BEFORE, 0)
+        self.stamps, self.samples = self.stamps[first:], self.samples[first:]
         self._range.forget_before(stamp_ns)
 
     # Steps between epochs
 
     def _check(self, upto_ns: int) -> None:
-        """Look for times in which the IMU says too little, and for the end of its range."""
+        """Find silences, and the samples up to a stamp that are at the end of the range."""
         stamps = self.stamps
         first, last = np.searchsorted(stamps, [self._checked_ns, upto_ns], side='right').tolist()
         samples, _ = without_spikes(stamps[:last + 1], self.samples[:last + 1])
@@ -258,7 +262,8 @@ class ImuBuffer:
         gaps = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
         self._silences = [Silence(start, end, 'imu_gap', NO_SAMPLE) for start, end in
                           zip(stamps[gaps].tolist(), stamps[gaps + 1].tolist())]
-        # An epoch is taken when the IMU is ahead by the lateness: what is known by then counts.
+        # An epoch is cut once the IMU is ahead of it by the lateness. What is known only after
+        # that does not count, or results would depend on when epochs are cut.
         self._silences += [Silence(max(start, known - self._lateness_ns), end, 'imu_stuck',
                                    SAME_VALUES)
                            for start, end, known in stuck(stamps, self.samples)]
@@ -267,29 +272,30 @@ class ImuBuffer:
                            for stamp in self._range.blind]
 
     def silence(self, start_ns: int, end_ns: int) -> Silence | None:
-        """Return why the IMU says too little between two stamps, or at one."""
+        """Return a silence between two stamps, or at one given twice; None: there is none."""
         return next((silence for silence in self._silences
                      if silence.start_ns < end_ns and silence.end_ns > start_ns), None)
 
     def parts(self, epochs_ns: list[int]) -> list[slice]:
-        """Divide epochs into parts to be cut one after the other, so that memory is bounded."""
+        """Divide epochs into slices that are cut one after the other, to limit memory."""
         stamps = self.stamps
         place, first = np.searchsorted(stamps, [epochs_ns, np.subtract(epochs_ns, KEPT_NS)])
-        size = place - place[0] + np.cumsum(place - first) // LOOKED_AT
+        size = place - place[0] + np.cumsum(place - first) // LOOK_BACK_DIVISOR
         starts = np.flatnonzero(np.diff(size // MAX_CUT_SAMPLES, prepend=-1)).tolist()
         return [slice(*ends) for ends in zip(starts, [*starts[1:], len(epochs_ns)])]
 
     def start(self, stamp_ns: int) -> tuple[Steps, Noise, Recent]:
-        """Return the steps of no length at the first epoch of an alignment; see `cut`."""
+        """Return the zero-length interval at the first epoch of an alignment, as from `cut`."""
         self.used_ns = stamp_ns
         return self.cut([stamp_ns], [0.0])
 
     def cut(self, epochs_ns: list[int], gravity_drift: list[float],
             ) -> tuple[Steps, Noise, Recent]:
         """
-        Return what `preintegrate` takes: up to each epoch, in increasing order, since the last.
+        Return what `preintegrate` takes for the intervals that end at K increasing epochs.
 
-        `gravity_drift`: noise of gravity for want of a place, m/s/sqrt(s), before each.
+        The first begins at the last epoch that was cut. `gravity_drift` is the noise in each that
+        comes from gravity at an unknown place, m/s/sqrt(s).
         """
         stamps = self.stamps
         ends_ns = np.array([self.used_ns, *epochs_ns])
@@ -307,9 +313,9 @@ class ImuBuffer:
         self._counts['imu_gap'] += int(np.count_nonzero(gap))
         beyond = self._range.beyond(stamps, ends_ns, steps.dt)
         noise = Noise(
-            _together(self._stated[0], GAP_ANGULAR_ACCELERATION * gap,
+            _combined(self._stated[0], GAP_ANGULAR_ACCELERATION * gap,
                       jitter * _rms(steps.omega_dot), beyond[0]),
-            _together(self._stated[1], GAP_JERK * gap, jitter * _rms(steps.f_dot), beyond[1],
+            _combined(self._stated[1], GAP_JERK * gap, jitter * _rms(steps.f_dot), beyond[1],
                       np.array(gravity_drift)[:, None]),
             excess[:, :1], excess[:, 1:])
         self.used_ns = epochs_ns[-1]
@@ -317,11 +323,11 @@ class ImuBuffer:
         return steps, noise, recent_motion(stamps, samples, ends_ns[1:])
 
 
-def _together(*densities: 'Array | float') -> Array:
-    """Return the density of noises that are independent of each other."""
+def _combined(*densities: 'Array | float') -> Array:
+    """Return the density of the sum of independent noises."""
     return np.asarray(np.sqrt(sum(map(np.square, densities))))
 
 
 def _rms(slope: Array) -> Array:
-    """Return the root mean square of the three axes at the end of each step, shape (K, n)."""
+    """Return the root mean square over the axes at the end of each step, shape (K, n)."""
     return np.sqrt(np.mean(np.square(slope[:, 1:]), axis=2))

@@ -12,10 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-What makes IMU samples miss the motion, and how much noise that is.
+Faults of IMU samples, and the noise that they add.
 
-Spikes, samples that repeat, the end of the sensors' range, lost samples, stamps that jitter,
-white noise as it is measured, and units that cannot be right.
+Spikes, repeated samples, the end of the sensors' range, lost samples, jitter of stamps, measured
+white noise, wrong units.
 """
 
 import math
@@ -23,59 +23,55 @@ import math
 from ins_align.geometry.rotation import Array, Index
 import numpy as np
 
-# The specific force averages gravity, over this time (s), unless the vehicle falls, flies loops
-# (up to 6 g) or its units are wrong (m/s^2).
+# Limits of the mean specific force (m/s^2) over this time (s). It averages to gravity, unless the
+# vehicle falls, flies loops (up to 6 g) or the unit is wrong.
 FORCE_RANGE = 4.0, 60.0
 FORCE_TIME = 5.0
-# A spike leaves the mean of its neighbours by at least this (rad/s, m/s^2), by this many times as
-# much as the neighbours differ, and as other samples do: of so many before it, this one in the
-# order of size, so that one more spike among them does no harm.
+# A spike differs from the mean of its neighbours by at least this much (rad/s, m/s^2), and by this
+# many times as much as the neighbours differ from each other and as earlier samples differ from
+# the mean of theirs. Of the latter the one of this rank counts, from below, among so many samples
+# before the spike: three are larger, as many as another spike makes.
 SPIKE_RATE, SPIKE_FORCE = 0.5, 5.0
 SPIKE_RATIO = 12.0
 SPIKE_BEFORE, SPIKE_RANK = 12, 7
-# An IMU that has sent the same six values this often and for this long (ns) measures nothing.
+# An IMU is stuck that has repeated the same six values this often and for this long (ns).
 STUCK_SAMPLES, STUCK_NS = 8, 250_000_000
-# A value that is the largest of its axis, and not of an IMU at rest (rad/s, m/s^2), is
-# the end of the range once it has come so often while so many other values change, and this many
-# times as often as the next smaller value: coarse values repeat without an end. The motion may go
-# beyond it by this share.
+# The largest value of an axis is the end of its range if it is at least this large (rad/s, m/s^2),
+# more than at rest, and has come this often while so many other axes changed, and this many times
+# as often as the next smaller value: with a coarse resolution smaller values repeat, too. The true
+# motion may exceed the end by this share.
 END_RATE, END_FORCE = 0.5, 15.0
 END_TIMES, END_CHANGING, PILED_UP = 5, 3, 4
 BEYOND_END = 0.5
-# An attitude is lost when the gyros may have missed this angle (rad).
+# The attitude is lost when the gyros may have missed this angle (rad).
 BLIND_ANGLE = 0.35
-# Samples that both checks want to see before those that they judge.
-IMU_BEFORE = SPIKE_BEFORE + 2
-# A step this many times the usual one holds lost samples; what the motion can do meanwhile
+# A step this many times the usual one holds lost samples; the motion that they may have missed
 # (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
 GAP_STEPS = 2.5
 GAP_ANGULAR_ACCELERATION, GAP_JERK = 2.0, 20.0
-# Samples come in bunches, stamped on arrival, where the usual step is so much shorter than the
-# longest but for one in twenty: then those are the usual pauses.
+# Samples come in bunches, stamped on arrival, where the median step is less than this share of
+# this quantile of the steps, which then is the usual pause between bunches.
 BUNCHED, PAUSES = 0.2, 0.95
-# Standard deviation of stamps over the median of what the steps between them deviate.
+# Standard deviation of the stamps over the median absolute deviation of the steps between them.
 JITTER_OF_MEDIAN = 1.4826 / math.sqrt(2)
 
 
 def without_spikes(stamps: Index, samples: Array) -> tuple[Array, np.ndarray]:
     """
-    Replace single samples that the motion cannot have made by what lies between their neighbours.
+    Replace single samples that no motion can cause by interpolation between their neighbours.
 
-    The gyros and the accelerometers are judged each on their own. A shock is no spike: what was
-    hit rings. Of samples, (N, 6), rad/s and m/s^2, the first `SPIKE_BEFORE` + 1 and the last one
-    cannot be judged. Returns them, the same array where nothing was found, and which ones were
-    replaced, (N,).
+    Gyros and accelerometers are judged separately. A shock is no spike, because it rings. Of the
+    samples, (N, 6), rad/s and m/s^2, the first `SPIKE_BEFORE` + 1 and the last cannot be judged.
+    Returns the samples, the same array if none is a spike, and which were replaced, (N,).
     """
     spikes = np.zeros((stamps.size, 2), bool)
-    if stamps.size < IMU_BEFORE + 1:
-        return samples, spikes[:, 0]
     x = samples.reshape(-1, 2, 3)
     away = np.sqrt(np.sum(np.square(x[1:-1] - 0.5 * (x[:-2] + x[2:])), axis=2))
     k, sensor = np.nonzero(away[SPIKE_BEFORE:] > [SPIKE_RATE, SPIKE_FORCE])
     if not k.size:
         return samples, spikes[:, 0]
     k += SPIKE_BEFORE
-    # The one just before has the spike for a neighbour.
+    # Without the sample just before the spike, which has the spike for a neighbour.
     before = away[k[:, None] - np.arange(2, SPIKE_BEFORE + 1), sensor[:, None]]
     usual = np.sort(before, axis=1)[:, SPIKE_RANK]
     between = np.linalg.norm(x[k + 2, sensor] - x[k, sensor], axis=1)
@@ -91,38 +87,43 @@ def without_spikes(stamps: Index, samples: Array) -> tuple[Array, np.ndarray]:
 
 def stuck(stamps: Index, samples: Array) -> list[tuple[int, int, int]]:
     """
-    Find where an IMU sends the same values again and again, stamps (N,), ns, samples (N, 6).
+    Find where an IMU repeats the same values, in stamps, (N,), ns, and samples, (N, 6).
 
-    Returns the first and the last stamp of each, and the one from which on it is no chance.
+    Returns of each such time the first and the last stamp, and from when on it was certain, ns.
     """
     new = np.flatnonzero(np.any(samples[1:] != samples[:-1], axis=1)) + 1
     first = np.concatenate([[0], new])
     last = np.concatenate([new, [stamps.size]]) - 1
     long = (last - first >= STUCK_SAMPLES) & (stamps[last] - stamps[first] >= STUCK_NS)
-    return [(start, int(stamps[j]), max(start + STUCK_NS, int(stamps[i + STUCK_SAMPLES])))
-            for i, j in zip(first[long], last[long]) for start in [int(stamps[i])]]
+    first, start = first[long], stamps[first[long]]
+    certain = np.maximum(start + STUCK_NS, stamps[first + STUCK_SAMPLES])
+    return list(zip(start.tolist(), stamps[last[long]].tolist(), certain.tolist()))
 
 
 class RangeCheck:
-    """Notices that an IMU is at the end of its range: an extreme comes again and again."""
+    """Detects an IMU at the end of its range, where an extreme value comes again and again."""
 
     def __init__(self) -> None:
         """Start with no samples."""
-        # Of each value and its negative the two largest that came, and how often they did.
+        # For the six axes, then for the axes reversed: the two largest values so far, and how
+        # often each has come.
         self._times = [{end: 0} for end in 2 * (3 * [END_RATE] + 3 * [END_FORCE])]
-        self._last = np.zeros(6)
-        # The last sample within the range, of gyros and accelerometers, ns.
+        self._last = np.zeros(6)            # the last sample
+        # Stamps of the last samples within the range, of gyros and of accelerometers, ns.
         self._within_ns = np.zeros(2, np.int64)
-        self._angles = 0.0                  # so many times the blind angle
-        # Of M samples at the end of the range, ns, and what the motion may have been beyond it
-        # from each to the next, (M, 2), as noise of gyros and accelerometers, rad/sqrt(s) and
+        # Of the last sample at the end of the range: when the gyros were within it before, ns, and
+        # the angle missed since, in whole multiples of `BLIND_ANGLE`.
+        self._since_ns, self._angles = 0, 0.0
+        # Stamps of M samples at the end of the range, ns, and noise densities of the motion that
+        # gyros and accelerometers may miss until the next sample, (M, 2), rad/sqrt(s) and
         # m/s/sqrt(s).
         self.stamps, self.densities = np.zeros(0, np.int64), np.zeros((0, 2))
-        # Where the gyros may have missed another `BLIND_ANGLE` since they were within it, ns.
+        # Stamps at which the gyros may have missed another `BLIND_ANGLE` since they were last
+        # within the range, ns.
         self.blind: list[int] = []
 
     def add(self, stamps: Index, samples: Array) -> None:
-        """Take samples, stamps in ns, shape (N,), and values, (N, 6), that follow the last."""
+        """Add samples that follow the last: stamps, (N,), ns, and values, (N, 6)."""
         if not stamps.size:
             return
         at_end = self._at_end(samples).reshape(-1, 2, 3)
@@ -137,20 +138,27 @@ class RangeCheck:
         missed = BEYOND_END * np.max(np.abs(samples[k].reshape(-1, 2, 3)) * at_end[k], axis=2)
         seconds = (stamps[k, None] - within[k]) * 1e-9
         self.stamps = np.concatenate([self.stamps, stamps[k]])
-        # The error lasts: the angle or velocity grows with the time, not with its root.
+        # The error is constant: an angle or velocity grows with time, not with its square root.
         self.densities = np.concatenate([self.densities, missed * np.sqrt(2 * seconds)])
-        angles = np.concatenate([[self._angles], missed[:, 0] * seconds[:, 0] // BLIND_ANGLE])
-        self.blind += stamps[k[angles[1:] > angles[:-1]]].tolist()
-        self._angles = angles[-1]
+        since = np.append(self._since_ns, within[k, 0])
+        angles = np.append(self._angles, missed[:, 0] * seconds[:, 0] // BLIND_ANGLE)
+        before = np.where(np.diff(since) == 0, angles[:-1], 0.0)
+        self.blind += stamps[k[angles[1:] > before]].tolist()
+        self._since_ns, self._angles = since[-1], angles[-1]
 
     def beyond(self, stamps: Index, ends_ns: Index, dt: Array) -> Array:
-        """Return densities, shape (2, K, n), of the steps `dt` between ends, of samples so far."""
+        """
+        Return noise densities, shape (2, K, n), of motion beyond the range, for steps.
+
+        `stamps` are those of the samples, `ends_ns`, (K + 1,), the ends of the intervals, and
+        `dt`, (K, n), the steps in them.
+        """
         beyond = np.zeros((2,) + dt.shape)
         inside = slice(*np.searchsorted(self.stamps, ends_ns[[0, -1]]))
         saturated = self.stamps[inside]
         if saturated.size:
             interval = np.searchsorted(ends_ns, saturated, side='right') - 1
-            # An interval's first step begins at its start, at a sample or between two.
+            # Each interval's first step begins at its start, which may be between two samples.
             first = np.searchsorted(stamps, ends_ns[:-1], side='right') - 1
             step = np.searchsorted(stamps, saturated) - first[interval]
             beyond[:, interval, step] = self.densities[inside].T
@@ -164,7 +172,7 @@ class RangeCheck:
             self.blind = [blind_ns for blind_ns in self.blind if blind_ns >= stamp_ns]
 
     def _at_end(self, samples: Array) -> np.ndarray:
-        """Which values are at the end of the range, shape (N, 6)."""
+        """Return which values are at the end of the range, shape (N, 6)."""
         at_end = np.zeros(samples.shape, bool)
         signed = np.hstack([samples, -samples])
         reached = np.flatnonzero(signed.max(axis=0) >= list(map(min, self._times)))
@@ -190,27 +198,28 @@ def white_noise(stamps_ns: Index, samples: Array, first: Index, last: Index) -> 
     """
     Return the white noise densities of gyros and accelerometers in K windows of the data.
 
-    Third divided differences take out everything that is quadratic over four samples, which
-    motion is, and leave what is new in each sample. Vibration counts as noise. Of samples, (N, 6),
-    a window has its first one and the one after its last, (K,). Returns means over the axes,
-    (K, 2), rad/sqrt(s) and m/s/sqrt(s); 0 for fewer than eight samples.
+    Third divided differences remove what is quadratic over four samples, as motion is, and keep
+    what is new in each sample. Vibration counts as noise. `first` and `last`, (K,), are indices of
+    a window's first sample and of the one after its last; samples are (N, 6). Returns means over
+    the axes, (K, 2), rad/sqrt(s) and m/s/sqrt(s); 0 for fewer than eight samples.
     """
     count = last - first - 3
     enough = count >= 5
     if not np.any(enough):
         return np.zeros((first.size, 2))
     n = stamps_ns.size - 3
-    # From each of four samples to the next ones.
-    one, two, three = ((stamps_ns[k:] - stamps_ns[:-k]) * 1e-9 for k in (1, 2, 3))
-    (a, b, c), (ab, bc) = ([spacing[i:i + n] for i in range(count)]
-                           for spacing, count in ((one, 3), (two, 2)))
-    weights = 1 / np.stack([-(a * ab * three), a * b * bc, -(ab * b * c), three * bc * c])
+    # Times between four samples in a row: a, b and c from each to the next.
+    one, two, abc = ((stamps_ns[k:] - stamps_ns[:-k]) * 1e-9 for k in (1, 2, 3))
+    a, b, c = one[:-2], one[1:-1], one[2:]
+    ab, bc = two[:-1], two[1:]
+    weights = 1 / np.stack([-(a * ab * abc), a * b * bc, -(ab * b * c), abc * bc * c])
     weights /= np.sqrt(np.sum(weights ** 2, axis=0))
-    left = np.zeros((6, n + 1))
+    noise = np.zeros((6, n + 1))
     for i in range(4):
-        left[:, :-1] += weights[i] * samples.T[:, i:i + n]
+        noise[:, :-1] += weights[i] * samples.T[:, i:i + n]
+    # Windows that are too short get valid indices; what they yield is not used.
     first, last, count = (np.where(enough, x, y) for x, y in ((first, 0), (last, n), (count, 1)))
-    sums = np.add.reduceat(np.square(left), np.stack([first, last - 3], axis=1).ravel(),
+    sums = np.add.reduceat(np.square(noise), np.stack([first, last - 3], axis=1).ravel(),
                            axis=1)[:, ::2]
     spacing = (stamps_ns[last - 1] - stamps_ns[first]) * 1e-9 / (last - first - 1)
     density = np.sqrt(sums.T.reshape(-1, 2, 3).mean(axis=2) * (spacing / count)[:, None])
@@ -219,11 +228,11 @@ def white_noise(stamps_ns: Index, samples: Array, first: Index, last: Index) -> 
 
 def gap_and_jitter(stamps_ns: Index, first: Index, last: Index, dt: Array) -> tuple[Array, Array]:
     """
-    Return what becomes of steps, `dt` of shape (K, n), with lost samples and jittering stamps.
+    Return two factors for the noise of steps, `dt` of shape (K, n): of lost samples and of jitter.
 
-    The first is to be multiplied with what the motion can do in a gap, the second with what it
-    does to a sample whose stamp jitters: its change per second. Densities then. What is usual is
-    that in K windows of the stamps, as in `white_noise`.
+    A noise density is the first times an angular acceleration or jerk that samples may have
+    missed, and the second times the change of the samples per second. The usual step and jitter
+    are those in K windows of the stamps, as in `white_noise`.
     """
     steps, last = np.diff(stamps_ns) * 1e-9, last - 1
     count = (last - first)[:, None]
@@ -237,7 +246,7 @@ def gap_and_jitter(stamps_ns: Index, first: Index, last: Index, dt: Array) -> tu
     usual, pause = ranked(windows, np.hstack([half, (PAUSES * count).astype(int)])).T[..., None]
     deviation = ranked(np.abs(windows - usual), half)
     bunched = usual < BUNCHED * pause
-    # Of bunches the pause is the usual step, and they are spread evenly over it.
+    # In bunches the pause is the usual step, and errors of the stamps are uniform over it.
     gap = np.where(dt > GAP_STEPS * np.where(bunched, pause, usual), dt, 0.0)
     jitter = JITTER_OF_MEDIAN * np.where(bunched, 0.3 * pause, deviation)
     # An error of acceleration * dt^2 over the step, as a density: squared, over dt.
@@ -245,14 +254,15 @@ def gap_and_jitter(stamps_ns: Index, first: Index, last: Index, dt: Array) -> tu
 
 
 def force_fault(mean: float) -> str:
-    """Say what is wrong with a mean magnitude of the specific force, m/s^2; '' if nothing is."""
-    return '' if FORCE_RANGE[0] < mean < FORCE_RANGE[1] else (
-        f'the specific force averages {mean:.3g} m/s^2, gravity is 9.8: check the unit (g?) '
-        'and that gravity is not taken out')
+    """Return what is wrong with a mean magnitude of the specific force, m/s^2; '' if nothing."""
+    if FORCE_RANGE[0] < mean < FORCE_RANGE[1]:
+        return ''
+    return (f'the specific force averages {mean:.3g} m/s^2, gravity is 9.8: check the unit (g?) '
+            'and that gravity is not taken out')
 
 
 class ForceCheck:
-    """Whether the magnitude of the specific force can be one in m/s^2."""
+    """Checks whether the mean specific force is plausible; `fault` is the result in words."""
 
     def __init__(self) -> None:
         """Start with no samples."""
@@ -260,7 +270,7 @@ class ForceCheck:
         self.fault = ''
 
     def add(self, mean: float, seconds: float) -> None:
-        """Take the mean magnitude over so many seconds, m/s^2."""
+        """Add a mean magnitude, m/s^2, over a time, s."""
         self._sum += mean * seconds
         self._seconds += seconds
         if self._seconds >= FORCE_TIME:

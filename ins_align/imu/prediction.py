@@ -12,9 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-The attitude between epochs: carried on with the gyroscopes, sample by sample.
+The attitude between epochs, carried on with the gyroscopes sample by sample.
 
-Plain numbers instead of arrays, for the node does this for each IMU message: numpy would take
+It computes with plain numbers, because the node does this for each IMU message and numpy takes
 several times as long for vectors of three.
 """
 
@@ -29,7 +29,7 @@ from ins_align.imu.noise import GAP_ANGULAR_ACCELERATION, GAP_STEPS
 from ins_align.results import Attitude
 import numpy as np
 
-# So many samples are kept until it is known from which of them on to carry.
+# Number of samples kept, over which a prediction that comes late is carried.
 HISTORY = 2000
 _SMALL_ANGLE = 1e-6  # rad: sin(x / 2) / x is 1 / 2 to rounding
 
@@ -38,41 +38,41 @@ class Prediction:
     """
     An attitude that gyroscopes carry on from an epoch.
 
-    The rate is ``measured - gyro_matrix @ measured - gyro_bias``, rad/s, and may be off steadily
-    by `gyro_bias_std`; that the Earth turns, too, is left out of it and counts as an error.
-    `angle_random_walk` is in rad/sqrt(s), `rate` is what was measured at the epoch, shape (3,),
-    `interval` the usual one between samples, s.
+    The rate is ``measured - gyro_matrix @ measured - gyro_bias``, rad/s, with a constant error of
+    sigma `gyro_bias_std`. The Earth rate is not taken off and counts as an error, too.
+    `angle_random_walk` is in rad/sqrt(s), `rate` is the one measured at the epoch, shape (3,),
+    and `interval` the usual time between samples, s.
     """
 
     def __init__(self, attitude: Attitude, gyro_bias: Array, gyro_matrix: Array,
                  gyro_bias_std: float, angle_random_walk: float, rate: Array,
                  interval: float) -> None:
-        """Stand at the epoch."""
+        """Start at the epoch."""
         self.stamp_ns = self._epoch_ns = attitude.stamp_ns
         x, y, z, w = attitude.quaternion_xyzw.tolist()
         self._quaternion = x, y, z, w
         self._covariance = tuple(attitude.covariance.ravel().tolist())
         self._bias = tuple(gyro_bias.tolist())
         self._matrix = (np.eye(3) - gyro_matrix).tolist()
-        self._rate = tuple(rate.tolist())   # as measured last
+        self._rate = tuple(rate.tolist())   # last measured
         self._white_variance = angle_random_walk ** 2
         self._rate_variance = gyro_bias_std ** 2 + EARTH_RATE ** 2
-        self._longest, self._gaps_variance = GAP_STEPS * interval, 0.0
+        self._longest_step, self._gaps_variance = GAP_STEPS * interval, 0.0
 
     def carry(self, stamp_ns: int, gyro: Sequence[float]) -> bool:
         """
-        Carry on to one sample (rad/s), with the mean of its rate and that of the last one.
+        Carry on to a sample (rad/s), with the mean of its rate and that of the last one.
 
-        Return whether the attitude is now that at the sample: not when it is old or broken, and
-        never again after a long gap, in which nobody knows how it has turned. What it may have
-        turned in a short one is added to its covariance, as in the filters.
+        Return whether the attitude is now that at the sample. It is not if the sample is old or
+        invalid, and never again after a gap longer than `MAX_GAP_NS`, in which the rotation is
+        unknown. A shorter gap adds to the covariance, as in the filters.
         """
         x, y, z = gyro
         if not (0 < stamp_ns - self.stamp_ns <= MAX_GAP_NS
                 and abs(x) < MAX_RATE and abs(y) < MAX_RATE and abs(z) < MAX_RATE):
             return False
         dt = (stamp_ns - self.stamp_ns) * 1e-9
-        if dt > self._longest:
+        if dt > self._longest_step:
             self._gaps_variance += (GAP_ANGULAR_ACCELERATION * dt * dt) ** 2
         last_x, last_y, last_z = self._rate
         self._rate = x, y, z
@@ -95,20 +95,20 @@ class Prediction:
 
     @property
     def quaternion_xyzw(self) -> tuple[float, float, float, float]:
-        """Body to ENU, w >= 0."""
+        """Quaternion of the rotation from body to ENU, w >= 0."""
         x, y, z, w = self._quaternion
         return (x, y, z, w) if w >= 0.0 else (-x, -y, -z, -w)
 
     @property
     def covariance(self) -> tuple[float, ...]:
-        """Of the small rotation about the axes of ENU, rad^2, nine numbers."""
+        """Covariance of the small rotation about the axes of ENU, rad^2, row by row."""
         age = (self.stamp_ns - self._epoch_ns) * 1e-9
         drift = (self._white_variance + self._rate_variance * age) * age + self._gaps_variance
         ee, en, eu, ne, nn, nu, ue, un, uu = self._covariance
         return ee + drift, en, eu, ne, nn + drift, nu, ue, un, uu + drift
 
     def attitude(self) -> Attitude:
-        """Return the attitude at the sample that it was carried to."""
+        """Return the attitude at the last sample that it was carried to."""
         return Attitude(self.stamp_ns, matrix_from_quaternion(np.array(self._quaternion)),
                         np.array(self.covariance).reshape(3, 3))
 
@@ -117,8 +117,8 @@ class Follower:
     """
     Carries the latest prediction to each sample as it arrives.
 
-    Predictions come from somebody who has seen fewer samples so far, and come late; the samples
-    since then are remembered and carried over again.
+    A prediction comes late, standing at an earlier sample; it is carried over the samples that
+    have arrived since, of which `HISTORY` are kept.
     """
 
     def __init__(self) -> None:
@@ -127,25 +127,25 @@ class Follower:
         self._prediction: Prediction | None = None
 
     def adopt(self, prediction: Prediction | None) -> None:
-        """Go on from another prediction, its own from now on; None: there is no attitude."""
+        """Take over a prediction and carry it to the newest sample; None: there is no attitude."""
         self._prediction = None
         if prediction is None:
             return
-        # In the order of arrival, from the newest: before a clock was set back, the same stamp
-        # may have been there already.
+        # From the newest sample back: the same stamp may also have come before the clock was set
+        # back.
         since = []
         for sample in reversed(self._samples):
             if sample[0] == prediction.stamp_ns:
                 break
             since.append(sample)
         else:
-            return  # it has seen what has not arrived here: wait for the next one
+            return  # its sample has not arrived here or is no longer kept: wait for the next one
         self._prediction = prediction
         for stamp_ns, gyro in reversed(since):
             prediction.carry(stamp_ns, gyro)
 
     def follow(self, stamp_ns: int, gyro: Sequence[float]) -> Prediction | None:
-        """Take a sample and return the attitude at its stamp; None where there is none."""
+        """Add a sample and return the prediction at its stamp; None while there is none."""
         self._samples.append((stamp_ns, gyro))
         now = self._prediction
         return now if now is not None and now.carry(stamp_ns, gyro) else None

@@ -12,11 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-From IMU samples to intervals between GNSS epochs.
+Preintegration of IMU samples over the intervals between GNSS epochs.
 
-ROS gives angular rate and specific force at instants, with jitter and gaps. Between neighbouring
-samples both are taken as cubics in time; a GNSS stamp inside a step splits it there. All samples
-of an interval, and all intervals of a batch, are handled as arrays.
+ROS gives angular rate and specific force at instants, with jitter and gaps. In a step, the time
+between neighbouring samples, both are taken as cubics; a GNSS stamp inside a step splits it. All
+samples of an interval, and all intervals of a batch, are handled as arrays.
 """
 
 from dataclasses import dataclass
@@ -29,15 +29,16 @@ from ins_align.imu.recent import Recent
 import numpy as np
 from numpy.typing import ArrayLike
 
-# Neighbouring steps whose lengths differ by more than this share are taken as one to the slope.
+# Where one of two neighbouring steps is shorter than this share of the other, the slope at the
+# sample between them is taken over both as one: noise makes the slope over the shorter one.
 UNEVEN = 0.1
-# So many steps of the IMU are one to the derivatives.
+# The derivatives take this many steps of the IMU as one.
 DERIVATIVE_STEPS = 4
 
 
 class SensorErrors(NamedTuple):
     """
-    Errors of gyros and accelerometers that stay: true = measured - matrix @ measured - bias.
+    Constant errors of gyros and accelerometers: true = measured - matrix @ measured - bias.
 
     A matrix has scale factor errors on its diagonal and misalignments beside it.
     """
@@ -49,12 +50,12 @@ class SensorErrors(NamedTuple):
 
     @staticmethod
     def none() -> 'SensorErrors':
-        """Return those of perfect sensors."""
+        """Return the errors of perfect sensors, zero."""
         return SensorErrors.of(np.zeros(24))
 
     @staticmethod
     def of(vector: Array) -> 'SensorErrors':
-        """Return those that make up a vector, shape (24,), the matrices row by row."""
+        """Return the errors in a vector, shape (24,), with the matrices row by row."""
         return SensorErrors(vector[:3], vector[3:12].reshape(3, 3), vector[12:15],
                             vector[15:].reshape(3, 3))
 
@@ -64,8 +65,8 @@ class Intervals:
     """
     Preintegrated IMU data of K intervals, each in the body frame at the interval's start.
 
-    Errors of rotation are left ones (``R <- exp_so3(J_Rg d) R``). J are derivatives to bias and
-    matrix of the gyros (g) or of the accelerometers (a), in the order of `SensorErrors.of`.
+    Errors of rotation multiply from the left (``R <- exp_so3(J_Rg d) R``). J are derivatives to
+    bias and matrix of the gyros (g) or of the accelerometers (a), in the order of `SensorErrors`.
     """
 
     duration: Array     # (K,), s
@@ -78,29 +79,29 @@ class Intervals:
     J_va: Array
     J_pa: Array
     Q: Array            # (K, 9, 9), of the errors (rotation, v, p) that the sensors' noise leaves
-    Q_excess: Array     # the same for the noise that was measured in excess of what is stated
+    Q_excess: Array     # the same, of the noise measured beyond the stated one
     force: Array        # (K,), mean magnitude of the specific force, m/s^2
     omega: Array        # (K, 3), angular rate at the end, as measured, rad/s
-    gained: Array       # (K, RUNGS, 3), before the end, as measured; see `Recent`
-    turned: Array
+    gained: Array       # (K, RUNGS, 3), as measured before the end; see `Recent`
+    turned: Array       # (K, RUNGS, 3)
 
     def take(self, index: 'slice | Array') -> 'Intervals':
         """Return the intervals of `index`."""
         return Intervals(**{name: array[index] for name, array in vars(self).items()})
 
     def end(self) -> 'Intervals':
-        """Return the interval of no length, and without noise, at the end of a single one."""
-        none = {name: np.zeros_like(array) for name, array in vars(self).items()}
-        return Intervals(**none | {'R': np.eye(3)[None], 'omega': self.omega,
+        """Return the interval of zero length, without noise, at the end of a single interval."""
+        zero = {name: np.zeros_like(array) for name, array in vars(self).items()}
+        return Intervals(**zero | {'R': np.eye(3)[None], 'omega': self.omega,
                                    'gained': self.gained, 'turned': self.turned})
 
     def mirrored(self, signs: Array) -> 'Intervals':
         """
-        Return what the intervals would be with the signs of sensors changed, leading axes (K, M).
+        Return the intervals with the signs of sensors changed, with leading axes (K, M).
 
-        `signs`, shape (M, 4), are those of the gyros x, y, z and of the accelerometers; where none
-        is changed, the leading axes are (K, 1) and serve all. To second order in the rotation over
-        an interval, with rate and force steady in it: good for telling the signs apart.
+        `signs`, shape (M, 4), are 1 or -1 for the gyros x, y, z and for all accelerometers; if
+        none is changed, the leading axes are (K, 1), to be broadcast. The result is of second
+        order in an interval's rotation, for constant rate and force: enough to tell signs apart.
         """
         gyro, accel = signs[:, :3], signs[:, 3:]
         wider = {name: array[:, None] for name, array in vars(self).items()}
@@ -108,10 +109,10 @@ class Intervals:
         if (signs == 1).all():
             return Intervals(**wider)
         turn = log_so3(self.R)[:, None]
-        # Forces act on average half and, for the way, a third of the rotation after the start.
+        # A force acts on average after half of the rotation, and on the position after a third.
         half, third = (exp_so3(part * gyro * turn) @ exp_so3(-part * turn) for part in (1/2, 1/3))
         ones = np.ones((len(signs), 3))
-        # What a bias does stays; an entry of a matrix is one in proportion to what is mirrored.
+        # A bias keeps its sign; an entry of a matrix is multiplied by what is mirrored.
         of_gyro = np.hstack([ones, np.tile(gyro, 3)])[:, None]
         of_accel = np.hstack([ones, np.tile(accel, 9)])[:, None]
         force = accel[:, None]
@@ -129,33 +130,33 @@ class Intervals:
 class Noise(NamedTuple):
     """White noise of the sensors in each step, shape () or (K, n), rad/sqrt(s), m/s/sqrt(s)."""
 
-    angle_random_walk: ArrayLike = 0.0      # as stated
+    angle_random_walk: ArrayLike = 0.0      # stated
     velocity_random_walk: ArrayLike = 0.0
-    gyro_excess: ArrayLike = 0.0            # as measured beyond that
+    gyro_excess: ArrayLike = 0.0            # measured beyond the stated one
     accel_excess: ArrayLike = 0.0
 
 
 class Steps(NamedTuple):
-    """IMU samples cut into K intervals of n steps, and their derivatives to time."""
+    """IMU samples, and their derivatives to time, cut into K intervals of n steps."""
 
     dt: Array           # (K, n), s; shorter intervals are padded with steps of zero length
-    omega: Array        # (K, n + 1, 3), rad/s, at the ends of the steps
-    f: Array            # the same of the specific force, m/s^2
-    omega_dot: Array
-    f_dot: Array
+    omega: Array        # (K, n + 1, 3), angular rate at the ends of the steps, rad/s
+    f: Array            # (K, n + 1, 3), specific force, m/s^2
+    omega_dot: Array    # (K, n + 1, 3), rad/s^2
+    f_dot: Array        # (K, n + 1, 3), m/s^3
 
 
 def split_at_epochs(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Steps:
     """
-    Cut a run of samples, (N, 6), rad/s and m/s^2, into the K intervals between K + 1 epochs.
+    Cut samples, (N, 6), rad/s and m/s^2, into the K intervals between K + 1 epochs.
 
     Values at an epoch are interpolated with the cubic of the neighbouring samples and their
-    central differences. Stamps increase strictly and hold all epochs between them; two epochs that
-    are equal make an interval of no length.
+    central differences. Stamps increase strictly, and all epochs lie between the first and the
+    last one; two equal epochs make an interval of zero length.
     """
     samples = samples.T
     slopes = _slopes(samples, np.diff(stamps_ns) * 1e-9)
-    # Of the epochs. Values, then slopes; samples and epochs side by side to be picked from.
+    # Values and slopes at the epochs.
     right = np.clip(np.searchsorted(stamps_ns, epochs_ns), 1, stamps_ns.size - 1)
     left = right - 1
     h = (stamps_ns[right] - stamps_ns[left]) * 1e-9
@@ -165,9 +166,10 @@ def split_at_epochs(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Steps
     value = samples[:, left] + t * rise + t * (1 - t) * ((1 - t) * bend0 + t * bend1)
     slope = (rise + (1 - 2 * t) * ((1 - t) * bend0 + t * bend1)
              + t * (1 - t) * (bend1 - bend0)) / h
-    known = np.concatenate([np.concatenate([samples, value], axis=1),
-                            np.concatenate([slopes, slope], axis=1)])
-    # Knots are the start of an interval, the samples inside it, and its end as often as it takes.
+    # In the columns, the samples and then the epochs.
+    known = np.block([[samples, value], [slopes, slope]])
+    # The ends of an interval's steps: its start, the samples inside it, and its end, repeated as
+    # padding.
     first = np.searchsorted(stamps_ns, epochs_ns[:-1], side='right')
     last = np.searchsorted(stamps_ns, epochs_ns[1:], side='left')
     inner = first + np.arange(-1, max(int(np.max(last - first)), 0) + 1)[:, None]
@@ -180,13 +182,12 @@ def split_at_epochs(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Steps
 
 
 def _slopes(samples: Array, spacing: Array) -> Array:
-    """Central differences at uneven spacing, one-sided at both ends; samples of shape (6, N)."""
+    """Return central differences of samples, shape (6, N), one-sided at the first and last."""
     rise = np.diff(samples) / spacing
     before, after = spacing[:-1], spacing[1:]
-    # Where one of two steps is much the shorter, its noise would make the slope.
     uneven = np.minimum(before, after) < UNEVEN * np.maximum(before, after)
-    near, far = np.where(uneven, before, after), np.where(uneven, after, before)
-    inner = (near * rise[:, :-1] + far * rise[:, 1:]) / (before + after)
+    first, second = np.where(uneven, [before, after], [after, before])
+    inner = (first * rise[:, :-1] + second * rise[:, 1:]) / (before + after)
     return np.concatenate([rise[:, :1], inner, rise[:, -1:]], axis=1)
 
 
@@ -194,9 +195,9 @@ def preintegrate(steps: Steps, noise: Noise, recent: Recent) -> Intervals:
     """
     Integrate the steps of K intervals as if the sensors had no errors.
 
-    Angle and velocity increments come from the cubic through both ends of a step (trapezoid with
-    end correction, whose noise telescopes); coning and sculling terms are of second order [1]_,
-    [2]_, in the form that rates at instants allow.
+    Angle and velocity increments come from the cubic through both ends of a step: the trapezoidal
+    rule with end corrections, whose noise cancels from step to step. Coning and sculling terms are
+    of second order [1]_, [2]_, in a form for rates at instants.
 
     References
     ----------
@@ -205,8 +206,7 @@ def preintegrate(steps: Steps, noise: Noise, recent: Recent) -> Intervals:
     .. [2] P. G. Savage, part 2: velocity and position algorithms, 21(2), 1998.
 
     """
-    # In Fortran order, so that the components of vectors and matrices, which all that follows is
-    # made of, are contiguous in memory.
+    # In Fortran order, so that each component of vectors and matrices is contiguous in memory.
     dt, omega, f, omega_dot, f_dot = map(np.asfortranarray, steps)
     omega0, omega1 = omega[:, :-1], omega[:, 1:]
     f0, f1 = f[:, :-1], f[:, 1:]
@@ -222,7 +222,7 @@ def preintegrate(steps: Steps, noise: Noise, recent: Recent) -> Intervals:
     step_p = 2 * h2_12 * (f0 + both) + h * h2_12 * cross(omega0, both)
 
     turned = cumulative_rotations(turn)
-    A = np.empty_like(turn)                       # from the start of each step to the interval's
+    A = np.empty_like(turn)         # from the body frame at a step's start to the interval's
     A[:, 0] = np.eye(3)
     A[:, 1:] = turned[:, :-1]
     u = _applied(A, step_v)
@@ -243,33 +243,35 @@ def preintegrate(steps: Steps, noise: Noise, recent: Recent) -> Intervals:
     v, p = v_end[:, -1], p_end[:, -1]
     v_rest = v[:, None] - v_mid
     p_rest = p[:, None] - (p_end - 0.5 * p_step) - v_mid * remaining[..., None]
-    Q, Q_excess = _covariances(noise, dt, v_rest, p_rest, remaining)
-    # Intervals are chained for hours, and taken one by one.
+    Q, Q_excess = (_covariance(*densities, dt, v_rest, p_rest, remaining)
+                   for densities in (noise[:2], noise[2:]))
+    # The rotations of many intervals, over hours, are multiplied by each other.
     R = orthonormalized(turned[:, -1])
     return Intervals(*map(np.ascontiguousarray, (
         duration, R, v, p, *derivatives, Q, Q_excess, magnitude, omega[:, -1], *recent)))
 
 
-def _covariances(noise: Noise, dt: Array, v_rest: Array, p_rest: Array,
-                 remaining: Array) -> tuple[Array, Array]:
-    """Return covariances of the errors at the end from what is stated and from what is beyond."""
-    def covariance(gyro: ArrayLike, accel: ArrayLike) -> Array:
-        if not (np.any(gyro) or np.any(accel)):
-            return np.zeros((dt.shape[0], 9, 9))
-        return (_of_gyros(np.square(gyro) * dt, v_rest, p_rest)
-                + _of_accelerometers(np.square(accel) * dt, dt, remaining))
-
-    return covariance(*noise[:2]), covariance(*noise[2:])
+def _covariance(gyro: ArrayLike, accel: ArrayLike, dt: Array, v_rest: Array, p_rest: Array,
+                remaining: Array) -> Array:
+    """Return the covariance, (K, 9, 9), of the errors at the end from noise of both sensors."""
+    if not (np.any(gyro) or np.any(accel)):
+        return np.zeros((dt.shape[0], 9, 9))
+    return (_of_gyros(np.square(gyro) * dt, v_rest, p_rest)
+            + _of_accelerometers(np.square(accel) * dt, dt, remaining))
 
 
 def _applied(matrix: Array, vectors: Array) -> Array:
-    """Return products of matrices and vectors, in Fortran order."""
+    """Return ``matrix @ vector`` as `product` does, shapes (..., 3, 3) and (..., 3)."""
     return product(matrix, vectors[..., None])[..., 0]
 
 
 def _total(values: Array) -> Array:
-    """Sum over steps, shape (K, n, ...), one by one: K and steps of no length change no bit."""
-    if len(values) == 1:                          # numpy sums in pairs what is contiguous
+    """
+    Return the sum over steps of values, shape (K, n, ...), added one after the other.
+
+    No bit of an interval's sum depends on K, or on steps of zero length at its end.
+    """
+    if len(values) == 1:          # contiguous, which np.sum would add pairwise
         return np.cumsum(values, axis=1)[:, -1]
     return np.sum(np.asfortranarray(values), axis=1)
 
@@ -279,10 +281,10 @@ def _derivatives(dt: Array, turns: Array, u: Array, rate: Array,
     """
     Return J_Rg, J_vg, J_pg, J_va, J_pa of `Intervals`.
 
-    A gyro bias turns the rest of the interval by minus the integral of the attitude (`turns`, of
-    each step); an entry of a matrix is a bias in proportion to a rate or force. A few steps are
-    taken as one: what the motion does within them is of second order in something that is small.
-    `u` is the velocity gained in each step.
+    A gyro bias turns the rest of the interval by minus the integral of the attitude, `turns` of
+    each step, (K, n, 3, 3); an entry of a matrix acts as a bias times the mean rate or force of
+    the step, (K, n, 3). `u`, (K, n, 3), is the velocity gained in each step. A few steps are taken
+    as one, with an error of second order in their motion.
     """
     def together(values: Array) -> Array:
         sums = values[:, ::DERIVATIVE_STEPS].copy(order='K')
@@ -304,7 +306,7 @@ def _derivatives(dt: Array, turns: Array, u: Array, rate: Array,
                         out=by[..., 3 + 3 * k:6 + 3 * k])
     turned_by = np.cumsum(by_gyros, axis=1)
     pushes = cross(u[..., None, :], (turned_by - 0.5 * by_gyros).swapaxes(2, 3)).swapaxes(2, 3)
-    # What a step adds to the velocity moves the body for the time that remains.
+    # The velocity gained in a step adds to the position for the time that remains.
     passed = np.cumsum(seconds, axis=1)
     remaining = (passed[:, -1:] - passed + 0.5 * seconds)[..., None, None]
     return (-turned_by[:, -1], _total(pushes), _total(remaining * pushes),
@@ -313,14 +315,12 @@ def _derivatives(dt: Array, turns: Array, u: Array, rate: Array,
 
 def _of_gyros(variance: Array, v_rest: Array, p_rest: Array) -> Array:
     """
-    Covariance of the errors (rotation, v, p) at the end from errors of angle, shape (K, 9, 9).
+    Return the covariance, (K, 9, 9), of the errors (rotation, v, p) from errors of angle.
 
-    Isotropic noise stays isotropic under the rotation of the body, so that only the velocity and
-    distance still to come after each step matter (v_rest, p_rest): an error of a step's angle
-    turns them. The variance is that of each step's angle increment, shape (K, n).
+    An error of a step's angle increment turns the velocity and distance that are still to come,
+    `v_rest` and `p_rest`, (K, n, 3). Its variance, (K, n), is isotropic, also after rotations.
     """
-    # Sums of the products of [1, v_rest, p_rest], from which those of
-    # [I, -[v_rest x], -[p_rest x]] follow.
+    # Sums of products of [1, v_rest, p_rest]; those of [I, -[v_rest x], -[p_rest x]] follow.
     variance = np.asfortranarray(variance)
     rest = np.empty(variance.shape + (7,), order='F')
     rest[..., 0], rest[..., 1:4], rest[..., 4:] = 1.0, v_rest, p_rest
@@ -329,7 +329,7 @@ def _of_gyros(variance: Array, v_rest: Array, p_rest: Array) -> Array:
     for i in range(7):
         moment[:, i, i:] = moment[:, i:, i] = _total(weighted[..., i, None] * rest[..., i:])
     eye = np.eye(3)
-    # Of blocks of 3 x 3.
+    # 3 x 3 blocks of 3 x 3 each.
     Q = np.zeros((variance.shape[0], 3, 3, 3, 3))
     Q[:, 0, :, 0] = moment[:, :1, :1] * eye
     turned = skew(moment[:, 0, 1:].reshape(-1, 2, 3))
@@ -343,10 +343,10 @@ def _of_gyros(variance: Array, v_rest: Array, p_rest: Array) -> Array:
 
 def _of_accelerometers(variance: Array, dt: Array, remaining: Array) -> Array:
     """
-    Covariance of the errors (rotation, v, p) at the end from errors of velocity, (K, 9, 9).
+    Return the covariance, (K, 9, 9), of the errors (rotation, v, p) from errors of velocity.
 
-    The variance is that of each step's velocity increment; `remaining` is the time still to come
-    after the middle of the step, in which it becomes distance; both have shape (K, n).
+    An error of a step's velocity increment, with this variance, (K, n), adds to the distance in
+    the time that remains after the middle of the step, (K, n).
     """
     Q = np.zeros((variance.shape[0], 3, 3, 3, 3))
     # dt^2 / 12 is the variance within the step itself

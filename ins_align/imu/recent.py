@@ -12,11 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-Recent motion: what the IMU saw just before a GNSS epoch, as a function of how long ago.
+Recent motion: integrals of the IMU samples from a moment before a GNSS epoch up to it.
 
-A delayed receiver tells where the antenna was and how fast it went a moment before the stamp.
-What the specific force has added to the velocity since, and the rates to the rotation, lead from
-the epoch back to that moment. They are kept at a ladder of ages that follows a walker's steps.
+A delayed receiver measures where the antenna was and how fast it moved some time before the stamp,
+the age. The integrals of specific force and angular rate over the age lead from the epoch back to
+that moment. They are tabulated at ages ("rungs") close enough to follow a walker's steps.
 """
 
 from functools import lru_cache
@@ -26,31 +26,31 @@ from typing import NamedTuple
 from ins_align.geometry.rotation import Array, cross, Index, rotated
 import numpy as np
 
-# Seconds between the ages, and how many there are: all of them as long as delays are.
+# Seconds between the ages, and their number: the last one is the largest delay.
 RUNG, RUNGS = 0.025, 40
-# Between samples so far apart (s) nobody knows how the vehicle has moved.
-SILENCE = 0.3
 AGES = RUNG * np.arange(1, RUNGS + 1)
-# So many rungs apart force and rate are calm of vibration.
+# Between samples this far apart (s) the motion is unknown.
+UNKNOWN_STEP = 0.3
+# A cubic through rungs this many apart takes vibration out of force and rate.
 SMOOTH = 2
 # Coefficients of the cubics that are 1 at one of the places 0, 1, 2, 3 and 0 at the others.
 CUBIC = np.linalg.inv(np.vander(np.arange(4.0), increasing=True))
 
 
 class Recent(NamedTuple):
-    """Integrals from each of `AGES` before an epoch up to it, of K epochs."""
+    """Integrals from each of `AGES` before an epoch up to it, for K epochs."""
 
     gained: Array       # (K, RUNGS, 3), of the specific force, m/s, in the body frame at the epoch
-    turned: Array       # (K, RUNGS, 3), of the angular rate: rotation vector of the body, rad
+    turned: Array       # (K, RUNGS, 3), rotation vector of the body, rad
 
 
 def recent_motion(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Recent:
     """
-    Integrate samples over the time before each of K epochs.
+    Integrate samples, (N, 6), rad/s and m/s^2, over the time before each of K epochs.
 
     A rate that changes its axis makes the rotation vector differ from its integral [Bortz1971]_.
-    Where the samples do not reach back far enough, because they begin there or are missing, it
-    goes on with their mean. Samples, (N, 6), rad/s and m/s^2, are there before and after each.
+    Before the first sample, and before the last gap, the mean since then is used. There has to be
+    a sample before and after each epoch.
 
     References
     ----------
@@ -69,13 +69,13 @@ def recent_motion(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Recent:
     inside = step < last[:, None]
     step = np.minimum(step, last[:, None] - 1)
     begin, end = ((stamps_ns[step.T + k] - epochs_ns).T * 1e-9 for k in (0, 1))
-    # Nothing is known of a silence and what was before it.
-    heard = np.logical_and.accumulate((end - begin < SILENCE)[:, ::-1], axis=1)[:, ::-1]
-    dt = np.where(inside & heard, np.minimum(end, 0.0) - begin, 0.0)[..., None]
+    # Gaps do not count, nor does what was before the last one.
+    known = np.logical_and.accumulate((end - begin < UNKNOWN_STEP)[:, ::-1], axis=1)[:, ::-1]
+    dt = np.where(inside & known, np.minimum(end, 0.0) - begin, 0.0)[..., None]
     middle = (0.5 * (samples[:, :-1] + samples[:, 1:])).take(step.T, axis=1).T
     both = _seen_from_epoch(dt, middle[..., :3], middle[..., 3:])
     sums = np.cumsum(dt * both, axis=1)
-    # Up to a rung: the steps before its own, and of that what lies before.
+    # The integral up to a rung: over the steps before, and over part of the one that it is in.
     own = np.clip(rungs - first[:, None], 0, step.shape[1] - 1)
     rows = np.arange(epochs_ns.size)[:, None]
     before = (sums[rows, own]
@@ -90,15 +90,14 @@ def recent_motion(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Recent:
 
 def _seen_from_epoch(dt: Array, rate: Array, force: Array) -> Array:
     """
-    Return forces in the axes of the body at the epoch, and what changes the rotation up to it.
+    Return forces in the body frame at the epoch, and rates of the rotation vector up to it.
 
-    `dt` are the seconds of the steps before each epoch, shape (K, n, 1), rate and force in the
-    body frame of the step, (K, n, 3); both together come back, force first, (K, n, 6).
+    `dt` are the lengths of the steps before each epoch, shape (K, n, 1), s; rate and force, in the
+    body frame of the step, are (K, n, 3). Returns both in one array, (K, n, 6), force first.
     """
     turn = dt * rate
     turned = np.cumsum(turn, axis=1)
-    # Rotation vector from the middle of a step to the epoch; rates that change their axis make it
-    # differ from their integral [Bortz1971]_.
+    # Rotation vector from the middle of a step to the epoch, to first order.
     to_come = turned[:, -1:] - turned + 0.5 * turn
     rate = rate - 0.5 * cross(to_come, rate)
     turn = dt * rate
@@ -109,10 +108,9 @@ def _seen_from_epoch(dt: Array, rate: Array, force: Array) -> Array:
 
 def exact(integrals: Array, age: float) -> tuple[Array, Array, Array]:
     """
-    Follow a force or rate, shape (K, RUNGS, 3) as in `Recent`, back to an age.
+    Return a force or rate at an age, and its integral and double integral from age 0, each (K, 3).
 
-    Returns its value, integral and double integral over the ages from 0 on, each (K, 3); before
-    age 0 it is extrapolated.
+    Interpolates the integrals of `Recent`, (K, RUNGS, 3); extrapolates to negative ages.
     """
     there, value, _ = _cubic(age, 1)
     rung = min(max(int(age / RUNG), 0), RUNGS - 1)
@@ -120,14 +118,14 @@ def exact(integrals: Array, age: float) -> tuple[Array, Array, Array]:
     trapezoids = 0.5 * rest * there
     trapezoids[1:rung] += RUNG
     trapezoids[rung] += 0.5 * (RUNG + rest)
-    # Up to the first rung, which is at age 0, the integrals are 0: it is left out.
+    # The weights begin with the rung at age 0, where the integrals are 0.
     value, integral, double_integral = (weights[1:] @ integrals
                                         for weights in (value, there, trapezoids))
     return value, integral, double_integral
 
 
 def smooth(integrals: Array, age: float) -> tuple[Array, Array]:
-    """Return a force or rate at an age, calm of vibration, and its derivative to the age."""
+    """Return a force or rate at an age, without vibration, and its derivative to the age."""
     _, value, change = _cubic(age, SMOOTH)
     return value[1:] @ integrals, change[1:] @ integrals
 
@@ -135,10 +133,10 @@ def smooth(integrals: Array, age: float) -> tuple[Array, Array]:
 @lru_cache(maxsize=8)          # the delay stays the same for many epochs
 def _cubic(age: float, apart: int) -> tuple[Array, Array, Array]:
     """
-    Weights of the rungs, the one at age 0 first, in a cubic and its two derivatives at an age.
+    Return weights of the rungs, from age 0 on, in a cubic and its two derivatives at an age.
 
-    The cubic goes through four rungs next to the age, so many of them apart; before age 0 no
-    further out than they are apart.
+    The cubic goes through four rungs near the age, `apart` rungs from each other: more for a
+    negative age, so that it is extrapolated by no more than their distance.
     """
     apart = min(max(math.ceil(-age / RUNG), apart), RUNGS // 3)
     x = age / (apart * RUNG)
