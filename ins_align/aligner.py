@@ -432,7 +432,7 @@ class Aligner:
             current, sensors.gyro_bias, sensors.gyro_matrix,
             float(np.max(method.nuisance().gyro_bias_std)),
             self.config.imu_noise.angle_random_walk, rate, usual)
-        carried = all(prediction.carry(*sample)
+        carried = all(prediction.propagate(*sample)
                       for sample in zip(stamps.tolist(), rates.tolist()))
         return prediction if carried else None
 

@@ -64,7 +64,7 @@ MEASURED = STAMPS, rate_of(STAMPS), force_of(STAMPS)
 
 def exact_motion(C, u, w, x):
     """Integrate the interval anew, without the errors in x."""
-    errors = SensorErrors.of(x[GYRO:])
+    errors = SensorErrors.from_vector(x[GYRO:])
     stamps, gyro, accel = MEASURED
     imu = integrate(cut_at(stamps, gyro - gyro @ errors.gyro_matrix.T - errors.gyro_bias,
                            accel - accel @ errors.accel_matrix.T - errors.accel_bias, EPOCHS))
@@ -74,7 +74,7 @@ def exact_motion(C, u, w, x):
 
 def exact_measurement(C, u, w, x):
     """Go back from the second epoch by the delay: velocity and position of the antenna there."""
-    errors, delay, now = SensorErrors.of(x[GYRO:]), x[DELAY], EPOCHS[1]
+    errors, delay, now = SensorErrors.from_vector(x[GYRO:]), x[DELAY], EPOCHS[1]
 
     def rate(time):
         return (np.eye(3) - errors.gyro_matrix) @ rate_of(time) - errors.gyro_bias

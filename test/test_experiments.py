@@ -109,7 +109,7 @@ def test_time_at_which_the_bound_crosses(monkeypatch):
 
 
 def test_draws_are_repeatable_and_cover_everything():
-    combinations = len(declare.FAULTS) * len(declare.SCENARIOS) * len(declare.GRADES)
+    combinations = len(declare.FAULTS) * len(declare.CAMPAIGN_SCENARIOS) * len(declare.GRADES)
     drawn = [declare.draw(index) for index in range(combinations)]
     assert drawn[5] == declare.draw(5)
     assert len({case[:2] for case in drawn}) == combinations
@@ -118,7 +118,7 @@ def test_draws_are_repeatable_and_cover_everything():
 def test_every_combination_of_faults_is_drawn_once():
     names = {fault for combination in declare.COMBINATIONS for fault in combination}
     assert names == set(declare.WORSE)
-    seeds = range(len(declare.COMBINATIONS) * len(declare.SCENARIOS))
+    seeds = range(len(declare.COMBINATIONS) * len(declare.CAMPAIGN_SCENARIOS))
     drawn = [declare.draw_worse(seed) for seed in seeds]
     assert drawn[7] == declare.draw_worse(7)
     assert len({case[:2] for case in drawn}) == len(drawn)
@@ -166,7 +166,7 @@ def test_shares_beyond_the_limits():
 
     def cells(*sigmas):
         runs = [*map(result, sigmas), {'levelled': []}]
-        return [*common.moment_row('name', runs, 'levelled').values()]
+        return [*common.event_row('name', runs, 'levelled').values()]
 
     assert cells(1.0, 4.0) == ['name', 3, 2, '4.0', '1 (50.0 %)', '0 (0.0 %)', '4.0', '0.2',
                                '0 (0.0 %)', '0 (0.0 %)', '0.5', '0.7']

@@ -43,7 +43,7 @@ def index_of(fault):
 
 
 def test_draws_are_repeatable_and_cover_everything():
-    combinations = len(faults.FAULTS) * len(faults.SCENARIOS) * len(faults.GRADES)
+    combinations = len(faults.FAULTS) * len(faults.CAMPAIGN_SCENARIOS) * len(faults.GRADES)
     drawn = [faults.draw(index) for index in range(combinations)]
     again = faults.draw(5)._replace(spoil=drawn[5].spoil)
     assert drawn[5] == again

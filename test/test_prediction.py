@@ -55,15 +55,15 @@ def truth(count):
     return attitude.as_matrix()
 
 
-def carry(carried, stamps, gyro):
-    """Carry to the last of many samples."""
-    assert all(carried.carry(*sample) for sample in zip(stamps.tolist(), gyro.tolist()))
+def propagate_all(carried, stamps, gyro):
+    """Propagate over many samples."""
+    assert all(carried.propagate(*sample) for sample in zip(stamps.tolist(), gyro.tolist()))
 
 
 @pytest.mark.parametrize('count', [0, 1, 2, 3, 37, 400])
 def test_rotations_are_those_of_scipy(count):
     carried = prediction()
-    carry(carried, STAMPS[:count], GYRO)
+    propagate_all(carried, STAMPS[:count], GYRO)
     assert carried.stamp_ns == (STAMPS[count - 1] if count else 0)
     assert carried.attitude().C_nb == pytest.approx(truth(count), abs=1e-12)
     assert carried.quaternion_xyzw[3] >= 0.0
@@ -76,7 +76,7 @@ def test_a_rate_that_swings_is_followed():
     stamps = np.arange(1, 1013) * 10_000_000
     gyro = np.outer(swing * np.sin(frequency * stamps * 1e-9), [0.0, 0.6, 0.8])
     carried = still(0, np.zeros(3))
-    carry(carried, stamps, gyro)
+    propagate_all(carried, stamps, gyro)
     angle = swing / frequency * (1 - np.cos(frequency * stamps[-1] * 1e-9))
     turned = Rotation.from_quat(carried.quaternion_xyzw).as_rotvec() @ [0.0, 0.6, 0.8]
     # The rate at the end of each step alone would be off by half a step of the largest rate.
@@ -86,7 +86,7 @@ def test_a_rate_that_swings_is_followed():
 def test_covariance_grows_with_the_noise_of_the_gyros():
     carried = prediction()
     assert carried.attitude().covariance == pytest.approx(COVARIANCE)
-    carry(carried, STAMPS, GYRO)
+    propagate_all(carried, STAMPS, GYRO)
     seconds = STAMPS[-1] * 1e-9
     drift = 4e-6 * seconds + (1e-6 + EARTH_RATE ** 2) * seconds ** 2
     assert carried.attitude().covariance == pytest.approx(COVARIANCE + drift * np.eye(3))
@@ -97,7 +97,7 @@ def test_what_it_may_have_turned_in_a_gap_is_not_known():
     stamps = STEP_NS * np.array([1, 2, 3, 63, 64])
     sigmas = []
     for stamp_ns in stamps.tolist():
-        assert carried.carry(stamp_ns, (0.0, 0.0, 0.5))
+        assert carried.propagate(stamp_ns, (0.0, 0.0, 0.5))
         sigmas.append(np.sqrt(np.diag(carried.attitude().covariance)))
     may_have_turned = GAP_ANGULAR_ACCELERATION * 0.3 ** 2       # rad, 10 deg
     assert np.max(sigmas[2]) < 0.02 * may_have_turned
@@ -106,11 +106,11 @@ def test_what_it_may_have_turned_in_a_gap_is_not_known():
 
 def test_what_is_old_or_broken_changes_nothing():
     carried = prediction()
-    carried.carry(STEP_NS, (0.1, 0.2, 0.3))
+    carried.propagate(STEP_NS, (0.1, 0.2, 0.3))
     before = carried.quaternion_xyzw
     for stamp_ns, x in ((STEP_NS, 1.0), (0, 1.0), (2 * STEP_NS, float('nan')),
                         (2 * STEP_NS, float('inf')), (2 * STEP_NS, -1e300)):
-        assert not carried.carry(stamp_ns, (0.0, x, 0.0))
+        assert not carried.propagate(stamp_ns, (0.0, x, 0.0))
     assert (carried.stamp_ns, carried.quaternion_xyzw) == (STEP_NS, before)
 
 
@@ -123,7 +123,7 @@ def test_follower_catches_up_with_predictions_that_come_late():
         if now is not None:
             assert now.stamp_ns == stamp_ns
         if k % 20 == 0 and k >= 40:  # a prediction up to forty samples ago
-            carry(slow, STAMPS[max(k - 60, 0):k - 40], GYRO[max(k - 60, 0):k - 40])
+            propagate_all(slow, STAMPS[max(k - 60, 0):k - 40], GYRO[max(k - 60, 0):k - 40])
             follower.adopt(copy(slow))
     assert now.attitude().C_nb == pytest.approx(truth(400), abs=1e-12)
 
@@ -143,7 +143,7 @@ def test_follower_has_nothing_where_nothing_is_known():
     follower.adopt(prediction())  # it stands at a sample that has not been seen
     assert follower.follow(STEP_NS, (0.0, 0.0, 0.0)) is None
     beginning = prediction()
-    beginning.carry(STEP_NS, (0.0, 0.0, 0.0))
+    beginning.propagate(STEP_NS, (0.0, 0.0, 0.0))
     follower.adopt(beginning)
     assert follower.follow(2 * STEP_NS, (0.0, 0.0, 0.0)) is not None
     assert follower.follow(2 * STEP_NS, (0.0, 0.0, 0.0)) is None  # there twice

@@ -74,7 +74,7 @@ def integrated(epochs, rate=RATE, jitter=0.0, errors=np.zeros(24)):
 
 def without(errors, gyro, accel):
     """Take errors, shape (24,), off what was measured."""
-    errors = SensorErrors.of(errors)
+    errors = SensorErrors.from_vector(errors)
     return (gyro - gyro @ errors.gyro_matrix.T - errors.gyro_bias,
             accel - accel @ errors.accel_matrix.T - errors.accel_bias)
 

@@ -14,7 +14,7 @@
 """Motion just before an epoch against the integral of the motion itself."""
 
 from alignment import nanoseconds
-from ins_align.imu.recent import AGES, exact, recent_motion, RUNGS, smooth
+from ins_align.imu.recent import AGE_COUNT, AGES, interpolated, recent_motion, smoothed
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -60,9 +60,9 @@ def measured(stamps_ms):
 def test_it_leads_back_to_the_motion_of_a_moment_ago(age):
     epochs_ms = [300, 423, 700]
     recent = motion(-200, epochs_ms)
-    _, gained, moved = exact(recent.gained, age)
-    turning, turn, _ = exact(recent.turned, age)
-    calm = smooth(recent.gained, age)[0]
+    _, gained, moved = interpolated(recent.gained, age)
+    turning, turn, _ = interpolated(recent.turned, age)
+    calm = smoothed(recent.gained, age)[0]
     for k, epoch in enumerate(np.array(epochs_ms) * 1e-3):
         velocity, distance, C = before(epoch, age)
         assert np.allclose(gained[k], velocity, atol=2e-3)
@@ -77,7 +77,7 @@ def test_it_leads_back_to_the_motion_of_a_moment_ago(age):
 def test_at_the_epoch_itself_nothing_has_been_gained():
     recent = motion(-200, [300])
     for integrals in (recent.gained, recent.turned):
-        value, gained, moved = exact(integrals, 0.0)
+        value, gained, moved = interpolated(integrals, 0.0)
         assert not np.any(gained) and not np.any(moved)
     assert np.allclose(value, rate(np.array([0.3])), atol=0.03)
 
@@ -86,7 +86,7 @@ def test_it_goes_on_a_little_beyond_the_epoch():
     recent = motion(-200, [300])
     for age in (-0.01, -0.02):
         velocity, _, _ = before(0.3, age)
-        assert np.allclose(exact(recent.gained, age)[1][0], velocity, atol=0.1 * abs(age))
+        assert np.allclose(interpolated(recent.gained, age)[1][0], velocity, atol=0.1 * abs(age))
 
 
 def test_forces_and_rates_that_last():
@@ -95,12 +95,12 @@ def test_forces_and_rates_that_last():
         recent_motion(stamps, np.tile(sample, (stamps.size, 1)), np.array([0]))
         for sample in ([0.0, 0.0, 0.0, 1.0, 2.0, 9.8], [0.1, 0.0, -0.2, 0.0, 0.0, 0.0]))
     for age in (-0.1, 0.0, 0.07, 0.3):
-        value, gained, moved = exact(recent.gained, age)
+        value, gained, moved = interpolated(recent.gained, age)
         assert np.allclose(value, [[1.0, 2.0, 9.8]])
         assert np.allclose(gained, [[age, 2 * age, 9.8 * age]])
         assert np.allclose(moved, [[age ** 2 / 2, age ** 2, 4.9 * age ** 2]])
-        assert np.allclose(exact(turning.turned, age)[1], [[0.1 * age, 0.0, -0.2 * age]])
-        calm, change = smooth(recent.gained, age)
+        assert np.allclose(interpolated(turning.turned, age)[1], [[0.1 * age, 0.0, -0.2 * age]])
+        calm, change = smoothed(recent.gained, age)
         assert np.allclose(calm, value) and np.allclose(change, 0.0, atol=1e-9)
 
 
@@ -110,9 +110,9 @@ def test_a_cubic_is_followed_exactly(age):
     a, b, c = np.array([[1.0, 2.0, 9.8], [3.0, -1.0, 0.5], [-7.0, 4.0, 5.0]])
     integrals = (a * AGES[:, None] + b * AGES[:, None] ** 2 + c * AGES[:, None] ** 3)[None]
     value, change = a + 2 * b * age + 3 * c * age ** 2, 2 * b + 6 * c * age
-    for found, expected in zip(smooth(integrals, age), (value, change)):
+    for found, expected in zip(smoothed(integrals, age), (value, change)):
         assert np.allclose(found, expected, atol=1e-9)
-    found, integral, _ = exact(integrals, age)
+    found, integral, _ = interpolated(integrals, age)
     assert np.allclose(found, value, atol=1e-9)
     assert np.allclose(integral, a * age + b * age ** 2 + c * age ** 3, atol=1e-12)
 
@@ -121,10 +121,10 @@ def test_a_cubic_is_followed_exactly(age):
 def test_noise_of_the_integrals_does_not_grow_where_they_are_followed(age):
     """A cubic goes on by one of its own steps at most: 4 (at age 0, which is 0), -6, 4, -1."""
     squares = 0.0
-    for rung in range(RUNGS):
-        one = np.zeros((1, RUNGS, 1))
+    for rung in range(AGE_COUNT):
+        one = np.zeros((1, AGE_COUNT, 1))
         one[0, rung] = 1.0
-        squares += exact(one, age)[1].item() ** 2
+        squares += interpolated(one, age)[1].item() ** 2
     assert squares <= 6 ** 2 + 4 ** 2 + 1 + 1e-9
 
 
@@ -151,7 +151,7 @@ def test_vibration_hardly_reaches_the_smooth_force():
         accel = [0.0, 0.0, 9.8] + 5.0 * np.cos(2 * np.pi * 67.0 * stamps[:, None] + phase)
         recent = recent_motion(nanoseconds(stamps), np.hstack([np.zeros((stamps.size, 3)), accel]),
                                nanoseconds([0.305]))
-        shaken = max(shaken, np.abs(smooth(recent.gained, 0.1)[0] - [0.0, 0.0, 9.8]).max())
+        shaken = max(shaken, np.abs(smoothed(recent.gained, 0.1)[0] - [0.0, 0.0, 9.8]).max())
     # Of what a single sample shows, each 50 ms keep 2 / (2 pi 67 Hz 0.05 s) at most, and two
     # parts of them count half each.
     assert shaken < 5.0 * 2 / (2 * np.pi * 67.0 * 0.05)
@@ -163,5 +163,6 @@ def test_one_epoch_is_the_same_with_others_to_the_bit():
     assert np.array_equal(together.gained[1], alone.gained[0])
     assert np.array_equal(together.turned[1], alone.turned[0])
     for age in (0.0, 0.07, 0.2):
-        for ours, its in zip(exact(together.gained[1:], age), exact(alone.gained, age)):
+        for ours, its in zip(interpolated(together.gained[1:], age),
+                             interpolated(alone.gained, age)):
             assert np.array_equal(ours[0], its[0])

@@ -400,7 +400,7 @@ class Bank:
         full = np.zeros((2, 12))
         for errors, triad in zip(full, triads(x.size)):
             errors[:triad.stop - triad.start] = x[triad]
-        return SensorErrors.of(full.ravel())
+        return SensorErrors.from_vector(full.ravel())
 
     def learnt(self) -> Learnt | None:
         """Return the prior for another start; None while epochs do not fit."""

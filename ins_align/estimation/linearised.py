@@ -24,7 +24,7 @@ from ins_align.estimation.states import (
     DELAY, FIRST, LEVER_ARM, Linearised, PHI, RHO, triads, XI)
 from ins_align.geometry.rotation import apply, Array, by_row, cross, exp_so3, skew
 from ins_align.imu.preintegration import Intervals
-from ins_align.imu.recent import AGES, exact, smooth
+from ins_align.imu.recent import AGES, interpolated, smoothed
 import numpy as np
 
 # A delay is followed along the recent motion within these (s), and linearly beyond.
@@ -95,10 +95,10 @@ class _Seen:
         self.shape = interval.duration.size, len(point), 3, FIRST + point.shape[1]
         gyro, accel = (point[:, triad] for triad in triads(point.shape[1]))
         self.delay = delay = float(point[0, DELAY])
-        force, self.gained, self.gained_p = exact(interval.gained, delay)
-        rate, self.turned, _ = exact(interval.turned, delay)
+        force, self.gained, self.gained_p = interpolated(interval.gained, delay)
+        rate, self.turned, _ = interpolated(interval.turned, delay)
         # The lever arm swings with the vibration too.
-        vibration = interval.omega - exact(interval.turned, 0.0)[0]
+        vibration = interval.omega - interpolated(interval.turned, 0.0)[0]
 
         def corrected(measured: Array, errors: Array, biases: float) -> Array:
             """Return the integrals of a triad without its errors."""
@@ -117,8 +117,8 @@ class _Seen:
         self.fallen_p = corrected(self.gained_p, accel, delay ** 2 / 2)
         # Derivatives use the motion without vibration. Age runs against time.
         self._calm = calm
-        self._calm_force = corrected(smooth(interval.gained, delay)[0], accel, 1.0)
-        self._change = corrected(smooth(interval.turned, delay)[1], gyro, 0.0)
+        self._calm_force = corrected(smoothed(interval.gained, delay)[0], accel, 1.0)
+        self._change = corrected(smoothed(interval.turned, delay)[1], gyro, 0.0)
         self._carry(point[:, LEVER_ARM])
 
     def _carry(self, lever: Array) -> None:

@@ -99,7 +99,7 @@ SIGNS = (
     Rival('the angular rate about y reversed', signs=(1.0, -1.0, 1.0, 1.0)),
     Rival('the angular rate about z reversed', signs=(1.0, 1.0, -1.0, 1.0)))
 # A parameter that is configured with a smaller sigma (SI) has a rival.
-TOLD = (
+CERTAIN = (
     ('lever_arm_std', 0.3, Rival(
         'a lever arm of [{lever}] m',
         'check lever_arm (its signs, the axes of the IMU), or raise lever_arm_std',
@@ -118,7 +118,7 @@ TOLD = (
 def rivals_of(config: Config) -> tuple[Rival, ...]:
     """Return the rivals of a configuration, which itself comes first."""
     stated = vars(config) | config.imu_noise._asdict()
-    told = tuple(rival for name, std, rival in TOLD if stated[name] < std)
+    told = tuple(rival for name, std, rival in CERTAIN if stated[name] < std)
     rivals = (*LEVELS, *(() if config.trust_imu_axes else SIGNS), *told)
     if config.vehicle == 'none':
         return rivals

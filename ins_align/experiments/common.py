@@ -225,10 +225,10 @@ def outcome(name: str, simulation: Simulation, stream: Stream, aligner: Aligner,
             'counts': {counter: count for counter, count in status.counts.items() if count},
             'least_heading_sigma_deg': min((epoch.initial.sigma_deg[2] for epoch in epochs
                                             if epoch.initial is not None), default=None),
-            **moments(epochs, true), **while_aligned(epochs, stream.start_ns, true)}
+            **judge_events(epochs, true), **while_aligned(epochs, stream.start_ns, true)}
 
 
-def moments(epochs: Iterable[Epoch], true: Truth) -> JsonDict:
+def judge_events(epochs: Iterable[Epoch], true: Truth) -> JsonDict:
     """
     Judge the first levelled epoch, each declaration, and the last epoch if it is aligned.
 
@@ -243,12 +243,12 @@ def moments(epochs: Iterable[Epoch], true: Truth) -> JsonDict:
         'declared': [epoch for epoch, before, now in zip(epochs, [False, *aligned], aligned)
                      if now and not before],
         'final': [epoch for epoch in epochs[-1:] if epoch.state is State.ALIGNED]}
-    return {name: [moment(epoch.t_s, errors_of([epoch.initial, epoch.current], true))
+    return {name: [judged(epoch.t_s, errors_of([epoch.initial, epoch.current], true))
                    for epoch in each if epoch.initial is not None and epoch.current is not None]
             for name, each in chosen.items()}
 
 
-def moment(t_s: float, errors: list[JsonDict]) -> JsonDict:
+def judged(t_s: float, errors: list[JsonDict]) -> JsonDict:
     """Return a time, s since t0, with the largest tilt and heading among several errors."""
     return {'t_s': t_s, **{name: max(error[name] for error in errors) for name in (
         'tilt_sigmas', 'heading_sigmas', 'tilt_deg', 'heading_deg')}}
@@ -272,7 +272,7 @@ def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth,
     errors = {k: error for k, error in zip(aligned, errors_of(
         [epochs[k].current for k in aligned], true, std_deg)) if error is not None}
     sigmas = {k: worst([error]) for k, error in errors.items()}
-    return {'first': [moment(epochs[k].t_s, [errors[k]]) for k in [*errors][:1]],
+    return {'first': [judged(epochs[k].t_s, [errors[k]]) for k in [*errors][:1]],
             'declared_s': next(((stamps[k] - start_ns) / SECOND for k in errors), None),
             'epochs': len(errors), 'worst_sigmas': max(sigmas.values(), default=None),
             'worst_heading_deg': max((error['heading_deg'] for error in errors.values()),
@@ -313,19 +313,19 @@ def beyond(values: Iterable[Any], limit: float) -> int:
     return sum(value > limit for value in values)
 
 
-def moment_row(name: str, runs: list[JsonDict], kind: str) -> JsonDict:
-    """Return how many runs have an entry of `moments`, when, and how large the errors were."""
+def event_row(name: str, runs: list[JsonDict], kind: str) -> JsonDict:
+    """Return how many runs have an entry of `events`, when, and how large the errors were."""
     found = [run[kind][0] for run in runs if run[kind]]
     row = {'case': name, 'runs': len(runs), 'declared': len(found),
-           'median, s': cell(np.median, (moment['t_s'] for moment in found), '.1f')}
+           'median, s': cell(np.median, (event['t_s'] for event in found), '.1f')}
     for angle in ANGLES:
-        sigmas = [moment[f'{angle}_sigmas'] for moment in found]
+        sigmas = [event[f'{angle}_sigmas'] for event in found]
         for limit in SIGMA_LIMITS:
             wrong = beyond(sigmas, limit)
             row[f'{angle} beyond {limit:g}'] = (
                 f'{wrong} ({100 * wrong / len(found):.1f} %)' if found else None)
         row[f'worst {angle}, sigma'] = cell(max, sigmas, '.1f')
-        row[f'{angle}, deg'] = cell(max, (moment[f'{angle}_deg'] for moment in found), '.2g')
+        row[f'{angle}, deg'] = cell(max, (event[f'{angle}_deg'] for event in found), '.2g')
     return row
 
 

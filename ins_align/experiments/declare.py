@@ -33,11 +33,11 @@ from typing import Any
 from ins_align.aligner import State
 from ins_align.config import CHIP_THRESHOLDS, Config, PRESETS
 from ins_align.experiments.common import (
-    aligned_row, bound_of, Case, cell, combination, follow, GRADES, groups_of, JsonDict,
-    moment_row, parallel, prepare, Report, run_case, setup)
+    aligned_row, bound_of, Case, cell, combination, event_row, follow, GRADES, groups_of,
+    JsonDict, parallel, prepare, Report, run_case, setup)
 from ins_align.experiments.spoilt import Random, Stream, vertical_absent
-from ins_align.simulation.arguments import errors_of
-from ins_align.simulation.simulate import SCENARIOS
+from ins_align.simulation.arguments import imu_errors_of
+from ins_align.simulation.simulate import CAMPAIGN_SCENARIOS
 import numpy as np
 
 DURATION = 100.0
@@ -60,9 +60,9 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         *([(case, seed) for seed in silent_seeds] for case in SILENT)], jobs, 'declare')
     waits = time_to_heading(max(runs // TIME_PART, 1), jobs)
     report.text(
-        f'{runs} runs of {DURATION:g} s over all scenarios ({", ".join(SCENARIOS)}), grades of '
-        'IMU and faults, none of which is configured, with random heading, latitude, mount and '
-        'lever arm.')
+        f'{runs} runs of {DURATION:g} s over all scenarios ({", ".join(CAMPAIGN_SCENARIOS)}), '
+        'grades of IMU and faults, none of which is configured, with random heading, latitude, '
+        'mount and lever arm.')
     groups = groups_of(found, FAULTS)
     for title, kind in (
             ('When ALIGNED was declared first', 'declared'),
@@ -70,10 +70,10 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
             ('When LEVELLED (or ALIGNED at once) was declared first. At rest and in steady '
              'straight motion an IMU with its z axis or all accelerations reversed cannot be told '
              'from one that is mounted upside down', 'levelled')):
-        report.table(title, [moment_row(*group, kind) for group in groups])
+        report.table(title, [event_row(*group, kind) for group in groups])
     report.table(
         f'MEMS for {SILENT_DURATION:g} s without a change of velocity: LEVELLED, and ALIGNED',
-        [{**moment_row(case.name, group, 'levelled'),
+        [{**event_row(case.name, group, 'levelled'),
           'ALIGNED': sum(bool(each['declared']) for each in group),
           'least heading sigma, deg': cell(
               min, (each['least_heading_sigma_deg'] for each in group), '.1f')}
@@ -117,7 +117,7 @@ LEVER_LEFT_OUT = 'lever arm left out', 'several of these'
 
 def draw(index: int) -> Case:
     """Draw a run of ``declare``."""
-    fault, scenario, grade = combination(index, [], FAULTS, SCENARIOS, GRADES)
+    fault, scenario, grade = combination(index, [], FAULTS, CAMPAIGN_SCENARIOS, GRADES)
     random = np.random.default_rng([1, index])
     arguments: JsonDict = {
         'duration': DURATION, 'lever_arm': random.uniform(-1.5, 1.5, 3).tolist(),
@@ -143,7 +143,7 @@ SILENT = tuple(Case(scenario, ((scenario, 'mems'),), None, {'duration': SILENT_D
 def time_to_heading(runs: int, jobs: int | None) -> list[JsonDict]:
     """Return the times to a declared heading, where and when its bound meets the threshold."""
     cases = [time_case(*kind)
-             for kind in itertools.product((*SCENARIOS, 'robot'), GRADES, (True, False))]
+             for kind in itertools.product((*CAMPAIGN_SCENARIOS, 'robot'), GRADES, (True, False))]
     [crossings] = parallel(crossing_time, [cases], jobs, 'bounds')
     reachable = [each for each in zip(cases, crossings) if each[1] is not None]
     seeds = range(TIME_SEED, TIME_SEED + runs)
@@ -230,23 +230,23 @@ def run_worse(report: Report, runs: int, jobs: int | None, data: Path | None) ->
     [found] = parallel(run_case, [[(draw_worse, seed) for seed in range(runs)]],
                        jobs, 'declare-worse')
     report.text(
-        f'{runs} runs of {DURATION:g} s over all scenarios ({", ".join(SCENARIOS)}), half '
-        f'of them with {STAND_STILL:g} s at rest first, with random heading, latitude, mount and '
-        'lever arm, configured as `mems` with the right lever arm. A fault has the runs in which '
-        'it is alone and those of its pairs.')
+        f'{runs} runs of {DURATION:g} s over all scenarios ({", ".join(CAMPAIGN_SCENARIOS)}), '
+        f'half of them with {STAND_STILL:g} s at rest first, with random heading, latitude, mount '
+        'and lever arm, configured as `mems` with the right lever arm. A fault has the runs in '
+        'which it is alone and those of its pairs.')
     alone = groups_of(found, ('none', *WORSE))
     pairs = [(f'{name}, in pairs', [each for each in found if PAIR in each['name']
                                     and name in each['name'].split(PAIR)]) for name in WORSE]
     groups = [*alone[:-1], *pairs, alone[-1]]
     for title, kind in (('First declared LEVELLED (or ALIGNED at once)', 'levelled'),
                         ('First declared ALIGNED', 'declared')):
-        report.table(title, [moment_row(*group, kind) for group in groups])
+        report.table(title, [event_row(*group, kind) for group in groups])
     return {'runs': found}
 
 
 def draw_worse(seed: int) -> Case:
     """Draw a run of ``declare-worse``."""
-    faults, scenario = combination(seed, [3], COMBINATIONS, SCENARIOS)
+    faults, scenario = combination(seed, [3], COMBINATIONS, CAMPAIGN_SCENARIOS)
     random = np.random.default_rng([4, seed])
     arguments = {'duration': DURATION, **setup(random),
                  'stand_still': STAND_STILL * random.integers(2)}
@@ -258,7 +258,7 @@ def draw_worse(seed: int) -> Case:
 
 # settings: everything is as configured
 
-MOVING = tuple(name for name in SCENARIOS if name not in ('straight', 'static'))
+MOVING = tuple(name for name in CAMPAIGN_SCENARIOS if name not in ('straight', 'static'))
 # What the GNSS measures, and the parameters that say so.
 HORIZONTAL = 'horizontal velocities'
 MEASURED: dict[str, JsonDict] = {
@@ -302,7 +302,7 @@ def draw_settings(seed: int) -> Case:
         'gnss_rate': gnss_rate, 'imu_rate': max(one_of(25, 50, 100, 200, 400), 2 * gnss_rate),
         'imu_jitter': one_of(0, 0, 0.3), 'gnss_delay': one_of(0, 0, 0.05, 0.15),
         'velocity_std': one_of(0.02, 0.1, 0.3), 'position_std': one_of(0.02, 0.5, 2.5),
-        **errors_of(PRESETS[grade])}
+        **imu_errors_of(PRESETS[grade])}
     config = {
         'lever_arm': tuple((lever_arm + lever_std * random.standard_normal(3)).tolist()),
         'lever_arm_std': lever_std, **MEASURED[measured],

@@ -32,7 +32,7 @@ from ins_align.experiments.common import (
     beyond, Case, cell, combination, follow, GRADES, groups_of, JsonDict, outcome, parallel,
     prepare, Report, setup, SIGMA_LIMITS, worst)
 from ins_align.experiments.spoilt import FAULTS, Random, SECOND, SENSORS, Stream
-from ins_align.simulation.simulate import SCENARIOS
+from ins_align.simulation.simulate import CAMPAIGN_SCENARIOS
 import numpy as np
 
 DURATION = 60.0
@@ -50,8 +50,8 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     [found] = parallel(run_watched, [range(runs)], jobs, 'faults')
     report.text(
         f'{runs} runs of {DURATION:g} s over {len(FAULTS)} faults, all scenarios '
-        f'({", ".join(SCENARIOS)}) and grades of IMU, with random heading, latitude, mount, '
-        'lever arm, velocity message and frame. The fault is in the messages; nothing is '
+        f'({", ".join(CAMPAIGN_SCENARIOS)}) and grades of IMU, with random heading, latitude, '
+        'mount, lever arm, velocity message and frame. The fault is in the messages; nothing is '
         'configured but what the name of the fault says. Samples come one by one or many at a '
         'time. Runs are counted that end in an exception, that yield a number that is not finite '
         'or an attitude that is no rotation, that have a counter which does not fit what was '
@@ -64,7 +64,7 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
 
 def draw(index: int) -> Case:
     """Draw a run; its `spoil` also draws the size of IMU batches and the times of updates."""
-    fault, scenario, grade = combination(index, [3], FAULTS, SCENARIOS, GRADES)
+    fault, scenario, grade = combination(index, [3], FAULTS, CAMPAIGN_SCENARIOS, GRADES)
     random = np.random.default_rng([4, index])
     arguments = {'duration': DURATION, **setup(random)}
     config = {'gnss_lateness': Config().gnss_lateness, 'velocity_type': str(random.choice(

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 from ins_align.experiments import ExperimentError
 from ins_align.experiments.common import (
-    beyond, cell, errors_of, JsonDict, moment, parallel, Report, SIGMA_LIMITS, while_aligned,
+    beyond, cell, errors_of, JsonDict, judged, parallel, Report, SIGMA_LIMITS, while_aligned,
     worst)
 from ins_align.experiments.spoilt import SECOND
 from ins_align.geometry.rotation import Array
@@ -169,7 +169,7 @@ def at_times(recording: Recording, epochs: list[Epoch]) -> dict[str, JsonDict]:
     shown = [epoch for epoch in epochs if epoch.current is not None]
     errors = errors_of([epoch.current for epoch in shown], recording.attitudes_at,
                        recording.reference_std_deg)
-    known = [moment(epoch.t_s, [error]) for epoch, error in zip(shown, errors)
+    known = [judged(epoch.t_s, [error]) for epoch, error in zip(shown, errors)
              if error is not None]
     found = {}
     for time in TIMES:
@@ -220,9 +220,9 @@ def methods_of(path: Path) -> dict[str, JsonDict]:
 
 # Rows of tables, each from a name and the results of its windows
 
-def _both(moments: list[JsonDict], name: str) -> str | None:
+def _both(events: list[JsonDict], name: str) -> str | None:
     """Return the median and the largest value of a named error."""
-    values = [moment[name] for moment in moments]
+    values = [event[name] for event in events]
     return f'{np.median(values):.2g} / {np.max(values):.2g}' if values else None
 
 

@@ -208,7 +208,7 @@ CAR, FLIGHT, HOVER, LAUNCH = (((scenario, 'mems'),)
 MIXED = tuple(product(('flight', 'car', 'hover'), ('mems', 'tactical')))
 CHIPS = tuple((scenario, 'chip') for scenario in ('car', 'flight', 'launch', 'hover'))
 OF_CHIPS = {'imu_grade': 'chip', **CHIP_THRESHOLDS}
-TOLD = {'gnss_delay_std': 0.0, 'lever_arm_std': 0.05}   # configured as known
+CERTAIN = {'gnss_delay_std': 0.0, 'lever_arm_std': 0.05}   # configured as known
 LONG, LONGER, QUARTER_HOUR = {'duration': 120.0}, {'duration': 150.0}, {'duration': 900.0}
 NOISELESS = {'velocity_std': 0.0}       # what spoils the messages adds the noise
 RTK, WANDERING = {'position_std': 0.05}, {'position_std': 0.5, 'position_drift_std': 1.5}
@@ -224,11 +224,11 @@ SPOTS = tuple(case._replace(simulate={'duration': DURATION, **case.simulate}) fo
            {'duration': rest + 90.0, 'stand_still': rest}, OF_CHIPS, part=part)
       for rest, part in ((20.0, 1), (120.0, 2))),
     # Wrong configurations
-    Case('told for certain, and right', MIXED, config=TOLD),
+    Case('told for certain, and right', MIXED, config=CERTAIN),
     *(Case(f'told for certain, delay {by:g} s off', MIXED, simulate={'gnss_delay': by},
-           config=TOLD) for by in (0.05, 0.1, 0.2)),
+           config=CERTAIN) for by in (0.05, 0.1, 0.2)),
     *(Case(f'told for certain, lever arm {off:g} m off', MIXED, partial(_told_lever, off=off),
-           config=TOLD) for off in (1.0, 2.0)),
+           config=CERTAIN) for off in (1.0, 2.0)),
     Case('MEMS told to be tactical', CAR + FLIGHT, None, LONG, {'imu_grade': 'tactical'}),
     Case('tactical told to be navigation', (('car', 'tactical'), ('flight', 'tactical')), None,
          LONG, {'imu_grade': 'navigation'}),

@@ -25,7 +25,7 @@ from ins_align.config import Config
 from ins_align.gnss.messages import Fix, fixes, MessageError, stamp_from_msg, velocities, Velocity
 import numpy as np
 
-FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
+FRD_SIGNS = np.array([1.0, -1.0, -1.0])
 UTC_KNOWN = 3  # bits of date and time in the field valid of UBX-NAV-PVT
 
 
@@ -135,8 +135,8 @@ def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velo
 def imu_from_driver(msg: Any, msgtype: str) -> tuple[int, np.ndarray, np.ndarray]:
     """Return ns, rad/s and m/s^2 of px4_msgs/SensorCombined; MessageError: a field is missing."""
     try:
-        return (_microseconds_ns(msg), FLU_FROM_FRD * np.asarray(msg.gyro_rad, float),
-                FLU_FROM_FRD * np.asarray(msg.accelerometer_m_s2, float))
+        return (_microseconds_ns(msg), FRD_SIGNS * np.asarray(msg.gyro_rad, float),
+                FRD_SIGNS * np.asarray(msg.accelerometer_m_s2, float))
     except AttributeError as error:
         raise _no_field(msgtype, error) from None
 

@@ -59,7 +59,7 @@ class Prediction:
         self._rate_variance = gyro_bias_std ** 2 + EARTH_RATE ** 2
         self._longest_step, self._gaps_variance = GAP_STEPS * interval, 0.0
 
-    def carry(self, stamp_ns: int, gyro: Sequence[float]) -> bool:
+    def propagate(self, stamp_ns: int, gyro: Sequence[float]) -> bool:
         """
         Carry on to a sample (rad/s), with the mean of its rate and that of the last one.
 
@@ -142,10 +142,10 @@ class Follower:
             return  # its sample has not arrived here or is no longer kept: wait for the next one
         self._prediction = prediction
         for stamp_ns, gyro in reversed(since):
-            prediction.carry(stamp_ns, gyro)
+            prediction.propagate(stamp_ns, gyro)
 
     def follow(self, stamp_ns: int, gyro: Sequence[float]) -> Prediction | None:
         """Add a sample and return the prediction at its stamp; None while there is none."""
         self._samples.append((stamp_ns, gyro))
         now = self._prediction
-        return now if now is not None and now.carry(stamp_ns, gyro) else None
+        return now if now is not None and now.propagate(stamp_ns, gyro) else None

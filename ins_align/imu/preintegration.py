@@ -51,10 +51,10 @@ class SensorErrors(NamedTuple):
     @staticmethod
     def none() -> 'SensorErrors':
         """Return the errors of perfect sensors, zero."""
-        return SensorErrors.of(np.zeros(24))
+        return SensorErrors.from_vector(np.zeros(24))
 
     @staticmethod
-    def of(vector: Array) -> 'SensorErrors':
+    def from_vector(vector: Array) -> 'SensorErrors':
         """Return the errors in a vector, shape (24,), with the matrices row by row."""
         return SensorErrors(vector[:3], vector[3:12].reshape(3, 3), vector[12:15],
                             vector[15:].reshape(3, 3))

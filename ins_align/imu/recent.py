@@ -27,11 +27,11 @@ from ins_align.geometry.rotation import Array, cross, Index, rotated
 import numpy as np
 
 # Seconds between the ages, and their number: the last one is the largest delay.
-RUNG, RUNGS = 0.025, 40
-AGES = RUNG * np.arange(1, RUNGS + 1)
+AGE_STEP, AGE_COUNT = 0.025, 40
+AGES = AGE_STEP * np.arange(1, AGE_COUNT + 1)
 # Between samples this far apart (s) the motion is unknown.
 UNKNOWN_STEP = 0.3
-# A cubic through rungs this many apart takes vibration out of force and rate.
+# A cubic through ages this many apart takes vibration out of force and rate.
 SMOOTH = 2
 # Coefficients of the cubics that are 1 at one of the places 0, 1, 2, 3 and 0 at the others.
 CUBIC = np.linalg.inv(np.vander(np.arange(4.0), increasing=True))
@@ -40,8 +40,9 @@ CUBIC = np.linalg.inv(np.vander(np.arange(4.0), increasing=True))
 class Recent(NamedTuple):
     """Integrals from each of `AGES` before an epoch up to it, for K epochs."""
 
-    gained: Array       # (K, RUNGS, 3), of the specific force, m/s, in the body frame at the epoch
-    turned: Array       # (K, RUNGS, 3), rotation vector of the body, rad
+    # (K, AGE_COUNT, 3), of the specific force, m/s, in the body frame at the epoch
+    gained: Array
+    turned: Array       # (K, AGE_COUNT, 3), rotation vector of the body, rad
 
 
 def recent_motion(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Recent:
@@ -75,7 +76,7 @@ def recent_motion(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Recent:
     middle = (0.5 * (samples[:, :-1] + samples[:, 1:])).take(step.T, axis=1).T
     both = _seen_from_epoch(dt, middle[..., :3], middle[..., 3:])
     sums = np.cumsum(dt * both, axis=1)
-    # The integral up to a rung: over the steps before, and over part of the one that it is in.
+    # The integral up to a step: over the steps before, and over part of the one that it is in.
     own = np.clip(rungs - first[:, None], 0, step.shape[1] - 1)
     rows = np.arange(epochs_ns.size)[:, None]
     before = (sums[rows, own]
@@ -106,25 +107,25 @@ def _seen_from_epoch(dt: Array, rate: Array, force: Array) -> Array:
     return np.concatenate([force, rate], axis=-1)
 
 
-def exact(integrals: Array, age: float) -> tuple[Array, Array, Array]:
+def interpolated(integrals: Array, age: float) -> tuple[Array, Array, Array]:
     """
     Return a force or rate at an age, and its integral and double integral from age 0, each (K, 3).
 
-    Interpolates the integrals of `Recent`, (K, RUNGS, 3); extrapolates to negative ages.
+    Interpolates the integrals of `Recent`, (K, AGE_COUNT, 3); extrapolates to negative ages.
     """
     there, value, _ = _cubic(age, 1)
-    rung = min(max(int(age / RUNG), 0), RUNGS - 1)
-    rest = age - rung * RUNG
+    step = min(max(int(age / AGE_STEP), 0), AGE_COUNT - 1)
+    rest = age - step * AGE_STEP
     trapezoids = 0.5 * rest * there
-    trapezoids[1:rung] += RUNG
-    trapezoids[rung] += 0.5 * (RUNG + rest)
-    # The weights begin with the rung at age 0, where the integrals are 0.
+    trapezoids[1:step] += AGE_STEP
+    trapezoids[step] += 0.5 * (AGE_STEP + rest)
+    # The weights begin with the step at age 0, where the integrals are 0.
     value, integral, double_integral = (weights[1:] @ integrals
                                         for weights in (value, there, trapezoids))
     return value, integral, double_integral
 
 
-def smooth(integrals: Array, age: float) -> tuple[Array, Array]:
+def smoothed(integrals: Array, age: float) -> tuple[Array, Array]:
     """Return a force or rate at an age, without vibration, and its derivative to the age."""
     _, value, change = _cubic(age, SMOOTH)
     return value[1:] @ integrals, change[1:] @ integrals
@@ -138,12 +139,12 @@ def _cubic(age: float, apart: int) -> tuple[Array, Array, Array]:
     The cubic goes through four rungs near the age, `apart` rungs from each other: more for a
     negative age, so that it is extrapolated by no more than their distance.
     """
-    apart = min(max(math.ceil(-age / RUNG), apart), RUNGS // 3)
-    x = age / (apart * RUNG)
-    first = min(max(int(x) - 1, 0), RUNGS // apart - 3)
+    apart = min(max(math.ceil(-age / AGE_STEP), apart), AGE_COUNT // 3)
+    x = age / (apart * AGE_STEP)
+    first = min(max(int(x) - 1, 0), AGE_COUNT // apart - 3)
     x -= first
-    weights = np.zeros((3, 1 + RUNGS))
+    weights = np.zeros((3, 1 + AGE_COUNT))
     weights[:, apart * first + apart * np.arange(4)] = np.array(
         [[1, x, x * x, x ** 3], [0, 1, 2 * x, 3 * x * x], [0, 0, 2, 6 * x]]) @ CUBIC
-    change, bend = weights[1] / (apart * RUNG), weights[2] / (apart * RUNG) ** 2
+    change, bend = weights[1] / (apart * AGE_STEP), weights[2] / (apart * AGE_STEP) ** 2
     return weights[0], change, bend

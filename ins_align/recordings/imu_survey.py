@@ -29,7 +29,7 @@ from ins_align.recordings.topic_survey import rounded, Surveyed
 import numpy as np
 
 WINDOW = 2.0  # s, the length of a window in which noise is measured
-QUIET = 0.1  # quantile of the windows' noise that is taken in motion, where motion adds least
+QUIET_QUANTILE = 0.1  # of the windows' noise, taken in motion, where motion adds least
 AVERAGING = 0.1  # s: noise of filtered sensors is white only over several samples
 NOISE_MARGIN = 1.5  # times a preset's noise that the preset still covers
 BIAS_SIGMAS = 2.5  # times a preset's sigma of a bias that the preset still covers
@@ -104,7 +104,7 @@ def _add_noise(imu: Surveyed, samples: Series, rest: tuple[float, float] | None,
         return
     widths = np.array([_add_resolution(imu, sensor, triad)
                        for sensor, triad in zip(SENSORS, np.split(values, 2, axis=1))])
-    walks = _walks(times[part], values[part], 0.5 if rest else QUIET)
+    walks = _walks(times[part], values[part], 0.5 if rest else QUIET_QUANTILE)
     root = math.sqrt(np.median(np.diff(times)))
     # With noise of half a quantum or more, rounding errors average out; with less they last.
     hidden = walks < widths * root

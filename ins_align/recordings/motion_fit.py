@@ -49,7 +49,7 @@ VELOCITY_STD = 0.2
 PRIOR_STD = np.repeat([1e4, 1e4, math.radians(0.5), 3.0, 0.5], 3)
 MAX_ROTATION_STD = 0.2  # rad: a window whose rotation is less well known does not show the delay
 OUTLIER = 6.0  # times the median size of residuals
-LONGEST = 3600.0  # s of the data, from the first motion on, that are fitted: bounds the memory
+MAX_FITTED_TIME = 3600.0  # s, from the first motion on, which bounds the memory
 
 
 class _Imu:
@@ -104,7 +104,7 @@ def fit_motion(samples: Series, velocities: Series, gravity: float,
     measurement by the clock of the IMU), ``gnss_delay_std``, ``velocity_noise`` (horizontal, per
     axis), ``velocity_noise_vertical``.
     """
-    found = _fit_motion(samples, velocities, gravity, offsets, LONGEST)
+    found = _fit_motion(samples, velocities, gravity, offsets, MAX_FITTED_TIME)
     if 'gnss_delay' in found and (
             abs(found['gnss_delay']) + 3.0 * found['gnss_delay_std'] < USUAL_DELAY):
         return found

@@ -112,7 +112,7 @@ class _Results:
                     break
             elif stamp_ns > min(prediction.stamp_ns + MAX_GAP_NS, epoch_ns + MAX_AGE_NS):
                 prediction = None
-            elif prediction.carry(stamp_ns, gyro.tolist()) or stamp_ns == epoch_ns:
+            elif prediction.propagate(stamp_ns, gyro.tolist()) or stamp_ns == epoch_ns:
                 yield 'imu', time_ns, self._imu(prediction, data, gyro, accel)
         for epoch in epochs:
             yield from self._of_epoch(epoch, time_ns)

@@ -37,7 +37,7 @@ _MAX_SAMPLES = 20_000_000
 _MAXIMA = {field.name: field.metadata['maximum'] for field in dataclasses.fields(Config)}
 
 
-def errors_of(noise: ImuNoise) -> dict[str, float]:
+def imu_errors_of(noise: ImuNoise) -> dict[str, float]:
     """
     Return the arguments of an IMU that has all errors which the estimator expects of its grade.
 
@@ -50,7 +50,7 @@ def errors_of(noise: ImuNoise) -> dict[str, float]:
 
 
 # Defaults of the grade chip; the other grades have only noise and biases by default.
-_CHIP_ERRORS = errors_of(PRESETS['chip'])
+_CHIP_ERRORS = imu_errors_of(PRESETS['chip'])
 
 
 class SimulationError(UsageError):

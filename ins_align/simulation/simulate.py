@@ -42,7 +42,7 @@ from ins_align.simulation.scenarios import displaced, START_NS, Trajectory, traj
 import numpy as np
 
 # Scenarios that the experiments draw from: one more would change all their runs.
-SCENARIOS = tuple(scenarios.SCENARIOS)[:8]
+CAMPAIGN_SCENARIOS = tuple(scenarios.SCENARIOS)[:8]
 STORAGES = ('mcap', 'sqlite3')
 TOPICS = {'/imu/data_raw': 'sensor_msgs/msg/Imu', '/reference/imu': 'sensor_msgs/msg/Imu',
           '/fix': 'sensor_msgs/msg/NavSatFix',
@@ -134,7 +134,7 @@ def give(aligner: Any, kind: str, payload: Any) -> None:
 
 def simulate(scenario: str, **options: Any) -> Simulation:
     """
-    Simulate the sensors of a vehicle that moves as one of `SCENARIOS`.
+    Simulate the sensors of a vehicle that moves as one of `scenarios.SCENARIOS`.
 
     The options are the fields of `Arguments`, in SI units except where the name says degrees. A
     SimulationError says which one makes no sense.
