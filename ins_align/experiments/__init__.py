@@ -31,9 +31,9 @@ NAMES = {
     'declare': ('Declared means right', 'declare.run', 1000),
     'declare-worse': ('IMUs worse than configured', 'declare.run_worse', 500),
     'faults': ('What drivers get wrong', 'faults.run', 1000),
-    'weak-spots': ('Where it is wrong and sure of itself', 'weak_spots.run', 24),
-    'vehicle': ('What a vehicle knows of its motion', 'weak_spots.run_vehicle', 24),
-    'settings': ('Right whatever the settings', 'declare.run_settings', 200),
+    'weak-spots': ('Faults that are hard to see', 'weak_spots.run', 24),
+    'vehicle': ('The motion of a vehicle as a constraint', 'weak_spots.run_vehicle', 24),
+    'settings': ('Correct configurations of all kinds', 'declare.run_settings', 200),
     'recordings': ('Real recordings', 'recordings.run', 0)}
 # Experiments that need recordings, and those that use them where there are some.
 NEED_DATA, TAKE_DATA = ('recordings',), ('vehicle', 'recordings')

@@ -188,8 +188,9 @@ def time_table(report: Report, waits: list[JsonDict]) -> None:
     met = [wait['ratio'] <= WAIT_LIMIT for wait in waits if wait['exact']]
     report.table(
         f'Time to a declared heading of {THRESHOLD_DEG:g} deg: median, and when the Cramer-Rao '
-        f'bound crosses it within {HORIZON:g} s. All known: noise, lever arm and delay, with a '
-        'threshold as large for the tilt; else the defaults, lever arm '
+        f'bound crosses it within {HORIZON:g} s, which is that of the heading at t0: the present '
+        'one, which a declaration waits for, may be known sooner. All known: noise, lever arm and '
+        'delay, with a threshold as large for the tilt; else the defaults, lever arm '
         f'({default.lever_arm_std:g} m) and delay ({default.gnss_delay_std:g} s) unknown to the '
         f'bound too. A declaration has to hold for {default.hold_time:g} s. With all known, '
         f'{sum(met)} of {len(met)} ratios are at most {WAIT_LIMIT:g} (target: all)',
@@ -271,8 +272,8 @@ def run_settings(report: Report, runs: int, jobs: int | None, data: Path | None)
     [found] = parallel(run_case, [[(draw_settings, seed) for seed in range(runs)]], jobs,
                        'settings')
     report.text(
-        f'{runs} runs that have nothing wrong and are configured as they are, but for noise that '
-        f'half of the receivers do not state: motions ({", ".join(MOVING)}) after up to three '
+        f'{runs} runs without faults that are configured correctly, except that half of the '
+        f'receivers do not state their noise: motions ({", ".join(MOVING)}) after up to three '
         'minutes at rest, IMUs at 25 to 400 Hz mounted in any way, GNSS at 1 to 20 Hz, '
         'velocities of 0.02 to 0.3 m/s, positions of 0.02 to 2.5 m, delays to 0.15 s, lever arms '
         'to 12 m that are known to 0.05 or 1 m per axis.')

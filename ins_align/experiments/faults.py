@@ -56,7 +56,7 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         'time. Runs are counted that end in an exception, that yield a number that is not finite '
         'or an attitude that is no rotation, that have a counter which does not fit what was '
         'sent, that make numpy warn. Errors are those at declarations and at the end; held is '
-        f'the most that an aligner holds, pickled, of {MAX_HELD * 1e-6:g} MB that it may.')
+        f'the largest size of a pickled aligner, of which {MAX_HELD * 1e-6:g} MB are allowed.')
     report.table('What became of it, by fault',
                  [row_of(*group) for group in groups_of(found, FAULTS) if group[1]])
     return {'runs': found}

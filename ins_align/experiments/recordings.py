@@ -83,10 +83,10 @@ class Recording(NamedTuple):
                 'velocities': [each for each in messages if isinstance(each, Velocity)]}
 
 
-def recordings_in(folder: Path) -> list[Path]:
-    """Return the recordings in a folder that carry a reference."""
+def recordings_in(folder: Path, pattern: str = '*') -> list[Path]:
+    """Return the recordings in a folder that carry a reference, of names that fit a pattern."""
     paths = []
-    for path in sorted(folder.iterdir()):
+    for path in sorted(folder.glob(pattern)):
         try:
             load(path)
             paths.append(path)
@@ -173,7 +173,7 @@ def at_times(recording: Recording, epochs: list[Epoch]) -> dict[str, JsonDict]:
              if error is not None]
     found = {}
     for time in TIMES:
-        before = [each for each in known if each['t_s'] <= time + 1e-6] or known[:1]
+        before = [each for each in known if each['t_s'] <= time + 1e-6]
         if before and known[-1]['t_s'] >= time - 1.5:
             found[f'{time:g}'] = before[-1]
     return found

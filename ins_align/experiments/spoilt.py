@@ -82,7 +82,8 @@ class Stream:
     def true_stamps(self, stamps: Any) -> Any:
         """Return the times of the simulation, ns, that belong to stamps."""
         edges, offsets = map(np.asarray, self.clock)
-        return np.clip(stamps - offsets[np.searchsorted(edges, stamps)], self.first, self.last)
+        passed = np.searchsorted(edges, stamps, side='right')
+        return np.clip(stamps - offsets[passed], self.first, self.last)
 
     def stamp_imu(self, stamps: np.ndarray) -> None:
         """Stamp IMU samples anew; they still arrive when they are measured."""

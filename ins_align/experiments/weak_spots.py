@@ -312,7 +312,7 @@ SPOTS = tuple(case._replace(simulate={'duration': DURATION, **case.simulate}) fo
 ))
 
 
-# What a vehicle knows of its motion
+# The motion of a vehicle as a constraint
 
 def _mounted(seed: int, mount_deg: tuple[float, ...] = ()) -> JsonDict:
     """Draw the course and, unless it is given, the mounting error (roll, pitch, yaw; deg)."""
@@ -364,16 +364,18 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     found = run_cases(run_case, SPOTS, runs, jobs)
     report.text(
         f'{runs} runs of each case, fewer where they are long, of {DURATION:g} s unless the case '
-        'needs more. Car and flight in turn, or a hover, a throw, all of these; MEMS grade unless '
-        'said otherwise; nothing is configured but what the case says.')
+        'needs more. Car and flight alternate, or hover, throw or all of these; MEMS grade unless '
+        'the case says otherwise; nothing is configured but what it says.')
     report.table('Weak spots', [aligned_row(*each) for each in found])
     return {'runs': runs, 'cases': dict(found)}
 
 
 def run_vehicle(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``vehicle``, with the recorded car if `data` has it."""
-    from ins_align.experiments.recordings import declared_row, run_window, STEP, windows_of
+    from ins_align.experiments.recordings import (
+        declared_row, recordings_in, run_window, STEP, windows_of)
 
+    paths = recordings_in(data, f'{RECORDING}*')[:1] if data else []
     found = run_cases(run_case, VEHICLE_SPOTS, runs, jobs)
     report.text(
         f'{runs} runs of each case, MEMS, GNSS velocity 0.1 m/s at 5 Hz, the mounting off by '
@@ -384,7 +386,7 @@ def run_vehicle(report: Report, runs: int, jobs: int | None, data: Path | None) 
     report.table('Simulated', [{**aligned_row(name, group), 'not used': sum(
         'contradicts vehicle' in each['reason'] for each in group)} for name, group in found])
     recorded: Groups = []
-    for path in sorted(data.glob(f'{RECORDING}*'))[:1] if data else ():
+    for path in paths:
         recorded = list(zip(RECORDED, parallel(
             run_window, [windows_of(path, config) for config in RECORDED.values()], jobs,
             'recorded car')))

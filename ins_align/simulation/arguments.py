@@ -86,7 +86,8 @@ class Arguments:
     ideal: bool = False
     outages: Sequence[tuple[float, float]] = ()
 
-    imu_rate: float = _imu(100.0, 'samples per second', 'Hz', 1e-3, 1e4)
+    # At higher rates rounding of perfect readings would show beside the noise of the best grade.
+    imu_rate: float = _imu(100.0, 'samples per second', 'Hz', 1e-3, 1e3)
     imu_jitter: float = _imu(0.0, 'samples are off their time by up to this part of the interval '
                              'between them; stamps tell the displaced instants', '1', 0.0, 0.49)
     lever_arm: Sequence[float] = _imu(
@@ -96,12 +97,14 @@ class Arguments:
         (0.0, 0.0, 0.0), 'attitude of the IMU in the vehicle', 'deg', -math.inf,
         names=('ROLL', 'PITCH', 'YAW'))
     gyro_bias_std: float | None = _imu(
-        None, "gyroscope bias, 1 sigma per axis; default: the grade's", 'rad/s')
+        None, "gyroscope bias, 1 sigma per axis; default: the grade's", 'rad/s', 0.0,
+        math.radians(_MAXIMA['gyro_bias_std']))
     accel_bias_std: float | None = _imu(
-        None, "accelerometer bias, 1 sigma per axis; default: the grade's", 'm/s^2')
+        None, "accelerometer bias, 1 sigma per axis; default: the grade's", 'm/s^2', 0.0,
+        _MAXIMA['accel_bias_std'])
     accel_bias: Sequence[float] | None = _imu(
-        None, 'accelerometer bias itself, instead of a drawn one', 'm/s^2', -math.inf,
-        names=('X', 'Y', 'Z'))
+        None, 'accelerometer bias itself, instead of a drawn one', 'm/s^2',
+        -_MAXIMA['accel_bias_std'], _MAXIMA['accel_bias_std'], names=('X', 'Y', 'Z'))
     gyro_scale_std: float | None = _imu(
         None, 'scale factor error of each gyroscope, 1 sigma, 0.01 is one percent; default: 0, '
         'of a chip what its grade states', '1', 0.0, _MAXIMA['gyro_scale_std'])
@@ -114,7 +117,7 @@ class Arguments:
         None, 'the same of the accelerometers: misalignment', '1')
     rate_random_walk: float | None = _imu(
         None, 'how the biases of the gyroscopes change; default: 0, of a chip what its grade '
-        'states', 'rad/s/sqrt(s)')
+        'states', 'rad/s/sqrt(s)', 0.0, math.radians(_MAXIMA['rate_random_walk']) / 60)
     dead_band: Sequence[float] = _imu(
         (0.0, 0.0), 'gyroscopes and accelerometers read 0 below this', 'rad/s and m/s^2',
         names=('GYRO', 'ACCEL'))
