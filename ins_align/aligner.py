@@ -101,6 +101,7 @@ class Aligner:
         self._force_check = ForceCheck()
         self._counts_before = Counter(self._counts)
         self._first_fix_ns: int | None = None
+        self._before_ns = 0                         # stamp of the last GNSS message before t0
         self._queued: list[AntennaEpoch] = []       # epochs that wait for steps 4 to 8
         self._last_ns: int | None = None            # stamp of the last epoch; None before t0
         self._start_ns = self._measured_ns = 0      # first epoch; last one with a measurement
@@ -166,6 +167,7 @@ class Aligner:
 
     def reset(self, reason: str = 'on request') -> None:
         """Start over from nothing, for a reason in words."""
+        self._process()                             # messages before it are counted
         self._counts['resets'] += 1
         self._start_over(reason)
 
@@ -209,7 +211,7 @@ class Aligner:
             if left_out := self._left_out('imu'):
                 self._wait(State.WAITING_FOR_IMU, 'no IMU sample of use yet', left_out)
             return
-        for message in self._gnss.release(upto_ns, last):
+        for message in self._gnss.release(upto_ns, last, self._imu.due_ns):
             self._bridge_outage(message.stamp_ns)
             self._queue(message)
         waiting_ns = self._gnss.oldest_ns
@@ -224,6 +226,10 @@ class Aligner:
                 self._wait(State.WAITING_FOR_IMU, NO_SAMPLE)
             elif self._first_fix_ns is None:
                 self._wait(State.WAITING_FOR_GNSS, 'no GNSS position yet', self._left_out('fix'))
+            elif (self._verdict.state is State.WAITING_FOR_IMU
+                  and upto_ns - self._before_ns > NO_VELOCITY_NS):
+                self._wait(State.WAITING_FOR_GNSS,
+                           f'no GNSS for {(upto_ns - self._before_ns) * 1e-9:.0f} s')
 
     def _queue(self, message: GnssEpoch) -> None:
         """Make an epoch of GNSS messages: t0, or one that waits for steps 4 to 8."""
@@ -236,6 +242,7 @@ class Aligner:
             self._restart('the position jumped')
             epoch = self._antenna.epoch(message)
         if self._last_ns is None:
+            self._before_ns = message.stamp_ns
             if epoch is not None:
                 self._start(epoch)
             self._counts['epochs_before_start'] += self._last_ns is None
@@ -268,6 +275,11 @@ class Aligner:
         """Decide on the state after an epoch, and append the `Epoch` to the output."""
         # 6. The fit holds what the rival hypotheses object.
         fit = method.fit()
+        if method.restarted:
+            self._counts['restarts'] += 1
+            self._announce_restart(method.restarted)
+            self.declared = self._time_to_align_s = None
+            method.restarted = ''
         # 7. The declaration decides on the state and words the reason.
         verdict = self._decide(epoch, method, fit)
         if epoch.v_n is not None:
@@ -298,7 +310,8 @@ class Aligner:
         stamp_ns, declaration = epoch.stamp_ns, self._declaration
         initial, current = method.initial(), method.current()
         self._initial = self._current = None
-        measured = epoch.v_n is not None or epoch.position_measured
+        measured = epoch.v_n is not None or (
+            epoch.position_measured and self.config.use_position is not False)
         if measured:
             self._measured_ns = stamp_ns
         silent_s = (stamp_ns - self._measured_ns) * 1e-9
@@ -320,10 +333,10 @@ class Aligner:
 
     def _start(self, epoch: AntennaEpoch) -> None:
         """Make an epoch t0 if possible; otherwise say what is missing."""
-        if not epoch.position_measured:
-            return
-        if self._first_fix_ns is None:
+        if self._first_fix_ns is None and epoch.position_measured:
             self._first_fix_ns = epoch.stamp_ns
+        if self._first_fix_ns is None or not (epoch.position_measured or epoch.v_n is not None):
+            return
         config = self.config
         wanted = config.use_velocity is not False
         alone = not wanted or (config.use_velocity == 'auto' and config.method != 'vif'

@@ -215,7 +215,8 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     for name, given, kind in (('fixes', fixes, Fix), ('velocities', velocities, Velocity)):
         if given is not None:
             found = _messages(name, given, kind, unit_ns, settings)
-            _check_clock(name, [message.stamp_ns for message in found], stamps_ns)
+            delay_ns = round(settings.gnss_delay * 1e9)
+            _check_clock(name, [message.stamp_ns - delay_ns for message in found], stamps_ns)
             gnss += found
     gnss.sort(key=lambda message: message.stamp_ns)
     # Each message follows the IMU samples up to its stamp.
@@ -274,7 +275,9 @@ def _check_clock(name: str, gnss_ns: list[int], imu_ns: Index) -> None:
 
 def _messages(name: str, given: Any, kind: type, unit_ns: float, config: Config) -> list[Any]:
     """Return fixes or velocities, from messages or from a table."""
-    if len(given) == 0 or all(isinstance(message, kind) for message in given):
+    if len(given) == 0:
+        return []
+    if all(isinstance(message, kind) for message in given):
         return list(given)
     table = _numbers(given)
     if table.ndim != 2 or table.shape[1] not in (4, 7, 13):

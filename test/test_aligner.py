@@ -149,6 +149,34 @@ def test_wanted_velocities_are_waited_for(flight, changes):
     assert 'no GNSS velocity' in status.reason
 
 
+@pytest.mark.parametrize('changes', (
+    {'use_velocity': True}, {'method': 'vif'}, {'use_position': False}))
+def test_fixes_and_velocities_of_different_epochs_start_together(flight, changes):
+    """Stamps that are 60 ms apart are not one epoch."""
+    aligner = Aligner(config_for(flight, **changes))
+    give_all(aligner, flight, change=lambda k, kind, message: message if kind == 'fix' else
+             message._replace(stamp_ns=message.stamp_ns + 60_000_000))
+    assert aligner.status().t0_ns is not None
+
+
+@pytest.mark.parametrize('imu_from_s, gnss_s', [(2.0, (1.2, 1.9)), (0.0, (0.0, 10.5))])
+def test_gnss_that_ends_before_a_start_is_the_reason(flight, imu_from_s, gnss_s):
+    """It is older than the IMU, or ends in a gap of the IMU."""
+    aligner = Aligner(config_for(flight, gnss_lateness=5.0))
+    seconds = (flight.gnss_stamps_ns - flight.imu_stamps_ns[0]) * 1e-9
+    t = (flight.imu_stamps_ns - flight.imu_stamps_ns[0]) * 1e-9
+    for k in np.flatnonzero((seconds >= gnss_s[0]) & (seconds < gnss_s[1])):
+        aligner.add_fix(flight.fix(k))
+        aligner.add_velocity(flight.velocity_measurement(k))
+    kept = (t >= imu_from_s) & ((t < 9.0) | (t > 11.0))
+    for block in np.array_split(np.flatnonzero(kept), 100):
+        aligner.add_imu(flight.imu_stamps_ns[block], flight.gyro[block], flight.accel[block])
+        aligner.update()
+    status = aligner.status()
+    assert status.state is State.WAITING_FOR_GNSS
+    assert re.fullmatch(r'no GNSS (position yet|for \d+ s)', status.reason)
+
+
 def test_epochs_tell_time_and_both_attitudes(flight, result):
     aligner, epochs = result
     assert [e.stamp_ns for e in epochs] == flight.gnss_stamps_ns.tolist()
@@ -205,6 +233,10 @@ def test_reset_starts_over(flight):
     assert aligner.declared is None and status.counts['resets'] == 1
     assert status.reason == 'no IMU sample since it started over'
     assert aligner.take_events()[-1] == (Severity.WARNING, 'alignment starts over: test')
+    before = status.counts['imu']
+    aligner.add_imu(flight.imu_stamps_ns[1600:1700], flight.gyro[:100], flight.accel[:100])
+    aligner.reset('test')
+    assert aligner.status().counts['imu'] == before + 100
     epochs = feed_part(aligner, flight, 15.0)
     assert aligner.status().t0_ns > flight.imu_stamps_ns[0] + 14 * SECOND
     assert epochs[0].t_s == 0.0
@@ -457,6 +489,7 @@ def test_positions_take_over_where_velocities_stop(use_position):
     assert error < chi2.ppf(0.9999, 3)
     assert (epochs[-1].state is State.ALIGNED) == (use_position == 'auto')
     assert (epochs[-1].current.sigma_deg[2] < 1.0) == (use_position == 'auto')
+    assert ('no GNSS for 60 s' in epochs[-1].reason) == (use_position is False)
 
 
 @pytest.mark.parametrize('until_s', (
@@ -665,6 +698,75 @@ def test_biases_outlive_a_second_loss_before_the_next_start(flight):
     assert status.counts['fix_jump'] >= 5 and status.counts['restarts'] == 1
     assert status.t0_ns > origin + 23 * SECOND
     assert np.all(status.gyro_bias_std <= 1.2 * before.gyro_bias_std)
+
+
+def test_biases_outlive_two_gaps_of_the_imu(flight):
+    """The second one comes before enough epochs for a start."""
+    aligner = Aligner(config_for(flight))
+    feed_part(aligner, flight, 0.0, 15.0)
+    before = aligner.status()
+    feed_part(aligner, flight, 15.7, 16.3)
+    feed_part(aligner, flight, 17.0)
+    status = aligner.status()
+    assert status.counts['restarts'] == 2
+    assert np.all(status.gyro_bias_std <= 1.2 * before.gyro_bias_std)
+
+
+@pytest.mark.parametrize('share', (0.02, 1.0))
+def test_when_somebody_looks_does_not_matter_to_samples_without_numbers(flight, share):
+    gyro = flight.gyro.copy()
+    seconds = (flight.imu_stamps_ns - flight.imu_stamps_ns[0]) * 1e-9
+    gyro[(seconds >= 15.025) & (seconds < 17.5)] = np.nan
+    random, results = np.random.default_rng(1), []
+    for often in (0.0, share):
+        aligner, place = Aligner(config_for(flight)), 0
+        for k, stamp in enumerate(flight.gnss_stamps_ns.tolist()):
+            until = np.searchsorted(flight.imu_stamps_ns, stamp)
+            for block in np.array_split(np.arange(place, until), 4):
+                aligner.add_imu(flight.imu_stamps_ns[block], gyro[block], flight.accel[block])
+                if random.random() < often:
+                    aligner.update()
+            place = until
+            aligner.add_fix(flight.fix(k))
+            aligner.add_velocity(flight.velocity_measurement(k))
+        aligner.flush()
+        results.append(aligner.status())
+    assert results[0].counts == results[1].counts and results[0].counts['restarts'] == 1
+    check_same_attitude(results[0].current, results[1].current)
+
+
+def test_a_bank_that_starts_again_by_itself_says_so(flight):
+    """Ten velocities in a row that are 50 m/s off."""
+    aligner = Aligner(config_for(flight))
+    give_all(aligner, flight, change=lambda k, kind, message: message if kind == 'fix' or not (
+        100 <= k < 111) else message._replace(velocity=message.velocity + [30.0, -40.0, 10.0]))
+    counts = aligner.status().counts
+    assert counts['restarts'] == 1 and counts.get('withdrawals', 0) == 0
+    assert (Severity.WARNING, 'alignment starts over: the last GNSS epochs do not fit the rest'
+            ) in aligner.take_events()
+
+
+def test_nothing_is_learnt_of_lever_arm_and_delay_at_rest():
+    """What the noise of the IMU looks like is no swing, and no delay."""
+    s = simulated('static', duration=60.0, velocity_std=0.03, gnss_delay=0.1, seed=1)
+    status = aligned(s, gnss_delay=0.0, gnss_delay_std=0.1, lever_arm_std=1.0)[0].status()
+    assert status.state is State.LEVELLED
+    assert status.gnss_delay == 0.0 and status.gnss_delay_std == pytest.approx(0.1, rel=0.01)
+    assert status.lever_arm_std == pytest.approx(1.0)
+
+
+def test_the_end_of_a_range_is_found_at_negative_stamps_too():
+    s = simulated('launch', imu_rate=200.0, duration=30.0, seed=1)
+    end = 0.65 * np.abs(s.gyro).max()
+    clipped = np.clip(s.gyro, -end, end)
+    counts = []
+    for shift in (0, int(s.imu_stamps_ns[0]) + 300 * SECOND):
+        other = replace(s, gyro=clipped, imu_stamps_ns=s.imu_stamps_ns - shift,
+                        gnss_stamps_ns=s.gnss_stamps_ns - shift)
+        aligner = Aligner(config_for(s))
+        give_all(aligner, other)
+        counts.append(aligner.status().counts)
+    assert counts[0] == counts[1] and counts[0]['imu_saturated'] > 5
 
 
 @pytest.mark.parametrize('seed', (1, pytest.param(2, marks=pytest.mark.campaign)))

@@ -302,6 +302,25 @@ def test_a_new_start_remembers_what_contradicted_the_one_before():
     assert declaration.update_without_attitude(4.0, few).reason.endswith('needed; no GNSS for 4 s')
 
 
+def test_an_attitude_that_is_gone_is_withdrawn():
+    """The bank may start again by itself: what it finds then has to hold for a while too."""
+    declaration = Declaration(Config(hold_time=2.0))
+    assert judge(declaration, 0.0, 3.0, GOOD).state is State.ALIGNED
+    declaration.update_without_attitude(0.0, fit(rows=0, offered=4))
+    assert declaration.update(3.2, GOOD, GOOD, fit()).state is State.ALIGNING
+    assert judge(declaration, 3.4, 3.0, GOOD).state is State.ALIGNED
+
+
+def test_figures_in_reasons_are_not_rounded_to_what_they_exceed():
+    late = Declaration(Config(gnss_delay=0.1, gnss_delay_std=0.001)).update(
+        0.0, GOOD, GOOD, fit(delay=0.104))
+    assert 'seem to be 0.104 s late, gnss_delay is 0.1 ' in late.reason
+    wide = np.diag(np.radians([0.1, 0.1, 1.03]) ** 2)
+    reason = judge(Declaration(Config()), 0.0, 70.0, wide).reason
+    assert 'heading sigma 1.03 deg, needs 1:' in reason
+    assert reason.endswith('if 1.03 deg is good enough')
+
+
 @pytest.mark.parametrize('P, state', [(GOOD, State.ALIGNED), (LEVEL, State.LEVELLED)])
 def test_noise_that_is_another_than_stated_is_the_end_of_the_reason(P, state):
     words = '; the GNSS velocities are 3.0 times as noisy as stated'

@@ -27,6 +27,7 @@ from ins_align.offline import replay
 from ins_align.results import State
 from ins_align.simulation.simulate import write_bag
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.stats import chi2
 
@@ -139,6 +140,18 @@ def test_rows_with_nan_are_left_out_and_counted(flight):
     assert counts['fix_nan'] == len(fixes[::10])
     assert counts['velocity_nan'] == len(velocities[::15])
     assert normalised_error(spoilt.current, flight) < chi2.ppf(0.9999, 3)
+
+
+def test_clocks_may_be_as_far_apart_as_gnss_delay_says(flight):
+    fixes, velocities = tables(flight, 'std')
+    fixes[:, 0], velocities[:, 0] = fixes[:, 0] + 50e9, velocities[:, 0] + 50e9
+    assert ins_align.align(*imu(flight), fixes, velocities, gnss_delay=50.0, **LEVER).aligned
+
+
+def test_a_frame_without_rows_has_no_messages(flight):
+    empty = pd.DataFrame({'stamp': [], 'latitude': [], 'longitude': [], 'altitude': []})
+    result = ins_align.align(*imu(flight), empty, None, **LEVER)
+    assert 'no GNSS position yet' in result.status.reason
 
 
 def test_a_masked_stamp_of_the_imu_is_refused(flight):

@@ -55,6 +55,20 @@ def test_straight_road_gives_a_heading_as_good_as_mounting_and_drift(mount_std, 
     assert known < aligner.status().current.sigma_deg[2] < 1.25 * known
 
 
+@pytest.mark.parametrize('grade', ['tactical', pytest.param('navigation', marks=CAMPAIGN)])
+def test_a_car_that_backs_out_and_drives_on_contradicts_nothing(grade):
+    simulation = simulate('reverse', seed=1, imu_grade=grade, duration=45.0)
+    aligner, epochs, sigmas = aligned(simulation, imu_grade=grade)
+    assert not any('contradicts' in epoch.reason for epoch in epochs)
+    assert aligner.status().state is State.ALIGNED and abs(sigmas[-1]) < 4
+
+
+def test_epochs_without_a_measurement_take_no_turn_of_the_constraint():
+    """GNSS every 2.5 s, so that an epoch without it, 2 s after each, is due first."""
+    status = aligned(simulate('highway', seed=5, duration=60.0, gnss_rate=0.4))[0].status()
+    assert status.state is State.ALIGNED and status.current.sigma_deg[2] < 2.0
+
+
 def test_straight_road_gives_no_heading_without_a_vehicle():
     without = aligned(simulate('highway', seed=1, duration=20.0), vehicle='none')[0].status()
     assert without.state is State.LEVELLED and without.current.sigma_deg[2] > 10.0

@@ -96,6 +96,7 @@ class Bank:
         self._velocity_ns = epoch.stamp_ns          # stamp of the last velocity
         self._velocities_since_ns: int | None = None
         self.moved = 0
+        self.restarted = ''         # why the bank has started again by itself, until it is read
         self._offered = 0
         self._rejected = [0, 0, 0]
         self._begin(epoch, imu, prior)
@@ -104,6 +105,7 @@ class Bank:
     def _begin(self, epoch: AntennaEpoch, imu: Intervals, prior: Learnt | None = None) -> None:
         """Start again at an epoch, with nothing known but the prior."""
         self.t0_ns = epoch.stamp_ns
+        self._prior = prior
         force = imu.gained[0, -1]
         force = STANDARD_GRAVITY * force / max(float(np.linalg.norm(force)), 1e-3)
         self._rivals = rivals = Rivals(self._config)
@@ -186,7 +188,10 @@ class Bank:
             self._C_nn0 = inertial.C_n0n[k].T
             self._last = epoch
             self._left -= 1
-            if self._in_a_row >= ASTRAY or self._drop_vehicle(filters):
+            why = ('the last GNSS epochs do not fit the rest' if self._in_a_row >= ASTRAY
+                   else self._drop_vehicle(filters))
+            if why:
+                self.restarted = why
                 self._begin(epoch, imu.take(slice(k, k + 1)).end())
                 yield epoch
                 return
@@ -247,7 +252,7 @@ class Bank:
         vehicle = self._vehicle
         filters.propagate(model, k)
         self._seconds += model.duration[k]
-        due = vehicle is not None and vehicle.is_due(model.duration[k])
+        due = vehicle is not None and vehicle.is_due(model.duration[k], any(measured.present[k]))
         self._innovation = NO_INNOVATION
         kinds = [kind for kind, present in enumerate(measured.present[k]) if present]
         if not kinds:
@@ -276,13 +281,14 @@ class Bank:
         self._rivals.select(filters)
         redraw_headings(filters)
 
-    def _drop_vehicle(self, filters: Filters) -> bool:
-        """Give up the assumption on the vehicle if the motion contradicts it; return whether."""
+    def _drop_vehicle(self, filters: Filters) -> str:
+        """Give up the assumption on the vehicle if the motion contradicts it; return why, or ''."""
+        vehicle = self._config.vehicle
         if self._vehicle is None or not self._vehicle.contradicted(filters):
-            return False
-        self._not_used = NOT_USED.format(vehicle=self._config.vehicle)
+            return ''
+        self._not_used = NOT_USED.format(vehicle=vehicle)
         self._config = replace(self._config, vehicle='none')
-        return True
+        return f'the motion contradicts vehicle: {vehicle}'
 
     def _conclude(self) -> None:
         """Mix the attitudes at an epoch, and ask the rivals."""
@@ -356,7 +362,8 @@ class Bank:
         """Return how well the data fit, and what speaks against a declaration."""
         filters, receiver = self._filters, self._receiver
         if filters is None:
-            return Fit(self._offered, delay=self._config.gnss_delay, doubt=self._start.lacks)
+            return Fit(self._offered, waiting=self._start.measured,
+                       delay=self._config.gnss_delay, doubt=self._start.lacks)
         velocity, position, either = self._rejected
         x, P = self._body()
         best = filters.best
@@ -364,8 +371,9 @@ class Bank:
             self._rivals.table[filters.ids[best]], self._config.imu_noise, x, P)
         if self._vehicle is not None:
             remarks += self._vehicle.in_words(filters)
-        return Fit(self._offered, 3 * (self._offered - either), receiver.misfit,
-                   self._innovation, velocity, position, either,
+        return Fit(self._offered, rows=3 * (self._offered - either), misfit=receiver.misfit,
+                   innovation=self._innovation, rejected_velocity=velocity,
+                   rejected_position=position, rejected=either,
                    delay=self._config.gnss_delay + float(x[DELAY]),
                    objection=self._doubt if self._contradicted else '', doubt=self._doubt,
                    remarks=remarks)
@@ -380,11 +388,18 @@ class Bank:
 
     def _body(self) -> tuple[Array, Array]:
         """Return the likeliest parameters of the body and their covariance."""
-        filters = self._filters
-        if filters is None:
-            return self._known[0].x, self._known[0].P
+        filters, known = self._filters, self._known[0]
+        if filters is None or self._mixture is None:
+            return known.x, known.P
         best = filters.best
-        return filters.x[filters.lead[best]], filters.P[best, FIRST:, FIRST:]
+        x, P = filters.x[filters.lead[best]].copy(), filters.P[best, FIRST:, FIRST:].copy()
+        if self._mixture[1][1, 2, 2] > RESOLVED_STD ** 2:
+            # Without a change of velocity lever arm and delay are estimated from nothing but the
+            # noise of the IMU, which looks like a swing that the GNSS does not see.
+            antenna = slice(0, GYRO)
+            P[antenna] = P[:, antenna] = 0.0
+            x[antenna], P[antenna, antenna] = known.x[antenna], known.P[antenna, antenna]
+        return x, P
 
     def nuisance(self) -> Nuisance:
         """Return biases, lever arm and delay."""
@@ -404,14 +419,6 @@ class Bank:
 
     def learnt(self) -> Learnt | None:
         """Return the prior for another start; None while epochs do not fit."""
-        if self._mixture is None or self._in_a_row:
-            return None
-        x, P = (array.copy() for array in self._body())
-        if self._mixture[1][1, 2, 2] > RESOLVED_STD ** 2:
-            # Without a change of velocity lever arm and delay are estimated from nothing but the
-            # noise of the IMU, which looks like a swing that the GNSS does not see.
-            antenna = slice(0, GYRO)
-            P[antenna] = P[:, antenna] = 0.0
-            x[antenna], P[antenna, antenna] = (self._known[0].x[antenna],
-                                               self._known[0].P[antenna, antenna])
-        return Learnt(x, P, self._last.stamp_ns)
+        if self._mixture is None:
+            return self._prior
+        return None if self._in_a_row else Learnt(*self._body(), self._last.stamp_ns)

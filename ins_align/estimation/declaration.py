@@ -47,6 +47,7 @@ class Fit:
     """How well the data fit the model of a method."""
 
     offered: int  #: epochs with a measurement, rejected ones included
+    waiting: int = 0  #: epochs that wait for a start, not offered yet
     rows: int = 0  #: redundant rows; 0 before there is a solution
     misfit: float = math.nan  #: mean square of normalised residuals
     #: (3,), of the velocity (of the position where only that is used) over its sigma.
@@ -130,7 +131,8 @@ class Declaration:
                        f'{self._against or verdict.reason}{_silence(silent_s)}')
 
     def update_without_attitude(self, silent_s: float, fit: Fit) -> Verdict:
-        """Judge an epoch at which there is no attitude yet; parameters as above."""
+        """Judge an epoch at which there is no attitude, or none any more; parameters as above."""
+        self.withdraw()
         return Verdict(State.ALIGNING,
                        (fit.doubt or self._too_few(fit))
                        + (_silence(silent_s) if silent_s else ''))
@@ -168,16 +170,18 @@ class Declaration:
         """Return advice; after a while also that the sigma may be good enough as it is."""
         parameter = f'{name}_std_threshold'
         threshold_deg = getattr(self.config, parameter)
-        words = f'{name} sigma {_above(sigma_deg, threshold_deg)}: {advice}'
+        sigma = _above(sigma_deg, threshold_deg)
+        words = f'{name} sigma {sigma}, needs {threshold_deg:g}: {advice}'
         if self._time_s >= PATIENCE and sigma_deg <= ACCEPTABLE * threshold_deg:
-            words += f', or raise {parameter} if {_deg(sigma_deg)} is good enough'
+            words += f', or raise {parameter} if {sigma} is good enough'
         return words
 
     def _too_few(self, fit: Fit) -> str:
         """Return how many epochs there are where there is no redundancy yet."""
         if self._contradiction:
             return f'{self._contradiction}; it has started over'
-        return f'{fit.offered - self._offered} GNSS epochs so far: more are needed'
+        return (f'{fit.offered + fit.waiting - self._offered} GNSS epochs so far: more are '
+                'needed')
 
     def _held(self, since_s: float | None, time_s: float) -> bool:
         return since_s is not None and time_s - since_s >= self.config.hold_time - 1e-6
@@ -189,7 +193,8 @@ class Declaration:
         config = self.config
         unexplained = abs(fit.delay - config.gnss_delay)
         if unexplained > DELAY_SIGMAS * config.gnss_delay_std > 0:
-            return (f'the GNSS stamps seem to be {fit.delay:.2f} s late, gnss_delay is '
+            digits = 2 if unexplained >= 0.02 else 3
+            return (f'the GNSS stamps seem to be {fit.delay:.{digits}f} s late, gnss_delay is '
                     f'{config.gnss_delay:g} and gnss_delay_std {config.gnss_delay_std:g}: check '
                     'the clocks, or set gnss_delay')
         if fit.objection:
@@ -209,11 +214,9 @@ def _silence(silent_s: float) -> str:
 
 
 def _above(sigma_deg: float, threshold_deg: float) -> str:
-    """Return a sigma, with enough digits to be above its threshold, and the threshold."""
+    """Return a sigma with enough digits to be above its threshold."""
     text = _deg(sigma_deg)
-    if float(text.split()[0]) <= threshold_deg:
-        text = f'{sigma_deg:.4g} deg'
-    return f'{text}, needs {threshold_deg:g}'
+    return text if float(text.split()[0]) > threshold_deg else f'{sigma_deg:.4g} deg'
 
 
 def _deg(sigma_deg: float) -> str:

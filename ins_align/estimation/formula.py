@@ -169,7 +169,7 @@ class NoteMethod:
                  use_position: bool) -> None:
         """Start at t0."""
         self.t0_ns = epoch.stamp_ns
-        self.moved = 0
+        self.moved, self.restarted = 0, ''
         self._config = config
         self._lever_b = np.array(config.lever_arm)
         self._free = config.free_start

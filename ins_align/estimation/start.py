@@ -102,13 +102,18 @@ class Start:
         return Intervals(**{name: np.concatenate([getattr(imu, name) for imu in self._imu])
                             for name in vars(self._imu[0])})
 
+    @property
+    def measured(self) -> int:
+        """Return the number of epochs with a measurement."""
+        return sum(map(_measured, self.epochs))
+
     def _drop_first(self) -> None:
         """Drop the first epochs: t0 is the next one with a measurement."""
         later = [k for k, epoch in enumerate(self.epochs) if k and _measured(epoch)]
+        first = later[0] if later else len(self.epochs)
+        del self.epochs[:first], self._imu[:first]
         if later:
-            imu = self._imu[later[0]].end()
-            del self.epochs[:later[0]], self._imu[:later[0]]
-            self._imu[0] = imu
+            self._imu[0] = self._imu[0].end()
 
     def solve(self, use_position: bool) -> RoughAttitude | None:
         """Return an attitude; None if the epochs do not suffice or contradict each other."""
@@ -172,10 +177,10 @@ class Start:
                 or epoch.position_covariance[2, 2] < UNKNOWN_ALTITUDE_STD ** 2
                 for epoch in epochs):
             return NO_VERTICAL
-        if len(epochs) < MAX_WAITING:
+        if self.measured < MAX_WAITING:
             return ''
         seconds = (epochs[-1].stamp_ns - epochs[0].stamp_ns) * 1e-9
-        return TOO_NOISY.format(seconds=seconds, epochs=len(epochs))
+        return TOO_NOISY.format(seconds=seconds, epochs=self.measured)
 
     def _pairs(self, kind: int) -> tuple[Array, Array, Array]:
         """Return times, s and a of the formula with a free start, for all epochs."""

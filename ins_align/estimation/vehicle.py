@@ -82,10 +82,10 @@ class Vehicle:
         # By how much each is less likely for the highest speed at which it has reversed (log).
         self._against = np.zeros(len(along))
 
-    def is_due(self, duration: float) -> bool:
-        """Count seconds; return whether an update is due."""
+    def is_due(self, duration: float, measured: bool) -> bool:
+        """Count seconds; return whether an update is due, for which a measurement is needed."""
         self._waited += duration
-        if self._waited < INTERVAL:
+        if self._waited < INTERVAL or not measured:
             return False
         self._waited = 0.0
         return True
@@ -100,9 +100,10 @@ class Vehicle:
                + apply(H_v[q][..., FIRST:], filters.x - model.point[q]))
         to_base = self._axes.T @ back.swapaxes(1, 2)
         v = apply(to_base[q], v_b)
-        # While its heading is open a rival goes in the direction in which it sets out; later it
-        # may turn back. The derivatives are those at motion along x.
-        open_ = np.bincount(filters.rival)[ids] > 1
+        # While its headings differ by 60 deg and more, a rival goes in the direction in which it
+        # sets out; later it may turn back. The derivatives are those at motion along x.
+        x_n0 = apply(filters.C, self._axes[:, 0])
+        open_ = np.minimum.reduceat(np.sum(x_n0 * x_n0[lead][q], axis=1), filters.first) < 0.5
         fast = np.linalg.norm(v_b[lead], axis=1)
         moves = fast > MOVES * np.sqrt(np.einsum('mij,mjk,mik->m', H_v, filters.P, H_v) / 3)
         speed = np.where(open_, along * fast, v[lead, 0] * (along != 0))

@@ -109,13 +109,16 @@ class GnssBuffer:
         """Stamp of the oldest message in the queue; None: it is empty."""
         return min(self._pending, default=None)
 
-    def release(self, upto_ns: int, last: bool = False) -> list[GnssEpoch]:
+    def release(self, upto_ns: int, last: bool = False,
+                due_ns: int | None = None) -> list[GnssEpoch]:
         """
         Return the epochs up to a stamp, in order, and remove them from the queue.
 
-        A fix or a velocity alone waits while its other half may still come, and so do all later
-        ones. `last`: no more messages will come; those after the stamp are dropped.
+        No message up to `due_ns` can still come, by default up to the stamp; it is not before it.
+        A fix or a velocity alone waits while its other half may come, and so do all later ones.
+        `last`: no more messages will come; those after the stamp are dropped.
         """
+        due_ns = upto_ns if due_ns is None else due_ns
         stamps = sorted(self._pending)
         released = []
         place = 0
@@ -124,10 +127,12 @@ class GnssBuffer:
             first, *close = (self._pending[stamp] for stamp in stamps[place:place + 2]
                              if stamp <= paired_upto_ns)
             epoch = _joined(first, *close)
-            half_may_come = first.is_half and not close and not last and paired_upto_ns > upto_ns
+            parts = [first] if epoch is first else [first, *close]
+            half_may_come = not last and (
+                parts[-1].stamp_ns > due_ns
+                or (first.is_half and not close and paired_upto_ns > due_ns))
             if half_may_come or epoch.stamp_ns > upto_ns:
                 break
-            parts = [first] if epoch is first else [first, *close]
             place += len(parts)
             fix = parts[0].fix or parts[-1].fix     # as it was sent, at its own stamp
             if fix is not None:

@@ -159,7 +159,12 @@ def _numbers(msg: Any, row: Receiver, fields: Mapping[str, float]) -> list[Any]:
 
 
 def _covariance(std: list[Any]) -> np.ndarray:
-    """Return a covariance, shape (1, 3, 3), from sigmas (horizontal, vertical) or as sent."""
+    """
+    Return a covariance, shape (1, 3, 3), from sigmas (horizontal, vertical) or as sent.
+
+    It has the sign of the sigmas: negative ones are not known.
+    """
     if np.ndim(std[0]):
         return np.reshape(std[0], (1, 3, 3))
-    return np.diag([std[0], std[0], std[-1]])[None] ** 2
+    sigmas = np.diag([std[0], std[0], std[-1]])[None]
+    return sigmas * np.abs(sigmas)

@@ -92,7 +92,8 @@ class ImuBuffer:
         # Samples up to here have been cut; those that arrive after that are late.
         self.used_ns = -(1 << 62)
         self._range = RangeCheck()
-        self._checked_ns = 0                # the range is checked up to here
+        self._checked_ns = -(1 << 62)       # the range is checked up to here
+        self.due_ns = -(1 << 62)            # no message up to here can still come in time
         self._silences: list[Silence] = []
 
     def add(self, stamp_ns: int, gyro: Iterable[float], accel: Iterable[float]) -> bool:
@@ -214,10 +215,10 @@ class ImuBuffer:
         self.consolidate(last)
         if self.newest_ns is None or self.stamps.size < 4:
             return None
-        settled_ns = self.newest_ns - (0 if last else self._lateness_ns)
-        settled = int(np.searchsorted(self.stamps, settled_ns, side='right'))
+        self.due_ns = self.newest_ns - (0 if last else self._lateness_ns)
+        settled = int(np.searchsorted(self.stamps, self.due_ns, side='right'))
         # Interpolation at an epoch needs two samples after it, and the check for spikes a third.
-        upto_ns = int(self.stamps[max(settled, 3) - 3])
+        upto_ns = min(int(self.stamps[max(settled, 3) - 3]), self.due_ns)
         self._check(upto_ns)
         return upto_ns
 
@@ -260,8 +261,9 @@ class ImuBuffer:
         self._counts['imu_saturated'] += self._range.stamps.size - before
         self._checked_ns = max(self._checked_ns, upto_ns)
         gaps = np.flatnonzero(np.diff(stamps) > MAX_GAP_NS)
-        self._silences = [Silence(start, end, 'imu_gap', NO_SAMPLE) for start, end in
-                          zip(stamps[gaps].tolist(), stamps[gaps + 1].tolist())]
+        # An epoch needs two samples after it: a silence begins before the last two.
+        self._silences = [Silence(start, end, 'imu_gap', NO_SAMPLE) for start, end in zip(
+            stamps[np.maximum(gaps - 2, 0)].tolist(), stamps[gaps + 1].tolist())]
         # An epoch is cut once the IMU is ahead of it by the lateness. What is known only after
         # that does not count, or results would depend on when epochs are cut.
         self._silences += [Silence(max(start, known - self._lateness_ns), end, 'imu_stuck',

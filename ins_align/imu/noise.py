@@ -110,7 +110,7 @@ class RangeCheck:
         self._times = [{end: 0} for end in 2 * (3 * [END_RATE] + 3 * [END_FORCE])]
         self._last = np.zeros(6)            # the last sample
         # Stamps of the last samples within the range, of gyros and of accelerometers, ns.
-        self._within_ns = np.zeros(2, np.int64)
+        self._within_ns: Index | None = None
         # Of the last sample at the end of the range: when the gyros were within it before, ns, and
         # the angle missed since, in whole multiples of `BLIND_ANGLE`.
         self._since_ns, self._angles = 0, 0.0
@@ -129,8 +129,10 @@ class RangeCheck:
         at_end = self._at_end(samples).reshape(-1, 2, 3)
         self._last = samples[-1]
         if not at_end.any():
-            self._within_ns[:] = stamps[-1]
+            self._within_ns = stamps[[-1, -1]]
             return
+        if self._within_ns is None:
+            self._within_ns = stamps[[0, 0]]
         beyond = np.any(at_end, axis=2)
         within = np.maximum.accumulate(np.where(beyond, self._within_ns, stamps[:, None]))
         self._within_ns = within[-1]
