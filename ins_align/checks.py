@@ -108,8 +108,8 @@ def exchange_fault(positions_deg: Series, velocities: Series) -> str:
 
 
 def _misfit(frame: VelocityFrame) -> float:
-    """Return the absolute log(speed ratio); infinite where directions do not fit."""
-    ratio = frame.speed_ratio if frame.frame in ('enu', 'ned') else None
+    """Return the absolute log(speed ratio); infinite where no turn makes directions fit."""
+    ratio = frame.speed_ratio if frame.frame in ('enu', 'ned', 'turned') else None
     return abs(math.log(ratio)) if ratio else math.inf
 
 
@@ -118,12 +118,17 @@ def beyond_the_poles(latitude_deg: float, longitude_deg: float) -> bool:
     return abs(longitude_deg) <= 90.0 < abs(latitude_deg) <= 180.0
 
 
-def lateness_advice(lateness: float) -> tuple[str, str]:
-    """Return advice for GNSS messages that are `lateness` s late, and the gnss_lateness to set."""
+def lateness_advice(lateness: float, delay: float = 0.0) -> tuple[str, str]:
+    """
+    Return advice for GNSS messages that are `lateness` s late, and the gnss_lateness to set.
+
+    `delay`, s, is negative where gnss_delay corrects a clock that is behind.
+    """
+    other_delay = max(delay - lateness, -MAX_DELAY)
     value = f'{min(math.ceil(2.0 * lateness) / 2.0 + 0.5, MAX_LATENESS):g}'
     return (f'GNSS messages come up to {lateness:.1f} s later than newer IMU samples: set '
             f'gnss_lateness to {value}; if it is their clock that is behind, and not the '
-            f'messages, set gnss_delay={-lateness:.1f} instead'), value
+            f'messages, set gnss_delay={other_delay:.1f} instead'), value
 
 
 class InputChecks:
@@ -131,6 +136,7 @@ class InputChecks:
 
     def __init__(self, config: Config) -> None:
         self._config = config
+        self._delay = min(config.gnss_delay, 0.0)  # a delay above 0 adds to gnss_lateness
         self._cells: dict[int, Array] = {}  # count, sums of rate and specific force, (7,)
         self._samples = self._too_fast = self._beyond_the_poles = 0
         self._newest_ns: Index = np.zeros(0, np.int64)  # IMU stamp, shape (1,) once there is one
@@ -149,7 +155,8 @@ class InputChecks:
         newest = np.maximum.accumulate(np.concatenate([self._newest_ns, stamps_ns]))
         for count, message in gnss:
             if place := count + self._newest_ns.size:
-                self._late.append((int(newest[place - 1]) - message.stamp_ns) * 1e-9)
+                self._late.append(
+                    (int(newest[place - 1]) - message.stamp_ns) * 1e-9 + self._delay)
             self._add_gnss(message)
         if stamps_ns.size:
             # Not the newest of all: the IMU's clock may have been set back.
@@ -221,5 +228,5 @@ class InputChecks:
         """Return a sentence if GNSS messages come too late, else nothing."""
         late = [lateness for lateness in self._late if lateness > self._config.gnss_lateness]
         if len(late) >= max(MIN_LATE, LATE_SHARE * len(self._late)) and max(late) < MAX_LATENESS:
-            return [lateness_advice(float(np.quantile(late, 0.99)))[0]]
+            return [lateness_advice(float(np.quantile(late, 0.99)), self._delay)[0]]
         return []

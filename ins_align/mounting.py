@@ -16,7 +16,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 import dataclasses
 from typing import Any, NamedTuple
 
@@ -90,7 +90,10 @@ def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Co
     missing: list[str] = []
     base, complete = None, True
     if config.lever_arm_from_tf is not False:
-        to_antenna = lookup(imu_frame, antenna_frame) if imu_frame and antenna_frame else None
+        # A driver of both sensors may use one frame_id: that says nothing about the lever arm.
+        told_apart = imu_frame.strip('/') != antenna_frame.strip('/')
+        to_antenna = (lookup(imu_frame, antenna_frame)
+                      if told_apart and imu_frame and antenna_frame else None)
         complete = to_antenna is not None
         if to_antenna is not None:
             config = _with_lever_arm(config, to_antenna.translation, (imu_frame, antenna_frame),
@@ -99,7 +102,7 @@ def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Co
             missing.append(f'from {antenna_frame!r} (antenna) to {imu_frame!r} (IMU)')
     if config.base_frame:
         base = lookup(imu_frame, config.base_frame) if imu_frame else None
-        if base is None:
+        if base is None or not all(np.isfinite(part).all() for part in base):
             missing.append(f'from {config.base_frame!r} (base) to {imu_frame!r} (IMU)')
     return Mounting(config, base, words, missing, complete)
 
@@ -142,7 +145,6 @@ class MountingSearch:
             raise ConfigError('lever_arm_from_tf is true or base_frame is set, but tf2_ros is not '
                               'installed: sudo apt install ros-$ROS_DISTRO-tf2-ros-py')
         self.antenna_frame: str | None = None  # None: no position yet
-        self._imu_frame: str | None = None
         self._lever_arm = config.lever_arm  # in use
         self._held: deque[tuple[int, Any]] = deque(maxlen=MAX_HELD)
         self.restart()
@@ -152,33 +154,39 @@ class MountingSearch:
         self.mounting: Mounting | None = None
         self.waits_for = 'a message of the IMU and a position' if self._required else ''
         self._since: float | None = None
+        self._imu_frame: str | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop the messages that are kept, because the alignment starts over."""
         self._held.clear()
 
     def take(self, items: list[tuple[int, Any]], now: float,
+             other_frames: Collection[str] = (),
              ) -> tuple[list[tuple[int, Any]], Mounting | None]:
         """
         Search on; return the items to process now, and the mounting when it is found.
 
         Items are messages and requests (which are callable) with the time when they came, ns; IMU
-        samples have a `frame_id`. Messages are kept during the search. At its end all of them are
-        returned, if they had to wait or the lever arm has changed. `now` is in seconds.
+        samples have a `frame_id`; `other_frames` are those of IMUs that are not aligned. Messages
+        are kept during the search. At its end all of them are returned, if they had to wait or the
+        lever arm has changed. `now` is in seconds.
         """
         if self.mounting is not None:
             return items, None
-        messages = [item for item in items if not callable(item[1])]
-        requests = [item for item in items if callable(item[1])]
-        self._held.extend(messages)
-        self._imu_frame = next((item.frame_id for _, item in reversed(messages)
-                                if hasattr(item, 'frame_id')), self._imu_frame)
+        self._imu_frame = next((item.frame_id for _, item in reversed(items)
+                                if getattr(item, 'frame_id', None) not in (None, *other_frames)),
+                               self._imu_frame)
         self.mounting = self._find(now)
         if self.mounting is None:
-            return requests if self._required else items, None
+            self._held.extend(item for item in items if not callable(item[1]))
+            return [item for item in items if not self._required or callable(item[1])], None
         self.waits_for = ''
         anew = self._required or self.mounting.config.lever_arm != self._lever_arm
         self._lever_arm = self.mounting.config.lever_arm
         held = list(self._held)
-        self._held.clear()
-        return [*requests, *held] if anew else items, self.mounting
+        self.forget()
+        return [*held, *items] if anew else items, self.mounting
 
     def _find(self, now: float) -> Mounting | None:
         """Return the mounting; None while the search goes on."""

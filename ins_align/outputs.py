@@ -15,7 +15,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 import dataclasses
 from dataclasses import dataclass
 import errno
@@ -71,7 +72,8 @@ def process(task: Task, progress: Callable[[float], None] | None = None) -> Outc
         result = replay(**task.arguments, progress=progress)
         if task.results:
             from ins_align.recordings.results_bag import write_results
-            write_results(result, task.results)
+            with _naming(task.results):
+                write_results(result, task.results)
         result = dataclasses.replace(result, bag=task.name)
         if task.csv:
             write_whole(task.csv, lambda file: file.write(result.to_csv().encode()))
@@ -99,6 +101,16 @@ def survey(bag: str) -> Outcome:
                    tuple(about(bag, warning) for warning in info.warnings))
 
 
+@contextmanager
+def _naming(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Name the file that was being written in errors that name none, as of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
+
+
 def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any]) -> None:
     """
     Write a file whole or not at all; `write` gets the open file.
@@ -110,7 +122,7 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any])
         raise FileExistsError(errno.EEXIST, 'it is no file', str(path))
     unfinished = path.with_name(f'.{path.name}.{os.getpid()}.part')
     try:
-        with open(unfinished, 'xb') as file:
+        with _naming(path), open(unfinished, 'xb') as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())

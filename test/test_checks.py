@@ -18,6 +18,7 @@ import re
 
 from ins_align.checks import BEYOND_THE_POLES, exchange_fault, InputChecks, lateness_advice
 from ins_align.config import Config, config_from_mapping
+from ins_align.geometry.rotation import matrix_from_rpy
 from ins_align.gnss.messages import Fix, Velocity
 from ins_align.gnss.motion import Series
 from ins_align.offline import replay
@@ -73,12 +74,24 @@ def test_info_and_replay_say_the_same(drive, tmp_path, change, sentence):
     assert 'too little motion' not in info or change is far_in_the_east
 
 
+@pytest.mark.parametrize('delay', [0.0, -55.0])
 @pytest.mark.parametrize('lateness', [1.7, 10.0, 10.1, 59.9])
-def test_what_late_messages_ask_for_can_be_set(lateness):
-    text, value = lateness_advice(lateness)
+def test_what_late_messages_ask_for_can_be_set(lateness, delay):
+    text, value = lateness_advice(lateness, delay)
     config_from_mapping({'gnss_lateness': float(value)})
     for setting in re.findall(r'gnss_delay=(\S+)', text):
         config_from_mapping({'gnss_delay': float(setting)})
+
+
+@pytest.mark.parametrize('behind, change, advice', [
+    (5.0, late, ('2.5', '-6.7')), (0.0, late, ('2.5', '-1.7')), (5.0, None, ()), (-1.5, None, ())])
+def test_late_messages_are_those_that_gnss_delay_does_not_explain(drive, behind, change, advice):
+    simulation = change(drive) if change else drive
+    simulation = dataclasses.replace(
+        simulation, gnss_stamps_ns=simulation.gnss_stamps_ns - round(behind * 1e9))
+    said = checked(simulation, config=Config(gnss_delay=-behind)).late_messages()
+    assert [re.findall(r'gnss_(?:lateness to|delay=)\s?(-?[\d.]+\d)', text) for text in said] == (
+        [list(advice)] if advice else [])
 
 
 def test_nothing_is_said_of_what_is_right(drive):
@@ -102,6 +115,16 @@ def test_velocities_north_east_down_are_no_exchanged_positions(drive):
     assert checks.faults() == []
 
 
+@pytest.mark.parametrize('angle', [-120.0, -25.0, 40.0, 180.0])
+def test_velocities_that_are_turned_are_no_exchanged_positions(angle):
+    simulation = simulate('flight', seed=1, duration=60.0, imu_rate=50.0)
+    turn = matrix_from_rpy(np.radians([0.0, 0.0, angle]))
+    velocity = simulation.velocity @ turn.T
+    assert checked(dataclasses.replace(simulation, velocity=velocity)).faults() == []
+    fault, = checked(exchanged(simulation)).faults()
+    assert EXCHANGED in fault
+
+
 @pytest.mark.parametrize('change, sentence', WRONG)
 def test_it_is_found_in_pieces_of_any_size(drive, change, sentence):
     for samples in (1, 37, 10 ** 6):
@@ -123,9 +146,9 @@ def test_what_is_no_number_says_nothing():
     assert exchange_fault(nothing, nothing) == ''
 
 
-def checked(simulation, samples=500):
+def checked(simulation, samples=500, config=Config()):
     """Give the checks a simulation as it arrives, so many samples at a time."""
-    checks = InputChecks(Config())
+    checks = InputChecks(config)
     stamps = simulation.imu_stamps_ns
     for start in range(0, len(stamps), samples):
         part = slice(start, start + samples)

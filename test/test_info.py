@@ -30,8 +30,10 @@ from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
 import pytest
 from recordings import (
-    FIX, IMU, messages_of, real_recording, TWIST, typestore, write_messages, write_recording)
+    FIX, IMU, make_twist, messages_of, real_recording, TWIST, typestore, write_messages,
+    write_recording)
 
+ODOMETRY = 'nav_msgs/msg/Odometry'
 TOPICS = {'/imu/data_raw': IMU, '/fix': FIX, '/fix_velocity': TWIST}
 DRIVE = {'scenario': 'car', 'seed': 1, 'duration': 60.0, 'stand_still': 15.0,
          'imu_grade': 'tactical', 'imu_rate': 50.0}
@@ -183,6 +185,34 @@ def test_velocity_that_says_it_is_in_the_body_frame(changed):
     info = inspect(changed(in_the_axes_of_the_vehicle, name='vehicle'))
     assert 'base_link' in by_name(info, '/fix_velocity').faults[0]
     assert 'use_velocity=false' in info.command
+
+
+@pytest.mark.parametrize('scenario, heading_deg', [('straight', 0.0), ('flight', None)])
+def test_a_receiver_is_preferred_to_the_wheels(tmp_path, scenario, heading_deg):
+    """Wheel odometry is more frequent; on a course about east it even fits as ENU."""
+    heading = {} if heading_deg is None else {'heading_deg': heading_deg}
+    write_bag(simulate(scenario, seed=1, duration=60.0, imu_rate=50.0, gnss_rate=10.0, **heading),
+              tmp_path / 'gnss')
+    with Bag(tmp_path / 'gnss') as bag:
+        messages = [(topic.name, time, deserialize(data, topic)) for topic, time, data
+                    in messages_of(bag) if topic.name in TOPICS]
+    types = typestore().types
+    quaternion = types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
+    pose = types['geometry_msgs/msg/PoseWithCovariance'](types['geometry_msgs/msg/Pose'](
+        types['geometry_msgs/msg/Point'](0.0, 0.0, 0.0), quaternion), np.zeros(36))
+    both = []
+    for name, time, message in messages:
+        if name == '/imu/data_raw' or message.header.stamp.nanosec // 100_000_000 % 2:
+            both.append((name, time, message))
+        if name == '/fix_velocity':
+            linear = message.twist.twist.linear
+            speed = make_twist(typestore(), 0, (math.hypot(linear.x, linear.y), 0.0, 0.0)).twist
+            both.append(('/odom', time, types[ODOMETRY](message.header, 'base_link', pose, speed)))
+    info = inspect(write_messages(tmp_path / 'both', 'mcap', both, {**TOPICS, '/odom': ODOMETRY}))
+    assert info.faults == [] and info.chosen['velocity'] == '/fix_velocity'
+    assert command_of(info)[:2] == ['--velocity-topic', '/fix_velocity']
+    fits = by_name(info, '/odom').figures['frame'] == 'enu'
+    assert fits == (scenario == 'straight')
 
 
 def test_velocities_of_other_types(changed):

@@ -13,6 +13,8 @@
 # limitations under the License.
 """Lever arm and mounting from TF, in recordings, live, and by hand."""
 
+from contextlib import closing
+import sqlite3
 from types import SimpleNamespace
 
 from ins_align.cli import main
@@ -25,7 +27,11 @@ from ins_align.results import Severity
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
 import pytest
+from recordings import FIX, IMU, make_fix, make_header, make_imu, START_NS
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
+TF = 'tf2_msgs/msg/TFMessage'
 LEVER_ARM = (1.5, -0.4, 0.8)
 MOUNT_DEG = (2.0, -3.0, 90.0)
 
@@ -97,6 +103,18 @@ def test_what_tf_has_may_be_missing_or_senseless(frames):
     for frame in ('far', 'bad'):
         found = find_mounting(frames.lookup, 'imu_link', frame, Config())
         assert found.config == Config() and 'TF has is none' in found.words[0].text
+    no_base = find_mounting(frames.lookup, 'imu_link', 'gnss', Config(base_frame='bad'))
+    assert no_base.missing == ["from 'bad' (base) to 'imu_link' (IMU)"]
+
+
+@pytest.mark.parametrize('imu_frame, antenna_frame', [('gnss', 'gnss'), ('ins', '/ins')])
+def test_one_frame_of_both_sensors_says_nothing_about_the_lever_arm(
+        frames, imu_frame, antenna_frame):
+    config = Config(lever_arm=LEVER_ARM, lever_arm_std=0.05)
+    assert find_mounting(frames.lookup, imu_frame, antenna_frame, config)[:3] == (config, None, [])
+    missing, = find_mounting(frames.lookup, imu_frame, antenna_frame,
+                             Config(lever_arm_from_tf=True)).missing
+    assert missing == f'from {antenna_frame!r} (antenna) to {imu_frame!r} (IMU)'
 
 
 @pytest.fixture(scope='module')
@@ -143,6 +161,42 @@ def test_recording_with_tf_that_says_otherwise_or_nothing(recording, drive, tmp_
     write_bag(drive, tmp_path / 'plain')
     with pytest.raises(BagError, match="no transform from 'gnss' .antenna. to 'imu' .IMU."):
         replay(tmp_path / 'plain', Config(lever_arm_from_tf=True))
+
+
+@pytest.mark.parametrize('topic, edit', [
+    ('/imu/data_raw', lambda data: b'\0\1\0\0'), ('/fix', lambda data: b'\0\1\0\0'),
+    ('/imu/data_raw', lambda data: data.replace(b'\4\0\0\0imu\0', b'\1\0\0\0' + bytes(4)))])
+def test_the_frame_is_that_of_the_first_message_with_one(drive, tmp_path, topic, edit):
+    path = tmp_path / 'drive'
+    write_bag(drive, path, 'sqlite3', tf=True)
+    with closing(sqlite3.connect(path / 'drive.db3')) as database:
+        key, data = database.execute(
+            'SELECT messages.id, data FROM messages JOIN topics ON topic_id = topics.id '
+            'WHERE name = ? ORDER BY timestamp', (topic,)).fetchone()
+        database.execute('UPDATE messages SET data = ? WHERE id = ?', (edit(data), key))
+        database.commit()
+    result = replay(path, Config(base_frame='base_link'), duration=2.0)
+    assert result.config.lever_arm == pytest.approx(LEVER_ARM)
+    assert result.topics.base is not None and result.warnings == ()
+
+
+def test_transforms_of_a_ros1_recording(tmp_path):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg('geometry_msgs/TransformStamped[] transforms', TF))
+    types = store.types
+    pose = types['geometry_msgs/msg/Transform'](
+        types['geometry_msgs/msg/Vector3'](*LEVER_ARM),
+        types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0))
+    to_antenna = types['geometry_msgs/msg/TransformStamped'](
+        make_header(store, START_NS, 'imu_link'), 'gps', pose)
+    with Writer(tmp_path / 'a.bag') as writer:
+        for topic, msgtype, message in (
+                ('/tf_static', TF, types[TF]([to_antenna])),
+                ('/fix', FIX, make_fix(store, START_NS)),
+                ('/imu', IMU, make_imu(store, START_NS, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8)))):
+            connection = writer.add_connection(topic, msgtype, typestore=store)
+            writer.write(connection, START_NS, store.serialize_ros1(message, msgtype))
+    assert replay(tmp_path / 'a.bag').config.lever_arm == pytest.approx(LEVER_ARM)
 
 
 def test_command_line(tmp_path, capsys):

@@ -14,10 +14,13 @@
 """The node by itself: parameters, signals, topics, services, without any sensor."""
 
 from dataclasses import fields
+from itertools import cycle
 import json
+import os
 import signal
 import subprocess
 import sys
+import time
 
 from ins_align.config import Config
 from node_harness import Listener, NodeProcess, running_node
@@ -92,6 +95,19 @@ def test_signals_end_it_cleanly(number):
         assert node.stop(number) == 0
     assert 'Traceback' not in node.output
     assert 'rror' not in node.output
+
+
+def test_more_signals_while_it_ends_change_nothing():
+    with Listener() as listener:
+        node = NodeProcess()
+        listener.wait_for(lambda: listener.statuses)
+        for number in cycle([signal.SIGINT, signal.SIGTERM]):
+            if node.status is not None:
+                break
+            os.kill(node.pid, number)
+            time.sleep(0.01)
+    assert node.wait() == 0
+    assert 'Traceback' not in node.output
 
 
 def test_parameters_and_status_of_an_idle_node():

@@ -164,6 +164,15 @@ def test_a_reason_is_logged_when_its_kind_changes_and_when_it_stays():
     # What comes and goes is not logged each time.
     for now in range(65, 100):
         assert log.due(f'ALIGNING: {"ab"[now % 2]}', now, True) == (now % 10 in (5, 6))
+    # A warning that no longer holds is not the last word.
+    assert logged('ALIGNED: heading sigma 0.7 deg', range(100, 106), False) == [100]
+    assert logged('ALIGNED: heading sigma 0.7 deg; no GNSS for 3 s', range(106, 109)) == [106]
+    assert logged('ALIGNED: heading sigma 0.6 deg', range(109, 200), False) == [110]
+    # An event is logged in any case: the status does not repeat it.
+    for now in (200, 205):
+        assert log.due('LEVELLED: heading sigma 2 deg', now + 1, True, logged=True)
+        assert log.due('ALIGNED: heading sigma 0.9 deg', now + 2, True, logged=True)
+    assert logged('ALIGNED: heading sigma 0.8 deg', range(208, 300), False) == []
 
 
 def test_receiver_messages_need_their_package_and_bring_the_velocity(monkeypatch):

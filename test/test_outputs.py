@@ -13,6 +13,7 @@
 # limitations under the License.
 """Outputs are whole or not there; what a recording says ends up in none but those asked for."""
 
+import errno
 import json
 from pathlib import Path
 import signal
@@ -93,6 +94,22 @@ def test_killed_simulation_leaves_no_recording(tmp_path):
     path = tmp_path / 'flight'
     killed('Path.rename', 'simulate', path, '--duration', '2')
     assert not path.exists()
+
+
+@pytest.mark.parametrize('call, option, name', [
+    ('os.fsync', '--csv', 'out.csv'), ('os.fsync', '--plot', 'out.png'),
+    ('os.fsync', '--json', 'out.json'),
+    ('ins_align.recordings.results_bag.Writer.write', '--bag', 'out')])
+def test_a_full_disk_names_the_output(standing, tmp_path, capsys, monkeypatch, call, option, name):
+    if option == '--plot':
+        pytest.importorskip('matplotlib')
+
+    def full(*arguments):
+        raise OSError(errno.ENOSPC, 'No space left on device')
+    monkeypatch.setattr(call, full)
+    assert main(['replay', str(standing), option, str(tmp_path / name)]) == 2
+    assert f'cannot write {tmp_path / name}: No space left on device' in capsys.readouterr().err
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize('arguments, reason', [

@@ -39,7 +39,7 @@ from recordings import (
 from rosbags.highlevel import AnyReader
 
 ODOMETRY, STAMPED = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/TwistStamped'
-VECTOR = 'geometry_msgs/msg/Vector3Stamped'
+VECTOR, TF = 'geometry_msgs/msg/Vector3Stamped', 'tf2_msgs/msg/TFMessage'
 
 
 def by_library(path):
@@ -157,6 +157,14 @@ def test_rows_of_a_database_that_are_no_messages(copy):
     assert {data for _, _, data in records} - {data for _, _, data in expected} == {b''}
 
 
+def test_a_damaged_message_of_a_compressed_database_costs_no_others(copy):
+    path, expected = copy('sqlite3 messages')
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("UPDATE messages SET data = x'00' WHERE timestamp = ?", expected[0][1:2])
+        database.commit()
+    assert by_bag(path) == ([(*expected[0][:2], b'\0'), *expected[1:]], [])
+
+
 # Cut off, damaged, hostile
 
 @pytest.mark.parametrize('kind', ['mcap', 'mcap chunks', 'mcap messages', 'mcap file'])
@@ -191,6 +199,21 @@ def test_mcap_without_an_index(tmp_path, chunked, missing):
     assert len(warnings) == bool(missing)
     with Bag(tmp_path / 'a') as bag:
         assert bag.topics[0] == ('/0', IMU, 'cdr', 'definition')
+
+
+def test_messages_that_are_counted_and_cannot_be_found(copy):
+    """Without a checksum of its chunk, a damaged record is left out without an error."""
+    def edit(content):
+        head = struct.pack('<BQ', 5, 22 + len(expected[0][2]))
+        return spoilt(content.index(head, len(content) // 2), b'\x80')(content)
+    expected = copy('mcap')[1]
+    path, _ = copy('mcap', edit)
+    records, warnings = by_bag(path)
+    assert len(records) == 4399 and warnings == [
+        'mcap.mcap is damaged: 4399 of 4400 messages on /fix, /fix_velocity, /imu/data_raw could '
+        'be read']
+    with Bag(path) as bag:
+        assert [*bag.blocks(bag.topics, START_NS)] and bag.warnings == []
 
 
 def spoilt(at, piece):
@@ -275,6 +298,28 @@ def test_message_that_is_too_long(tmp_path, kind):
     path = write_messages(tmp_path / 'a', kind, [('/v', START_NS, message)], {'/v': TWIST})
     with pytest.raises(BagError, match='2097... bytes or more on /v|too big|more than the 65536'):
         by_bag(path)
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'mcap messages', 'sqlite3'])
+def test_transforms_may_be_longer(tmp_path, kind):
+    """All fixed frames of a robot are one message."""
+    types = typestore().types
+    transform = types['geometry_msgs/msg/Transform'](
+        types['geometry_msgs/msg/Vector3'](1.0, 0.0, 0.0),
+        types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0))
+    for name, size in (('a', 1 << 19), ('b', 1 << 21)):
+        message = types[TF]([types['geometry_msgs/msg/TransformStamped'](
+            make_header(typestore(), START_NS, 'x' * size), 'y', transform)])
+        write_messages(tmp_path / name, kind, [('/tf_static', START_NS, message)],
+                       {'/tf_static': TF})
+    assert by_bag(tmp_path / 'a') == (by_library(tmp_path / 'a'), [])
+    with pytest.raises(BagError, match='2097... bytes or more on /tf|too big|more than the 1048'):
+        by_bag(tmp_path / 'b')
+    if kind == 'mcap':
+        path = storage_file(tmp_path / 'a')
+        path.write_bytes(path.read_bytes()[:-20])
+        records, _ = by_bag(path)
+        assert len(records[0][2]) > 1 << 19
 
 
 @pytest.mark.parametrize('times, size, message', [

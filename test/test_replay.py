@@ -27,6 +27,7 @@ from ins_align.geometry.rotation import log_so3, matrix_from_rpy, quaternion_fro
 from ins_align.offline import replay
 from ins_align.recordings import bag
 from ins_align.recordings.decode import ImuSamples
+from ins_align.recordings.info import inspect
 from ins_align.results import CSV_HEADER, Reference
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
@@ -191,6 +192,22 @@ def test_what_cannot_be_decoded_is_counted(flight, tmp_path):
     assert counts['fix_undecodable'] == 15
     assert counts['velocity_undecodable'] == 15
     assert counts['imu'] == 3001 - 30
+
+
+def test_first_velocity_that_is_damaged(flight, tmp_path):
+    database = sqlite3.connect(flight / 'flight.db3')
+    spoilt = sqlite3.connect(tmp_path / 'spoilt.db3')
+    database.backup(spoilt)
+    database.close()
+    spoilt.execute("UPDATE messages SET data = x'00010000' WHERE id = (SELECT min(id) "
+                   'FROM messages WHERE topic_id = (SELECT id FROM topics '
+                   "WHERE name = '/fix_velocity'))")
+    spoilt.commit()
+    spoilt.close()
+    result, info = replay(tmp_path / 'spoilt.db3', CONFIG), inspect(tmp_path / 'spoilt.db3')
+    assert result.warnings == () and result.topics.velocity.name == '/fix_velocity'
+    assert result.status.counts['velocity_undecodable'] == 1
+    assert info.chosen['velocity'] == '/fix_velocity' and 'velocity_frame' not in info.command
 
 
 def test_body_frame_velocity_is_counted(flight, tmp_path):

@@ -13,6 +13,8 @@
 # limitations under the License.
 """Results as a recording: against the result, the truth, and as other readers see them."""
 
+import math
+
 from ins_align.cli import main
 from ins_align.config import Config
 from ins_align.geometry.rotation import log_so3, matrix_from_quaternion
@@ -24,7 +26,7 @@ from ins_align.results import State
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
 import pytest
-from recordings import real_recording
+from recordings import real_recording, write_messages
 from rosbags.highlevel import AnyReader
 
 IMU_TOPIC, PERIOD_NS = '/imu/data_raw', 10_000_000
@@ -120,6 +122,58 @@ def test_status_is_that_of_the_result(drive):
     told = [f'{span.first.state.value}: {span.reason}' for span in result.spans]
     assert len(told) >= 2 and set(told) <= {status.message for status, _ in statuses}
     assert len(statuses) >= 45  # one a second
+
+
+def ahead(k, seconds, message):
+    """Let the clock of one sample be an hour ahead."""
+    if k == 3000:
+        message.header.stamp.sec += 3600
+
+
+def set_back(k, seconds, message):
+    if seconds >= 20.0:
+        message.header.stamp.sec -= 1000
+
+
+def no_numbers(k, seconds, message):
+    if k % 49 == 0 and hasattr(message, 'angular_velocity'):
+        message.angular_velocity.y = math.nan
+
+
+@pytest.mark.parametrize('change, start', [
+    (ahead, None), (set_back, None), (set_back, 22.0), (no_numbers, None)])
+def test_samples_gone_astray_cost_no_others(drive, tmp_path, change, start):
+    messages = []
+    for topic, found in read(drive[0] / 'drive').items():
+        for k, (time_ns, message) in enumerate(found):
+            if topic == IMU_TOPIC or change is set_back and topic in ('/fix', '/fix_velocity'):
+                change(k, 1e-9 * (time_ns - found[0][0]), message)
+            messages.append((topic, time_ns, message))
+    messages.sort(key=lambda message: message[1])
+    path = write_messages(tmp_path / 'a', 'mcap', messages, {
+        topic: message.__msgtype__ for topic, _, message in messages})
+    result = replay(path, CONFIG, start=start)
+    write_results(result, tmp_path / 'out')
+    found = read(tmp_path / 'out')
+
+    # Each sample from the declaration by its clock on, with an orientation.
+    declared = [after.stamp_ns for before, after in zip(result.epochs, result.epochs[1:])
+                if after.state is State.ALIGNED is not before.state]
+    samples = [stamp_from_msg(message) for topic, _, message in messages
+               if topic == IMU_TOPIC and not math.isnan(message.angular_velocity.y)]
+    imus = [message for _, message in found['/ins_align/imu']]
+    assert len(declared) == (2 if change is set_back and start is None else 1)
+    assert len(imus) == sum(stamp <= sample < stamp + 100e9
+                            for stamp in declared for sample in samples)
+    for message in imus:
+        turn = message.orientation
+        assert np.isfinite([turn.x, turn.y, turn.z, turn.w,
+                            *message.orientation_covariance]).all()
+    # Epochs are recorded in time, also by a clock that was set back, with a status each second.
+    late = [(time_ns - stamp_from_msg(message)) * 1e-9 % 1000.0
+            for time_ns, message in found['/ins_align/sigma_deg']]
+    assert max(late) <= 2e-9 * PERIOD_NS
+    assert len(found['/ins_align/status']) >= 45 - (start or 0.0)
 
 
 def test_official_reader(drive):

@@ -282,7 +282,7 @@ class Bank:
         redraw_headings(filters)
 
     def _drop_vehicle(self, filters: Filters) -> str:
-        """Give up the assumption on the vehicle if the motion contradicts it; return why, or ''."""
+        """Give up the assumption on the vehicle if the motion contradicts it; return why."""
         vehicle = self._config.vehicle
         if self._vehicle is None or not self._vehicle.contradicted(filters):
             return ''

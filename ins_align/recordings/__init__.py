@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 MAX_CHUNK_BYTES = 1 << 28  # of one chunk, unpacked
 MAX_HELD_BYTES = 1 << 30  # of all chunks, unpacked, whose times overlap
 MAX_MESSAGE_BYTES = 1 << 16  # of an IMU or GNSS message, which has some hundred bytes
+MAX_TF_BYTES = 1 << 20  # of a message of TF, which has some hundred bytes for each frame
 MAX_DEFINITION_BYTES = 1 << 24  # of a schema or channel record of an mcap file
 MAX_TOPICS = 10_000
 MAX_LISTED = 20  # names in a sentence
@@ -77,6 +78,11 @@ class Topic(NamedTuple):
 def max_unpacked_bytes(size: int) -> int:
     """Return how many bytes a file of `size` bytes may unpack to."""
     return max(UNPACKED_BYTES_FREE, MAX_UNPACK_RATIO * size)
+
+
+def max_message_bytes(msgtype: str) -> int:
+    """Return how many bytes a message of a type may have."""
+    return MAX_TF_BYTES if msgtype.endswith('/TFMessage') else MAX_MESSAGE_BYTES
 
 
 def unpack(data: bytes, compression: str, limit: int, damaged: bytes | None = None) -> bytes:

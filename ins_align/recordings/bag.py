@@ -30,8 +30,8 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from ins_align.recordings import (
-    BagError, listed, MAX_CHUNK_BYTES, MAX_HELD_BYTES, MAX_MESSAGE_BYTES, MAX_METADATA_BYTES,
-    MAX_TOPICS, max_unpacked_bytes, one_line, Topic, unpack, ZSTD_MAGIC, ZSTD_MODULE)
+    BagError, listed, MAX_CHUNK_BYTES, MAX_HELD_BYTES, max_message_bytes, MAX_METADATA_BYTES,
+    MAX_TF_BYTES, MAX_TOPICS, max_unpacked_bytes, one_line, Topic, unpack, ZSTD_MAGIC, ZSTD_MODULE)
 from ins_align.recordings.salvage import MAGIC as MCAP_MAGIC
 from ins_align.recordings.salvage import SalvagedMcap
 import numpy as np
@@ -49,6 +49,7 @@ COMMANDS = {'.bag': 'rosbag reindex {0}', '.mcap': 'mcap recover {0} -o mended.m
             # Not .recover: the sqlite3 of Debian and Ubuntu is built without what it needs.
             '.db3': "sqlite3 {0} .dump | sed 's/^ROLLBACK.*/COMMIT;/' | sqlite3 mended.db3"}
 BLOCK = 4096  # messages in a block
+FIRST = 100  # messages of a topic that show what it holds; the very first may be damaged
 PIECE_BYTES = 1 << 20  # unpacked from a file at a time
 INDEX_ENTRY_BYTES = 12  # for each message in the index of a ROS 1 file
 MAX_PASSES = 20  # times a ROS 1 file may be unpacked: chunks that overlap are unpacked repeatedly
@@ -103,25 +104,33 @@ class Bag:
         """
         Yield the messages of some topics in recorded order, `size` (or `BLOCK`) at a time.
 
-        `start_ns` and `stop_ns` bound the recorded time; the stop is exclusive.
+        `start_ns` and `stop_ns` bound the recorded time; the stop is exclusive. Without bounds, a
+        warning is added at the end if the files count more messages.
         """
         numbers = {key: topics.index(topic) for key, topic in self._topics.items()
                    if topic in topics}
         with _bag_errors(self.path):
             records = self._records(numbers, start_ns, stop_ns)
+            found = 0
             while group := list(itertools.islice(records, size or BLOCK)):
                 messages: list[list[bytes]] = [[] for _ in topics]
                 for number, _, data in group:
                     messages[number].append(data)
+                found += len(group)
                 yield Block(np.array([time_ns for _, time_ns, _ in group], np.int64),
                             np.array([number for number, _, _ in group]),
-                            [*map(_unpack_messages, messages)])
+                            [*map(_unpack_messages, messages, topics)])
+        counted = sum(connection.msgcount for reader in self._readers
+                      for connection in reader.connections if id(connection) in numbers)
+        if (start_ns, stop_ns) == (None, None) and found < counted:
+            self.warn(f'{self.path.name or self.path} is damaged: {found} of {counted} messages '
+                      f'on {listed({topic.name for topic in topics})} could be read')
 
-    def first_message(self, topic: Topic) -> bytes | None:
-        """Return the first message of a topic; None if there is none."""
-        for block in self.blocks([topic], size=1):
-            return block.messages[0][0]
-        return None
+    def first_messages(self, topic: Topic) -> Sequence[bytes]:
+        """Return the first messages of a topic, at most `FIRST`."""
+        for block in self.blocks([topic], size=FIRST):
+            return block.messages[0]
+        return ()
 
     def _records(self, numbers: Mapping[int, int], start_ns: int | None, stop_ns: int | None,
                  ) -> Iterator[tuple[int, int, bytes]]:
@@ -133,9 +142,9 @@ class Bag:
                 sources[0] if len(sources) == 1 else heapq.merge(*sources, key=itemgetter(1))):
             if type(data) is not bytes:  # a database may hold text, numbers or NULL instead
                 data = b''
-            elif len(data) > MAX_MESSAGE_BYTES:
+            elif len(data) > (limit := max_message_bytes(connection.msgtype)):
                 raise BagError(f'has a message of {len(data)} bytes or more on '
-                               f'{connection.topic}, where {MAX_MESSAGE_BYTES} are allowed')
+                               f'{connection.topic}, where {limit} are allowed')
             yield numbers[id(connection)], time_ns, data
 
     def _find_topics(self) -> tuple[Topic, ...]:
@@ -263,7 +272,7 @@ class Bag:
         reader: Any = rosbag2.Reader(path)
         reader.open()
         with suppress(AttributeError):  # rosbags without apsw; `_records` checks lengths anyway
-            reader.storage.dbconn.limit(SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
+            reader.storage.dbconn.limit(SQLITE_LIMIT_LENGTH, MAX_TF_BYTES)
         return reader
 
 
@@ -334,11 +343,11 @@ class _Rosbag1Reader(rosbag1.Reader):
             raise ValueError('index larger than the file')
 
 
-def _unpack_messages(messages: list[bytes]) -> list[bytes]:
-    """Unpack messages if the first is compressed; damaged ones become empty."""
-    if not messages or not messages[0].startswith(ZSTD_MAGIC):
-        return messages
-    return [unpack(message, 'zstd', MAX_MESSAGE_BYTES, damaged=b'') for message in messages]
+def _unpack_messages(messages: list[bytes], topic: Topic) -> list[bytes]:
+    """Unpack the messages of a topic that are compressed; damaged ones become empty."""
+    limit = max_message_bytes(topic.msgtype)
+    return [unpack(message, 'zstd', limit, damaged=b'') if message.startswith(ZSTD_MAGIC)
+            else message for message in messages]
 
 
 def _first_bytes(path: Path) -> bytes:

@@ -33,6 +33,9 @@ import numpy as np
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 IMU_TYPE, FIX_TYPE = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
+TF_TYPE = 'tf2_msgs/msg/TFMessage'
+# Types whose definition is read from the recording; rosbags has none of TF in ROS 1.
+DEFINED_TYPES = {*DRIVER_TYPES, TF_TYPE}
 VECTOR_TYPE = 'geometry_msgs/msg/Vector3Stamped'  # not always a velocity
 VELOCITY_TYPES = ('geometry_msgs/msg/TwistWithCovarianceStamped', 'geometry_msgs/msg/TwistStamped',
                   'nav_msgs/msg/Odometry', VECTOR_TYPE)
@@ -162,7 +165,7 @@ def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config) -> dict
         return '' if kind == 'fix' else frame_of_velocity(message, config.velocity_type)
 
     # Consecutive messages with the same frame are converted together.
-    for frame, group in groupby((_read(data, topic) for data in messages), frame_of):
+    for frame, group in groupby((deserialize_or_none(data, topic) for data in messages), frame_of):
         alike = list(group)
         if frame is None:
             found[kind] += [Refused(f'{kind}_undecodable')] * len(alike)
@@ -176,7 +179,8 @@ def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config) -> dict
     return found
 
 
-def _read(data: bytes, topic: Topic) -> Any:
+def deserialize_or_none(data: bytes, topic: Topic) -> Any:
+    """Deserialise one message as `deserialize` does; return None where that raises an error."""
     try:
         return deserialize(data, topic)
     except MessageError:
@@ -190,7 +194,7 @@ def short_name(msgtype: str) -> str:
 
 @lru_cache(maxsize=16)
 def _typestore(encoding: str, msgtype: str, definition: str) -> Any:
-    """Return a store of types, with a driver's type added if its definition is given."""
+    """Return a store of types, with one added if its definition is given."""
     store = get_typestore(Stores.ROS1_NOETIC if encoding == 'ros1' else Stores.ROS2_JAZZY)
     if definition:
         store.register({name: content for name, content
@@ -212,7 +216,7 @@ def deserialize(data: bytes, topic: Topic) -> Any:
             'mcap')
     try:
         store = _typestore(topic.encoding, topic.msgtype,
-                           topic.definition if topic.msgtype in DRIVER_TYPES else '')
+                           topic.definition if topic.msgtype in DEFINED_TYPES else '')
         if topic.encoding == 'ros1':
             return store.deserialize_ros1(data, topic.msgtype)
         return store.deserialize_cdr(data, topic.msgtype)

@@ -143,7 +143,8 @@ def _survey_fixes(fixes: list[Recorded], velocities: list[Recorded]) -> tuple[Se
     if fix is None:
         return EMPTY, 9.81
     for velocity in velocities:
-        if fault := exchange_fault(fix.series(), velocity.series()):
+        if not velocity.doubt and (
+                fault := exchange_fault(fix.series(), velocity.series())):
             fix.add(fault, fault=True)
             fix.values = fix.values[:, [1, 0, 2]]
             break
@@ -192,10 +193,11 @@ def _survey_imu(data: Recorded, motion: Series, gravity: float, alone: bool) -> 
 
 
 def _best(topics: list[Recorded]) -> Recorded | None:
-    """Return the topic without faults to read: first by known frame, then by usable messages."""
+    """Return the topic without faults to read: by known frame, no doubt and usable messages."""
     good = [data for data in topics if not data.faults]
     return max(good, default=None, key=lambda data: (
-        data.figures.get('frame') in FRAMES_THAT_FIT, np.count_nonzero(data.usable)))
+        data.figures.get('frame') in FRAMES_THAT_FIT, not data.doubt,
+        np.count_nonzero(data.usable)))
 
 
 def _add_manoeuvres(info: Info, velocities: Series) -> None:

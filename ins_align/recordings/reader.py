@@ -33,12 +33,11 @@ from ins_align.mounting import find_mounting, FixedFrames, Mounting
 from ins_align.recordings import BagError, listed, Topic
 from ins_align.recordings.bag import Bag, Block
 from ins_align.recordings.decode import (
-    decode, decode_imu, deserialize, FIX_TYPE, Gnss, IMU_TYPE, ImuSamples, short_name, VECTOR_TYPE,
-    VELOCITY_TYPES)
+    decode, decode_imu, deserialize, deserialize_or_none, FIX_TYPE, Gnss, IMU_TYPE, ImuSamples,
+    short_name, TF_TYPE, VECTOR_TYPE, VELOCITY_TYPES)
 from ins_align.results import Severity
 import numpy as np
 
-TF_TYPE = 'tf2_msgs/msg/TFMessage'
 UNSTAMPED_TYPES = ['geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistWithCovariance',
                    'geometry_msgs/msg/Vector3']
 REFERENCE_NAMESPACE = '/reference/'
@@ -129,10 +128,11 @@ def _mounting(bag: Bag, topics: Topics, config: Config) -> Mounting:
 
 
 def _frame_id(bag: Bag, topic: Topic) -> str:
-    """Return the frame_id of the first message of a topic; empty if there is none."""
-    data = bag.first_message(topic)
-    with suppress(MessageError, AttributeError):
-        return str(deserialize(data or b'', topic).header.frame_id)
+    """Return the first frame_id in the first messages of a topic; empty if there is none."""
+    for data in bag.first_messages(topic):
+        with suppress(MessageError, AttributeError):
+            if frame_id := str(deserialize(data, topic).header.frame_id):
+                return frame_id
     return ''
 
 
@@ -196,7 +196,7 @@ def _velocity(bag: Bag, config: Config, fix: Topic, name: str | None) -> Topic |
     elif topic.msgtype in preferred:
         if names := sorted(f'{other.name} ({short_name(other.msgtype)})'
                            for other in candidates(bag, others)
-                           if not doubt(bag.first_message(other), other)):
+                           if not doubt(bag.first_messages(other), other)):
             bag.warn(f'the velocity is read from {topic.name} ({short_name(topic.msgtype)}), '
                      f'not from {", ".join(names)}: --velocity-topic chooses')
     return topic
@@ -220,7 +220,7 @@ def _choose(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None,
         return _named(bag, what, list(dict.fromkeys(itertools.chain(*groups))), name)
     for types in groups:
         found = candidates(bag, types)
-        # A single topic of a standard type is read even if its first message raises doubts.
+        # A single topic of a standard type is read even if its first messages raise doubts.
         if what == 'velocity' or len(found) > 1 or types[0] in DRIVER_TYPES:
             found = [topic for topic in found if _can_be_used(bag, topic, config)]
         if len(found) > 1:
@@ -261,12 +261,17 @@ def candidates(bag: Bag, types: Collection[str]) -> list[Topic]:
     return found
 
 
-def doubt(first: bytes | None, topic: Topic, config: Config = Config()) -> str:
-    """Return why the first message of a topic is not what its type promises; '' if it is."""
-    if first is None:
+def doubt(first: Sequence[bytes], topic: Topic, config: Config = Config()) -> str:
+    """
+    Return why a topic is not what its type promises; '' if it is.
+
+    Of its first messages the first one is judged that can be deserialised.
+    """
+    if not first:
         return 'it has no messages'
+    read = (deserialize_or_none(data, topic) for data in first)
     try:
-        message = deserialize(first, topic)
+        message = next(filter(None, read), None) or deserialize(first[0], topic)
         if topic.msgtype in RECEIVERS:
             with suppress(NoTimeError):
                 receiver_from_msg(message, topic.msgtype, config)
@@ -287,8 +292,8 @@ def doubt(first: bytes | None, topic: Topic, config: Config = Config()) -> str:
 
 
 def _can_be_used(bag: Bag, topic: Topic, config: Config) -> bool:
-    """Tell whether the first message of a topic is what its type promises; warn if not."""
-    if why := doubt(bag.first_message(topic), topic, config):
+    """Tell whether a topic is what its type promises by its first messages; warn if not."""
+    if why := doubt(bag.first_messages(topic), topic, config):
         bag.warn(f'{topic.name} cannot be used: {why}')
     return not why
 

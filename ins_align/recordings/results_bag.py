@@ -24,7 +24,7 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from ins_align.imu.buffer import MAX_GAP_NS
+from ins_align.imu.buffer import MAX_GAP_NS, MAX_RATE
 from ins_align.imu.prediction import Prediction
 from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
@@ -98,21 +98,24 @@ class _Results:
             if self._imu_frame is None:
                 header = getattr(deserialize(data, self._topic), 'header', None)
                 self._imu_frame = getattr(header, 'frame_id', '')
-            while epochs and epochs[0].stamp_ns <= stamp_ns:
+            good = bool((np.abs(gyro) < MAX_RATE).all())
+            # Not all epochs up to the stamp: it may be far ahead, or the clock is set back later.
+            while epochs and 0 <= stamp_ns - epochs[0].stamp_ns <= MAX_GAP_NS:
                 epoch = epochs.popleft()
                 yield from self._of_epoch(epoch, time_ns)
                 share = ((epoch.stamp_ns - last_ns) / (stamp_ns - last_ns)
                          if last_ns < stamp_ns else 1.0)
-                rate = last_gyro + max(share, 0.0) * (gyro - last_gyro)
+                rate = last_gyro + max(share, 0.0) * (gyro - last_gyro) if good else last_gyro
                 prediction = self._prediction(epoch, rate, 1e-9 * (stamp_ns - last_ns))
                 epoch_ns = epoch.stamp_ns
-            last_ns, last_gyro = stamp_ns, gyro
+            if good:
+                last_ns, last_gyro = stamp_ns, gyro
             if prediction is None:
                 if not epochs:
                     break
-            elif stamp_ns > min(prediction.stamp_ns + MAX_GAP_NS, epoch_ns + MAX_AGE_NS):
-                prediction = None
-            elif prediction.propagate(stamp_ns, gyro.tolist()) or stamp_ns == epoch_ns:
+            elif stamp_ns <= epoch_ns + MAX_AGE_NS and (
+                    prediction.propagate(stamp_ns, gyro.tolist())
+                    or (good and stamp_ns == epoch_ns)):
                 yield 'imu', time_ns, self._imu(prediction, data, gyro, accel)
         for epoch in epochs:
             yield from self._of_epoch(epoch, time_ns)
@@ -147,7 +150,8 @@ class _Results:
             for name in FOR_PLOTS:
                 yield name, time_ns, self._make(
                     VECTOR, self._header(now.stamp_ns), self._make(XYZ, *getattr(now, name)))
-        if epoch.state is not self._state or epoch.stamp_ns >= self._status_ns + STATUS_PERIOD_NS:
+        since_ns = abs(epoch.stamp_ns - self._status_ns)  # the clock may have been set back
+        if epoch.state is not self._state or since_ns >= STATUS_PERIOD_NS:
             self._status_ns = epoch.stamp_ns
             yield 'status', time_ns, self._status(dataclasses.replace(
                 self._unknown, state=epoch.state, reason=epoch.reason, stamp_ns=epoch.stamp_ns,

@@ -23,7 +23,7 @@ from typing import Any
 import zlib
 
 from ins_align.recordings import (
-    BagError, MAX_CHUNK_BYTES, MAX_DEFINITION_BYTES, MAX_MESSAGE_BYTES, max_unpacked_bytes, unpack)
+    BagError, MAX_CHUNK_BYTES, MAX_DEFINITION_BYTES, max_message_bytes, max_unpacked_bytes, unpack)
 from rosbags.interfaces import (
     Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat)
 
@@ -94,8 +94,9 @@ class SalvagedMcap:
                         and (stop is None or time_ns < stop)):
                     begin += _MESSAGE_HEAD.size
                     # Of a message that is too long, enough is read for `Bag` to refuse it.
-                    end = min(end, begin + MAX_MESSAGE_BYTES + 1)
-                    yield wanted[channel], time_ns, data[begin:end]
+                    connection = wanted[channel]
+                    end = min(end, begin + max_message_bytes(connection.msgtype) + 1)
+                    yield connection, time_ns, data[begin:end]
 
     def _records(self) -> Iterator[tuple[Any, int, int, int]]:
         """Yield data, kind, start and end in the data of each record, also of those in chunks."""

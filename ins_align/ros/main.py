@@ -89,6 +89,9 @@ def main(args: Sequence[str] | None = None) -> int:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+        # The interpreter gives signals that are not ignored their default action before it ends.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
     if node is not None and node.failure is not None:
         raise node.failure
     return 0

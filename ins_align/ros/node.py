@@ -29,6 +29,7 @@ import threading
 import time
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Quaternion, QuaternionStamped, Vector3, Vector3Stamped
 from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
@@ -51,10 +52,9 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
-from rclpy.time import Time
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Header, UInt8
 from std_srvs.srv import Trigger
@@ -78,22 +78,22 @@ class ReasonLog:
     def __init__(self) -> None:
         """Start with nothing logged."""
         self._logged: dict[str, float] = {}  # text without numbers to when it was logged last, s
-        self._present = ''
+        self._last = ''  # the one that was logged last
 
-    def due(self, text: str, now: float, again: bool) -> bool:
+    def due(self, text: str, now: float, again: bool, logged: bool = False) -> bool:
         """
         Return whether to log a text at time `now`, s; if so, it counts as logged.
 
-        Numbers in the text are ignored. It is logged if it differs from the text of the last call,
-        or if `again` says to repeat it, but not within `LOG_AGAIN` after it was logged.
+        Numbers in the text are ignored. It is logged if it differs from the text logged last, or
+        if `again` says to repeat it, but not within `LOG_AGAIN` after it was logged.
+        With `logged` it has been logged in any case, and only counts.
         """
         kind = _NUMBER.sub('#', text)
-        stays, self._present = kind == self._present, kind
-        self._logged = {logged: when for logged, when in self._logged.items()
+        self._logged = {other: when for other, when in self._logged.items()
                         if now - when < LOG_AGAIN}
-        if kind in self._logged or (stays and not again):
+        if not logged and (kind in self._logged or (kind == self._last and not again)):
             return False
-        self._logged[kind] = now
+        self._logged[kind], self._last = now, kind
         return True
 
 
@@ -146,6 +146,9 @@ class AlignmentNode(Node):
         # The worker's:
         self._aligner = Aligner(self._config)
         self._checks = InputChecks(self._config)
+        # Messages that the checks do not have yet: samples, and GNSS with their number before it.
+        self._unchecked: list[ImuSample] = []
+        self._unchecked_gnss: list[tuple[int, Fix | Velocity]] = []
         self._declared: Attitude | None = None
         self._imu_frame: str | None = None
         self._imu_received_ns = 0  # when the last sample of that IMU was received
@@ -156,7 +159,6 @@ class AlignmentNode(Node):
         self._reasons = ReasonLog()
         self._wake, self._stopping = threading.Event(), False
         self._worker = threading.Thread(target=self._run, name='ins_align', daemon=True)
-
         self._open_topics()
         self.get_logger().info(inputs_in_words(self, self._inputs, self._config))
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -206,7 +208,7 @@ class AlignmentNode(Node):
         try:
             items = gnss_from_msg(topic, msg, self._config)
         except MessageError as error:
-            why = str(error)
+            why = '' if topic in self._unused else str(error)
             items = [lambda: self._aligner.reject(REJECTED_AS[topic], why)]
         self._inbox.extend((info['received_timestamp'], item) for item in items)
 
@@ -236,7 +238,7 @@ class AlignmentNode(Node):
         """Give the aligner what has come, and publish the results."""
         # Topics wait in separate queues: restore the order of reception.
         items.sort(key=itemgetter(0))
-        items, mounting = self._search.take(items, time.monotonic())
+        items, mounting = self._search.take(items, time.monotonic(), self._other_frames)
         if mounting is not None:
             self._use_mounting(mounting)
         self._feed(items)
@@ -249,6 +251,7 @@ class AlignmentNode(Node):
         events = self._aligner.take_events()
         for event in events:
             self._log(event.severity, event.text)
+            self._reasons.due(event.text, time.monotonic(), True, logged=True)
         # By a clock that does not stop with simulated time.
         if events or time.monotonic() >= self._next_status:
             self._publish_status()
@@ -262,7 +265,6 @@ class AlignmentNode(Node):
             self._config = dataclasses.replace(self._config, lever_arm=mounting.config.lever_arm)
             self._aligner = Aligner(self._config, mounting.base)
             self._checks = InputChecks(self._config)
-            self._imu_frame = None
 
     def _log(self, severity: Severity, text: str) -> None:
         # rclpy allows one severity for each line of code.
@@ -275,24 +277,23 @@ class AlignmentNode(Node):
 
     def _feed(self, items: list[tuple[int, Any]]) -> None:
         """Give messages to the aligner and the checks, and do the requests in between."""
-        samples: list[ImuSample] = []
-        gnss: list[tuple[int, Fix | Velocity]] = []  # with the number of samples before it
         for received_ns, item in items:
             if isinstance(item, ImuSample):
                 if self._accepts_frame(item.frame_id, received_ns):
                     self._aligner.add_imu(item.stamp_ns, item.gyro, item.accel)
-                    samples.append(item)
+                    self._unchecked.append(item)
             elif isinstance(item, Fix):
                 self._aligner.add_fix(item)
-                gnss.append((len(samples), item))
+                self._unchecked_gnss.append((len(self._unchecked), item))
             elif isinstance(item, Velocity):
                 self._aligner.add_velocity(item)
-                gnss.append((len(samples), item))
+                self._unchecked_gnss.append((len(self._unchecked), item))
             else:
                 item()
-        stamps, gyro, accel, _ = zip(*samples) if samples else ((), (), (), ())
+        stamps, gyro, accel, _ = zip(*self._unchecked) if self._unchecked else ((), (), (), ())
         self._checks.add(np.array(stamps, np.int64), np.array(gyro).reshape(-1, 3),
-                         np.array(accel).reshape(-1, 3), gnss)
+                         np.array(accel).reshape(-1, 3), self._unchecked_gnss)
+        self._unchecked, self._unchecked_gnss = [], []
 
     def _align(self) -> None:
         """Process the epochs that are ready, and publish their results."""
@@ -306,6 +307,8 @@ class AlignmentNode(Node):
         self._align()  # messages before the request count, whenever the worker took them
         self._aligner.reset(why)
         self._checks = InputChecks(self._config)
+        self._unchecked, self._unchecked_gnss = [], []
+        self._search.forget()
 
     def _accepts_frame(self, frame_id: str, received_ns: int) -> bool:
         """
@@ -329,6 +332,7 @@ class AlignmentNode(Node):
                 self._start_over(
                     f'frame_id of the IMU changed from {self._imu_frame!r} to {frame_id!r}')
                 self._other_frames.add(self._imu_frame)
+                self._other_frames.discard(frame_id)
             self._imu_frame = frame_id
         self._imu_received_ns = received_ns
         return True
@@ -357,8 +361,8 @@ class AlignmentNode(Node):
             header=self._header(attitude.stamp_ns), quaternion=Quaternion(**turn)))
 
     def _header(self, stamp_ns: int) -> Header:
-        return Header(stamp=Time(nanoseconds=stamp_ns).to_msg(),
-                      frame_id=self._config.world_frame_id)
+        sec, nanosec = divmod(stamp_ns, 1_000_000_000)  # rclpy.time has no negative times
+        return Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=self._config.world_frame_id)
 
     def _publish_numbers(self, epoch: Epoch) -> None:
         """Publish angles and sigmas of an epoch, for plots."""
@@ -377,7 +381,9 @@ class AlignmentNode(Node):
         self._next_status = now + STATUS_PERIOD
         status = self._checks.judge(self._aligner.status())
         level = level_of(status.state)
-        silent = 0.0 if self._imu_heard is None else now - self._imu_heard
+        # While a transform is waited for, samples are kept from the aligner.
+        silent = (0.0 if self._imu_heard is None or self._search.waits_for
+                  else now - self._imu_heard)
         faults = [] if first else self._input_faults(status, silent > IMU_SILENT)
         if silent > IMU_SILENT:
             # The aligner goes by stamps: it notices a gap only when the next sample comes.
@@ -410,7 +416,8 @@ class AlignmentNode(Node):
             (FIX_TOPIC, status.state is State.WAITING_FOR_GNSS),
             (VELOCITY_TOPIC, self._config.use_velocity is True
              and not status.counts.get('velocity'))) if wanted]
-        return list(topic_faults(self, self._inputs, expected))
+        used = {topic: kind for topic, kind in self._inputs.items() if topic not in self._unused}
+        return list(topic_faults(self, used, expected))
 
     # Topics and parameters
 
@@ -424,6 +431,7 @@ class AlignmentNode(Node):
         self._state_publisher = self._publish_on(UInt8, '~/state', 10)
         gnss = gnss_topics(self._config)
         self._inputs = {IMU_TOPIC: Imu, **gnss}
+        self._unused = {VELOCITY_TOPIC} if self._config.use_velocity is False else set()
         self._gate = Gate()
         self._imu_subscription = self._subscribe_to(
             Imu, IMU_TOPIC, self._on_imu, IMU_DEPTH, self._gate)
@@ -450,7 +458,8 @@ class AlignmentNode(Node):
             QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT),
             callback_group=group,
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            # A shorter queue would lose samples while the gate is closed.
+            qos_overriding_options=QoSOverridingOptions((QoSPolicyKind.RELIABILITY,)),
             raw=msg_type is Imu)
 
     def _declare_parameters(self) -> Config:
