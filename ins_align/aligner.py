@@ -429,7 +429,7 @@ class Aligner:
         """
         Return the current attitude, propagated with the gyros to the newest IMU sample.
 
-        None before there is an attitude, and after a gap of the IMU.
+        None before there is an attitude, and after a time in which the IMU measured too little.
         """
         prediction = self.prediction()
         return None if prediction is None else prediction.attitude()
@@ -440,6 +440,8 @@ class Aligner:
         if current is None or method is None:
             return None
         stamps, rates, rate, usual = self._imu.rates_since(current.stamp_ns)
+        if stamps.size and self._imu.silence(current.stamp_ns, int(stamps[-1])):
+            return None
         sensors = method.sensor_errors()
         prediction = Prediction(
             current, sensors.gyro_bias, sensors.gyro_matrix,

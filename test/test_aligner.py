@@ -915,6 +915,18 @@ def test_imu_that_sends_the_same_again_and_again_is_not_believed(flight):
     assert counts['imu_stuck'] == counts['restarts'] == 1
 
 
+def test_no_attitude_is_carried_over_values_that_repeat(flight):
+    """For 0.3 s in a turn; no epoch has been processed since."""
+    aligner = Aligner(config_for(flight))
+    s = stick(flight, 12.0, 12.3)
+    feed_part(aligner, s, 0.0, 11.9)
+    assert aligner.attitude_now() is not None
+    feed_part(aligner, s, 11.9, 12.6)
+    status = aligner.status()
+    assert status.current.stamp_ns < flight.imu_stamps_ns[0] + 12 * SECOND
+    assert aligner.attitude_now() is None
+
+
 def test_while_the_imu_is_stuck_that_is_the_reason(flight):
     aligner = Aligner(config_for(flight))
     feed_part(aligner, stick(flight, 12.0, 20.0), 0.0, 18.0)

@@ -215,6 +215,26 @@ def test_a_receiver_is_preferred_to_the_wheels(tmp_path, scenario, heading_deg):
     assert fits == (scenario == 'straight')
 
 
+def test_a_receiver_is_preferred_to_a_filter(tmp_path):
+    """Of a combined unit, which sends the output of its filter more often."""
+    write_bag(simulate('car', seed=1, duration=30.0, gnss_rate=10.0), tmp_path / 'gnss')
+    with Bag(tmp_path / 'gnss') as bag:
+        messages = [(topic.name, time, deserialize(data, topic)) for topic, time, data
+                    in messages_of(bag) if topic.name in TOPICS]
+    filtered = {f'/ekf{name}': kind for name, kind in TOPICS.items() if name != '/imu/data_raw'}
+    both = [each for name, time, message in messages for each in (
+        [(name, time, message)] if name == '/imu/data_raw' else
+        [(f'/ekf{name}', time, message)]
+        + [(name, time, message)] * (message.header.stamp.nanosec // 100_000_000 % 2))]
+    info = inspect(write_messages(tmp_path / 'both', 'mcap', both, {**TOPICS, **filtered}))
+    assert info.chosen == {'imu': '/imu/data_raw', 'fix': '/fix', 'velocity': '/fix_velocity'}
+    assert 'output of a filter' not in describe(info)
+    alone = [each for each in both if each[0] in filtered or each[0] == '/imu/data_raw']
+    info = inspect(write_messages(tmp_path / 'alone', 'mcap', alone, {
+        '/imu/data_raw': TOPICS['/imu/data_raw'], **filtered}))
+    assert '/ekf/fix is the output of a filter, by its name' in describe(info)
+
+
 def test_velocities_of_other_types(changed):
     """Vector3Stamped is read if its name says velocity, a Twist without a stamp is named."""
     types = typestore().types

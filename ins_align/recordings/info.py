@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 import math
 import os
+import re
 import shlex
 from typing import Any
 
@@ -45,6 +46,8 @@ import numpy as np
 
 WEAK_CHANGE = 1.0  # m/s: smaller changes of velocity show no heading with a usual receiver
 MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
+# Names of topics with the output of a filter, whose errors last and which is not at the antenna.
+FUSED = re.compile(r'(^|[/_])(ekf|ukf|filter|filtered|fused)([/_]|$)', re.IGNORECASE)
 MIN_AHEAD = 0.3  # s: a smaller difference of clocks may be jitter
 MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s, sigmas: a delay beyond the sum of both is set
 FRAMES_THAT_FIT = ('enu', 'ned')
@@ -112,6 +115,9 @@ def inspect(path: str | os.PathLike[str]) -> Info:
                     {kind: data and data.name for kind, data in chosen.items()})
         _add_manoeuvres(info, grid)
         for data in filter(None, chosen.values()):
+            if data.kind != 'imu' and FUSED.search(data.name):
+                info.add(f'{data.name} is the output of a filter, by its name: an alignment needs '
+                         'the measurements of a receiver, at its antenna')
             if data.faults:
                 info.add(f'{data.name} cannot be used: {data.faults[0]}', fault=True)
         if velocity is None and fix is not None and not fix.faults:
@@ -193,11 +199,11 @@ def _survey_imu(data: Recorded, motion: Series, gravity: float, alone: bool) -> 
 
 
 def _best(topics: list[Recorded]) -> Recorded | None:
-    """Return the topic without faults to read: by known frame, no doubt and usable messages."""
+    """Return the topic without faults to read: a receiver's, with the most usable messages."""
     good = [data for data in topics if not data.faults]
     return max(good, default=None, key=lambda data: (
         data.figures.get('frame') in FRAMES_THAT_FIT, not data.doubt,
-        np.count_nonzero(data.usable)))
+        not FUSED.search(data.name), np.count_nonzero(data.usable)))
 
 
 def _add_manoeuvres(info: Info, velocities: Series) -> None:
@@ -236,7 +242,7 @@ def _add_timing(info: Info, imu: Recorded, gnss: list[Recorded], motion: Series,
     """Add delay and lateness of GNSS messages against the IMU, and the noise of velocities."""
     source = gnss[-1]
     apart = imu.age_s - source.age_s
-    lateness = _lateness(imu, gnss)
+    lateness, behind = _lateness(imu, gnss), 0.0
     found = fit_motion(imu.series(), Series(motion.times + apart, motion.vectors), gravity,
                        (0.0, apart) if abs(apart) >= MIN_AHEAD else (0.0,))
     info.add('', gnss_lateness=lateness, **found)
@@ -247,16 +253,16 @@ def _add_timing(info: Info, imu: Recorded, gnss: list[Recorded], motion: Series,
         info.add(f'delay of the GNSS against the IMU: {delay:+.2f} s +- {max(std, 0.01):.2f} s, '
                  'as the motion of the IMU shows',
                  {'gnss_delay': round(delay, 2)} if abs(delay) > least else {})
-        if delay < -least:
-            lateness += delay  # the alignment itself adds a delay above 0 to gnss_lateness
+        if delay < -least:  # the alignment itself adds a delay above 0 to gnss_lateness
+            behind = delay
     elif ahead >= MIN_AHEAD:
         info.add(f'the stamps of GNSS messages are {ahead:.1f} s ahead of those of the IMU: their '
                  'clocks differ, which gnss_delay corrects as far as messages were recorded at '
                  'once', {'gnss_delay': round(ahead, 1)})
     if source.kind == 'velocity' and 'velocity_noise' in found:
         _add_velocity_noise(info, source)
-    if Config.gnss_lateness < lateness < MAX_LATENESS:
-        text, value = lateness_advice(lateness)
+    if Config.gnss_lateness < lateness + behind < MAX_LATENESS:
+        text, value = lateness_advice(lateness + behind, behind)
         info.add(text, {'gnss_lateness': float(value)})
 
 
