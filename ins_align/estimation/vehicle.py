@@ -39,6 +39,8 @@ SLIPS = {'car': math.radians(1.0), 'boat': math.radians(10.0), 'aeroplane': math
 INTERVAL, NOISE = 1.0, 0.05
 # Sigma of the speed at which a vehicle reverses (m/s).
 BACKWARDS_SPEED = 2.0
+# Headings of a rival differ when the cosine of the angle between two of them is below this.
+ONE_WAY = 0.5
 # The speed of a vehicle that moves is so many of its sigmas: the direction of noise would feign a
 # heading.
 MOVES = 5.0
@@ -100,10 +102,10 @@ class Vehicle:
                + apply(H_v[q][..., FIRST:], filters.x - model.point[q]))
         to_base = self._axes.T @ back.swapaxes(1, 2)
         v = apply(to_base[q], v_b)
-        # While its headings differ by 60 deg and more, a rival goes in the direction in which it
-        # sets out; later it may turn back. The derivatives are those at motion along x.
+        # While its headings differ, a rival goes in the direction in which it sets out; later it
+        # may turn back. The derivatives are those at motion along x.
         x_n0 = apply(filters.C, self._axes[:, 0])
-        open_ = np.minimum.reduceat(np.sum(x_n0 * x_n0[lead][q], axis=1), filters.first) < 0.5
+        open_ = np.minimum.reduceat(np.sum(x_n0 * x_n0[lead][q], axis=1), filters.first) < ONE_WAY
         fast = np.linalg.norm(v_b[lead], axis=1)
         moves = fast > MOVES * np.sqrt(np.einsum('mij,mjk,mik->m', H_v, filters.P, H_v) / 3)
         speed = np.where(open_, along * fast, v[lead, 0] * (along != 0))
