@@ -160,6 +160,8 @@ class Aligner:
     def reject(self, reason: str, why: str = '') -> None:
         """Count a message that the caller could not use; `why`, in words, is an event once."""
         self._counts[reason] += 1
+        if self.config.use_velocity is False and reason.startswith('velocity'):
+            return
         self._refusal = why or self._refusal
         if why and why not in self._warned and len(self._warned) < MAX_WARNINGS:
             self._warned.add(why)

@@ -149,6 +149,12 @@ def test_wanted_velocities_are_waited_for(flight, changes):
     assert 'no GNSS velocity' in status.reason
 
 
+def test_faults_of_velocities_that_are_not_wanted_are_only_counted():
+    aligner = Aligner(Config(use_velocity=False))
+    aligner.reject('velocity_body_frame', 'in the wrong axes')
+    assert aligner.status().counts['velocity_body_frame'] == 1 and not aligner.take_events()
+
+
 @pytest.mark.parametrize('changes', (
     {'use_velocity': True}, {'method': 'vif'}, {'use_position': False}))
 def test_fixes_and_velocities_of_different_epochs_start_together(flight, changes):

@@ -208,7 +208,7 @@ class AlignmentNode(Node):
         try:
             items = gnss_from_msg(topic, msg, self._config)
         except MessageError as error:
-            why = '' if topic in self._unused else str(error)
+            why = str(error)
             items = [lambda: self._aligner.reject(REJECTED_AS[topic], why)]
         self._inbox.extend((info['received_timestamp'], item) for item in items)
 
@@ -416,8 +416,10 @@ class AlignmentNode(Node):
             (FIX_TOPIC, status.state is State.WAITING_FOR_GNSS),
             (VELOCITY_TOPIC, self._config.use_velocity is True
              and not status.counts.get('velocity'))) if wanted]
-        used = {topic: kind for topic, kind in self._inputs.items() if topic not in self._unused}
-        return list(topic_faults(self, used, expected))
+        inputs = dict(self._inputs)
+        if self._config.use_velocity is False:
+            inputs.pop(VELOCITY_TOPIC, None)
+        return list(topic_faults(self, inputs, expected))
 
     # Topics and parameters
 
@@ -431,7 +433,6 @@ class AlignmentNode(Node):
         self._state_publisher = self._publish_on(UInt8, '~/state', 10)
         gnss = gnss_topics(self._config)
         self._inputs = {IMU_TOPIC: Imu, **gnss}
-        self._unused = {VELOCITY_TOPIC} if self._config.use_velocity is False else set()
         self._gate = Gate()
         self._imu_subscription = self._subscribe_to(
             Imu, IMU_TOPIC, self._on_imu, IMU_DEPTH, self._gate)
