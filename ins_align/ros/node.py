@@ -416,9 +416,8 @@ class AlignmentNode(Node):
             (FIX_TOPIC, status.state is State.WAITING_FOR_GNSS),
             (VELOCITY_TOPIC, self._config.use_velocity is True
              and not status.counts.get('velocity'))) if wanted]
-        inputs = dict(self._inputs)
-        if self._config.use_velocity is False:
-            inputs.pop(VELOCITY_TOPIC, None)
+        inputs = {topic: kind for topic, kind in self._inputs.items()
+                  if topic != VELOCITY_TOPIC or self._config.use_velocity is not False}
         return list(topic_faults(self, inputs, expected))
 
     # Topics and parameters
