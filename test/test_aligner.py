@@ -1406,7 +1406,8 @@ def test_errors_that_last_are_not_taken_for_a_quiet_receiver():
     assert len(errors) > 200 and max(errors) < 25.0
 
 
-@pytest.mark.parametrize('scenario', ['robot', 'hover'])
+@pytest.mark.parametrize('scenario', [
+    'hover', pytest.param('robot', marks=pytest.mark.campaign)])
 def test_positions_that_come_more_often_say_no_more(scenario):
     """A receiver filters over 2 s errors that last 20 s, at 20 Hz, and states none of it."""
     s = simulated(scenario, imu_grade='mems', duration=100.0, gnss_rate=20.0, seed=2,
