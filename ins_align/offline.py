@@ -205,7 +205,7 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
                           'which arrays do not have: leave them out, and set lever_arm')
     unit_ns = 1.0 if np.asarray(stamps).dtype.kind in 'iu' else 1e9
     stamps_ns = _nanoseconds('the IMU', np.ma.asarray(stamps), unit_ns)
-    rates, forces = _numbers(gyro), _numbers(accel)
+    rates, forces = _numbers('gyro', gyro), _numbers('accel', accel)
     for name, array in (('gyro', rates), ('accel', forces)):
         if stamps_ns.ndim != 1 or array.shape != (stamps_ns.size, 3):
             raise ValueError(f'{name} has the shape {array.shape} and stamps {stamps_ns.shape}: '
@@ -232,14 +232,18 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     return result
 
 
-def _numbers(given: Any) -> Array:
+def _numbers(name: str, given: Any) -> Array:
     """Return an array of floats, with nan for what is masked."""
-    return np.asarray(np.ma.filled(np.ma.asarray(given, float), np.nan))
+    try:
+        return np.asarray(np.ma.filled(np.ma.asarray(given, float), np.nan))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f'{name} must be numbers in rows of the same length ({error}); times are '
+                         'seconds, or integer nanoseconds') from None
 
 
 def _nanoseconds(name: str, stamps: np.ndarray, unit_ns: float) -> Index:
     if stamps.dtype.kind not in 'iu' or np.ma.is_masked(stamps):
-        stamps = np.round(_numbers(stamps) * unit_ns)
+        stamps = np.round(_numbers(f'the stamps of {name}', stamps) * unit_ns)
         if not np.all(np.abs(stamps) < MAX_STAMP_NS):
             raise ValueError(f'the stamps of {name} must be seconds, or nanoseconds if those of '
                              'the IMU are integers, without nan and none of them masked')
@@ -279,7 +283,7 @@ def _messages(name: str, given: Any, kind: type, unit_ns: float, config: Config)
         return []
     if all(isinstance(message, kind) for message in given):
         return list(given)
-    table = _numbers(given)
+    table = _numbers(name, given)
     if table.ndim != 2 or table.shape[1] not in (4, 7, 13):
         columns = 'latitude, longitude, altitude' if kind is Fix else 'east, north, up'
         raise ValueError(f'{name} have the shape {table.shape}: it must be (K, 4), (K, 7) or '

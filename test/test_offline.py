@@ -148,6 +148,14 @@ def test_clocks_may_be_as_far_apart_as_gnss_delay_says(flight):
     assert ins_align.align(*imu(flight), fixes, velocities, gnss_delay=50.0, **LEVER).aligned
 
 
+def test_what_is_no_number_gets_a_sentence(flight):
+    times, fixes = pd.to_datetime(flight.imu_stamps_ns), pd.DataFrame(tables(flight, 'std')[0])
+    of_times = fixes.assign(stamp=pd.to_datetime(fixes[0]))
+    for stamps, given in ((list(times), fixes), (flight.imu_stamps_ns, of_times)):
+        with pytest.raises(ValueError, match='must be numbers .* times are seconds, or integer'):
+            ins_align.align(stamps, *imu(flight)[1:], given, None, **LEVER)
+
+
 def test_a_frame_without_rows_has_no_messages(flight):
     empty = pd.DataFrame({'stamp': [], 'latitude': [], 'longitude': [], 'altitude': []})
     result = ins_align.align(*imu(flight), empty, None, **LEVER)
