@@ -1498,7 +1498,8 @@ def test_a_receiver_that_never_measures_the_vertical_is_noticed(flight, result):
     assert run(lambda v: 0.0 * v).counts['velocity_no_vertical'] == 0
 
 
-@pytest.mark.parametrize('scenario', ['car', 'flight', 'hover'])
+@pytest.mark.parametrize('scenario', [
+    pytest.param('car', marks=pytest.mark.campaign), 'flight', 'hover'])
 def test_a_velocity_that_nothing_measures_says_nothing_about_the_tilt(scenario):
     """It is unknown to metres per second, and turns with errors of the attitude."""
     squares = []

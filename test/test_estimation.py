@@ -538,7 +538,8 @@ def test_a_chip_at_rest_is_no_surer_of_its_tilt_than_of_its_accelerometers():
     assert least > 0.8 * np.degrees(PRESETS['chip'].accel_bias_std / STANDARD_GRAVITY)
 
 
-@pytest.mark.parametrize('lever_arm_std, least', [(0.0, 95.0), (1.0, 100.0)])
+@pytest.mark.parametrize('lever_arm_std, least', [
+    pytest.param(0.0, 95.0, marks=pytest.mark.campaign), (1.0, 100.0)])
 def test_a_chip_at_rest_knows_no_rate_about_the_vertical(lever_arm_std, least):
     """Noise that looks like a turn must not say that there is one, however quiet the receiver."""
     for seed in range(2):

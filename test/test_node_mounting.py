@@ -120,9 +120,9 @@ def test_a_base_alone_does_not_wait_for_the_antenna(lever_arm_from_tf, antenna_f
     assert mounting.config.lever_arm == (1.0, 2.0, 3.0)
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize('base_frame, vehicle', [
-    ('', 'none'), *(pytest.param('base_link', vehicle, marks=pytest.mark.campaign)
-                    for vehicle in ('none', 'car'))])
+    ('', 'none'), ('base_link', 'none'), ('base_link', 'car')])
 def test_node_with_tf_gives_the_numbers_of_the_parameter(tmp_path, monkeypatch, base_frame,
                                                          vehicle):
     package = tmp_path / 'path' / 'tf2_ros'
