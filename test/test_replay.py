@@ -13,6 +13,7 @@
 # limitations under the License.
 """Replay: the same numbers whatever the format, the blocks, the reference."""
 
+from contextlib import closing, contextmanager
 from dataclasses import replace
 import json
 from pathlib import Path
@@ -35,6 +36,16 @@ import pytest
 from recordings import real_recording, write_recording
 
 CONFIG = Config(lever_arm=(1.0, 1.0, 1.0))
+
+
+@contextmanager
+def copied(flight, path):
+    """Open a copy of the flight's database, to change it."""
+    with closing(sqlite3.connect(path)) as copy:
+        with closing(sqlite3.connect(flight / 'flight.db3')) as database:
+            database.backup(copy)
+        yield copy
+        copy.commit()
 
 
 @pytest.fixture(scope='module')
@@ -81,15 +92,10 @@ def test_format_does_not_matter(simulation, result, tmp_path):
 
 def test_reference_is_not_read_by_the_alignment(flight, result, tmp_path):
     """A reference that lies changes the comparison and nothing else."""
-    database = sqlite3.connect(flight / 'flight.db3')
-    liar = sqlite3.connect(tmp_path / 'liar.db3')
-    database.backup(liar)
-    database.close()
-    liar.execute('UPDATE messages SET data = (SELECT data FROM messages m WHERE '
-                 "m.topic_id = (SELECT id FROM topics WHERE name='/reference/imu') LIMIT 1) "
-                 "WHERE topic_id = (SELECT id FROM topics WHERE name='/reference/imu')")
-    liar.commit()
-    liar.close()
+    with copied(flight, tmp_path / 'liar.db3') as liar:
+        liar.execute('UPDATE messages SET data = (SELECT data FROM messages m WHERE '
+                     "m.topic_id = (SELECT id FROM topics WHERE name='/reference/imu') LIMIT 1) "
+                     "WHERE topic_id = (SELECT id FROM topics WHERE name='/reference/imu')")
     other = replay(tmp_path / 'liar.db3', CONFIG)
     assert numbers(other) == numbers(result)
     assert other.reference.attitude_at(result.status.current.stamp_ns) is None
@@ -176,17 +182,12 @@ def test_progress_goes_up_to_one(flight):
 
 
 def test_what_cannot_be_decoded_is_counted(flight, tmp_path):
-    database = sqlite3.connect(flight / 'flight.db3')
-    spoilt = sqlite3.connect(tmp_path / 'spoilt.db3')
-    database.backup(spoilt)
-    database.close()
-    for topic, every in (('/imu/data_raw', 100), ('/fix', 10), ('/fix_velocity', 10)):
-        spoilt.execute("UPDATE messages SET data = x'00010000ff' WHERE id IN (SELECT id FROM "
-                       '(SELECT id, row_number() OVER (ORDER BY id) AS number FROM messages '
-                       'WHERE topic_id = (SELECT id FROM topics WHERE name = ?)) '
-                       'WHERE number % ? = 0)', (topic, every))
-    spoilt.commit()
-    spoilt.close()
+    with copied(flight, tmp_path / 'spoilt.db3') as spoilt:
+        for topic, every in (('/imu/data_raw', 100), ('/fix', 10), ('/fix_velocity', 10)):
+            spoilt.execute("UPDATE messages SET data = x'00010000ff' WHERE id IN (SELECT id FROM "
+                           '(SELECT id, row_number() OVER (ORDER BY id) AS number FROM messages '
+                           'WHERE topic_id = (SELECT id FROM topics WHERE name = ?)) '
+                           'WHERE number % ? = 0)', (topic, every))
     counts = replay(tmp_path / 'spoilt.db3', CONFIG).status.counts
     assert counts['imu_undecodable'] == 30
     assert counts['fix_undecodable'] == 15
@@ -195,15 +196,10 @@ def test_what_cannot_be_decoded_is_counted(flight, tmp_path):
 
 
 def test_first_velocity_that_is_damaged(flight, tmp_path):
-    database = sqlite3.connect(flight / 'flight.db3')
-    spoilt = sqlite3.connect(tmp_path / 'spoilt.db3')
-    database.backup(spoilt)
-    database.close()
-    spoilt.execute("UPDATE messages SET data = x'00010000' WHERE id = (SELECT min(id) "
-                   'FROM messages WHERE topic_id = (SELECT id FROM topics '
-                   "WHERE name = '/fix_velocity'))")
-    spoilt.commit()
-    spoilt.close()
+    with copied(flight, tmp_path / 'spoilt.db3') as spoilt:
+        spoilt.execute("UPDATE messages SET data = x'00010000' WHERE id = (SELECT min(id) "
+                       'FROM messages WHERE topic_id = (SELECT id FROM topics '
+                       "WHERE name = '/fix_velocity'))")
     result, info = replay(tmp_path / 'spoilt.db3', CONFIG), inspect(tmp_path / 'spoilt.db3')
     assert result.warnings == () and result.topics.velocity.name == '/fix_velocity'
     assert result.status.counts['velocity_undecodable'] == 1

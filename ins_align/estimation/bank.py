@@ -252,9 +252,9 @@ class Bank:
         vehicle = self._vehicle
         filters.propagate(model, k)
         self._seconds += model.duration[k]
-        due = vehicle is not None and vehicle.is_due(model.duration[k], any(measured.present[k]))
         self._innovation = NO_INNOVATION
         kinds = [kind for kind, present in enumerate(measured.present[k]) if present]
+        due = vehicle is not None and vehicle.is_due(model.duration[k], bool(kinds))
         if not kinds:
             return
         # A vehicle that moves along its own axis tells something of the vertical velocity.

@@ -94,11 +94,10 @@ class _Results:
         prediction: Prediction | None = None
         last_ns, last_gyro = 0, np.zeros(3)
         time_ns = epoch_ns = 0
-        for time_ns, data, stamp_ns, gyro, accel in self._samples():
+        for time_ns, data, stamp_ns, gyro, accel, good in self._samples():
             if self._imu_frame is None:
                 header = getattr(deserialize(data, self._topic), 'header', None)
                 self._imu_frame = getattr(header, 'frame_id', '')
-            good = bool((np.abs(gyro) < MAX_RATE).all())
             # Not all epochs up to the stamp: it may be far ahead, or the clock is set back later.
             while epochs and 0 <= stamp_ns - epochs[0].stamp_ns <= MAX_GAP_NS:
                 epoch = epochs.popleft()
@@ -121,14 +120,15 @@ class _Results:
             yield from self._of_epoch(epoch, time_ns)
         yield 'status', time_ns, self._status(self._result.status)
 
-    def _samples(self) -> Iterator[tuple[int, Any, int, Any, Any]]:
-        """Yield recorded time, message, stamp, rate and specific force of the IMU."""
+    def _samples(self) -> Iterator[tuple[int, Any, int, Any, Any, bool]]:
+        """Yield recorded time, message, stamp, rate, specific force, and if the rate is valid."""
         with Bag(self._result.bag) as bag:
             for block in bag.blocks([self._topic]):
                 samples = decode_imu(block.messages[0], self._topic)
+                good = (np.abs(samples.gyro) < MAX_RATE).all(axis=1)
                 for place, *numbers in zip(
                         np.flatnonzero(samples.decoded).tolist(), samples.stamps_ns.tolist(),
-                        samples.gyro, samples.accel):
+                        samples.gyro, samples.accel, good.tolist()):
                     yield int(block.times_ns[place]), block.messages[0][place], *numbers
 
     def _prediction(self, epoch: Epoch, rate: Any, interval: float) -> Prediction | None:
