@@ -19,15 +19,13 @@ from collections.abc import Sequence
 from contextlib import suppress
 import dataclasses
 from functools import lru_cache
-from itertools import groupby
 from typing import Any, NamedTuple
 
 from ins_align.config import Config
 from ins_align.gnss.drivers import (
     DRIVER_TYPES, imu_from_driver, INERTIAL_UNITS, receiver_from_msg, RECEIVERS, type_in_words)
 from ins_align.gnss.messages import (
-    Fix, fixes_from_msgs, frame_of_velocity, imu_from_msg, MessageError,
-    velocities_from_msgs, Velocity)
+    Fix, fixes_from_msgs, imu_from_msg, MessageError, velocities_from_msgs, Velocity)
 from ins_align.recordings import Topic
 import numpy as np
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
@@ -111,15 +109,13 @@ def decode_imu(messages: Sequence[bytes], topic: Topic) -> ImuSamples:
     for place, data in enumerate(messages):
         with suppress(MessageError):
             message = deserialize(data, topic)
+            stamps_ns[place], numbers[place, GYRO], numbers[place, ACCEL] = (
+                imu_from_msg(message) if topic.msgtype == IMU_TYPE else
+                imu_from_driver(message, topic.msgtype))
             if topic.msgtype == IMU_TYPE:
-                stamps_ns[place], numbers[place, GYRO], numbers[place, ACCEL] = imu_from_msg(
-                    message)
                 q = message.orientation
                 numbers[place, ORIENTATION] = q.x, q.y, q.z, q.w
                 numbers[place, ORIENTATION_COVARIANCE] = message.orientation_covariance
-            else:
-                stamps_ns[place], numbers[place, GYRO], numbers[place, ACCEL] = imu_from_driver(
-                    message, topic.msgtype)
             decoded[place] = True
     return ImuSamples(stamps_ns[decoded], numbers[decoded], decoded)
 
@@ -144,39 +140,29 @@ def _decode_imu_rows(data: np.ndarray, encoding: str) -> tuple[np.ndarray, np.nd
 def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config) -> dict[str, list[Gnss]]:
     """Decode messages with positions, velocities or both: by kind, one `Gnss` per message."""
     kinds = KINDS[topic.msgtype]
-    found: dict[str, list[Gnss]] = {kind: [] for kind in kinds}
-    if topic.msgtype in RECEIVERS:
-        for data in messages:
-            both: Sequence[Gnss]
-            try:
-                both = receiver_from_msg(deserialize(data, topic), topic.msgtype, config)
-            except MessageError as error:
-                both = [Refused(f'{kind}_undecodable', str(error)) for kind in kinds]
-            for kind, message in zip(kinds, both):
-                found[kind].append(message)
-        return found
-    kind, = kinds
-    if kind == 'velocity':
+    if topic.msgtype in VELOCITY_TYPES:
         config = dataclasses.replace(config, velocity_type=short_name(topic.msgtype))
+    rows = [_decode_gnss_message(data, topic, config) for data in messages]
+    return {kind: [row[column] for row in rows] for column, kind in enumerate(kinds)}
 
-    def frame_of(message: Any) -> str | None:
-        if message is None:
-            return None
-        return '' if kind == 'fix' else frame_of_velocity(message, config.velocity_type)
 
-    # Consecutive messages with the same frame are converted together.
-    for frame, group in groupby((deserialize_or_none(data, topic) for data in messages), frame_of):
-        alike = list(group)
-        if frame is None:
-            found[kind] += [Refused(f'{kind}_undecodable')] * len(alike)
-        elif kind == 'fix':
-            found[kind] += fixes_from_msgs(alike)
-        else:
-            try:
-                found[kind] += velocities_from_msgs(alike, config)
-            except MessageError as error:
-                found[kind] += [Refused('velocity_body_frame', str(error))] * len(alike)
-    return found
+def _decode_gnss_message(data: bytes, topic: Topic, config: Config) -> Sequence[Gnss]:
+    """Decode one message: one `Gnss` for each of its kinds."""
+    kinds = KINDS[topic.msgtype]
+    if topic.msgtype in RECEIVERS:
+        try:
+            return receiver_from_msg(deserialize(data, topic), topic.msgtype, config)
+        except MessageError as error:
+            return [Refused(f'{kind}_undecodable', str(error)) for kind in kinds]
+    message = deserialize_or_none(data, topic)
+    if message is None:
+        return [Refused(f'{kinds[0]}_undecodable')]
+    if topic.msgtype == FIX_TYPE:
+        return fixes_from_msgs([message])
+    try:
+        return velocities_from_msgs([message], config)
+    except MessageError as error:
+        return [Refused('velocity_body_frame', str(error))]
 
 
 def deserialize_or_none(data: bytes, topic: Topic) -> Any:
