@@ -24,14 +24,15 @@ import io
 from itertools import chain
 import json
 import os
+from pathlib import Path
 import sys
 from typing import Any, NoReturn
 
 from ins_align.config import (
     Config, config_from_mapping, load_params, parse_override, UsageError, without_unknown)
 from ins_align.outputs import (
-    check_plot, check_writable, names_for, not_aligned, Outcome, process, STANDARD_OUTPUT,
-    survey, Task, write_whole)
+    check_plot, in_the_way, names_for, not_aligned, Outcome, process, STANDARD_OUTPUT, survey,
+    Task, write_whole)
 from ins_align.processes import keep_to_one, run_all, run_on_cluster
 
 # Everything else is imported where it is used: --help must not wait for numpy.
@@ -39,8 +40,7 @@ from ins_align.processes import keep_to_one, run_all, run_on_cluster
 ALIGNED, NOT_ALIGNED, UNUSABLE, INTERRUPTED, NO_READER = 0, 1, 2, 130, 141
 
 # Packages to install whose names differ from that of the module.
-PACKAGES = {'backports': 'backports.zstd', 'PIL': 'pillow', 'pyins': 'python-ins',
-            'yaml': 'pyyaml'}
+PACKAGES = {'backports': 'backports.zstd', 'pyins': 'python-ins', 'yaml': 'pyyaml'}
 
 SCENARIOS = 'flight, car, straight, static, hover, launch, reverse, swing, highway, robot'
 
@@ -105,43 +105,39 @@ def main(argv: Sequence[str] | None = None) -> int:
     if unknown:
         arguments.parser.error(f'unrecognized arguments: {" ".join(unknown)}')
     try:
+        if arguments.command is None:
+            arguments.parser.print_help()
+            return UNUSABLE
         status = int(arguments.run(arguments))
         print(end='', flush=True)
         return status
     except KeyboardInterrupt:
         return INTERRUPTED
-    except ModuleNotFoundError as error:
-        sentence, status = str(_not_installed(error)), UNUSABLE
     except BrokenPipeError:  # the reader of the output has ended, as "head" does
-        sentence, status = '', NO_READER
-    except (UsageError, OSError) as error:
-        sentence, status = str(error), UNUSABLE
-        if isinstance(error, OSError):
-            sentence = f'{error.filename or "output"}: {error.strerror}'
-            if error.filename is None:  # disk full: closing would fail again
-                os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    if sentence:
-        print(f'ins_align {arguments.command}: {sentence}', file=sys.stderr)
-    return status
+        return NO_READER
+    except ModuleNotFoundError as error:
+        sentence = _not_installed(error)
+    except UsageError as error:
+        sentence = str(error)
+    except OSError as error:
+        sentence = f'{error.filename or "output"}: {error.strerror}'
+        if error.filename is None:  # disk full: closing would fail again
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    print(f'ins_align {arguments.command}: {sentence}', file=sys.stderr)
+    return UNUSABLE
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
     top = Parser(prog='ins_align', description=DESCRIPTION)
     top.add_argument('--version', action='version', version=f'%(prog)s {_version()}')
-    top.set_defaults(run=_help, parser=top)  # without a command
+    top.set_defaults(parser=top)
     commands = top.add_subparsers(dest='command', metavar='COMMAND', title='commands')
     _add_info(commands)
     _add_replay(commands)
     _add_simulate(commands)
     _add_experiment(commands)
     return top
-
-
-def _help(arguments: argparse.Namespace) -> int:
-    """Print the help if no command is given."""
-    arguments.parser.print_help()
-    return UNUSABLE
 
 
 def _add_command(commands: Any, name: str, run: Callable[[argparse.Namespace], int],
@@ -330,9 +326,10 @@ def _check_outputs(arguments: argparse.Namespace, files: dict[str, list[str]]) -
     if arguments.json not in (None, STANDARD_OUTPUT):
         outputs.append(arguments.json)
     inputs = [*arguments.bags, *filter(None, [getattr(arguments, 'params', None)])]
-    targets = list(map(os.path.realpath, outputs))
+    inputs, targets = (list(map(os.path.realpath, paths)) for paths in (inputs, outputs))
     for path, target in zip(outputs, targets):
-        check_writable(path, inputs)
+        if what := in_the_way(Path(target), inputs):
+            raise UsageError(f'cannot write {path}: {what}')
         if targets.count(target) > 1:
             raise UsageError(f'{path} is given for two outputs')
 
@@ -378,12 +375,12 @@ def _config(arguments: argparse.Namespace) -> Config:
     return config_from_mapping(values)
 
 
-def _not_installed(error: ModuleNotFoundError) -> UsageError:
-    """Return the error that says what to install; raise that of a missing module of our own."""
+def _not_installed(error: ModuleNotFoundError) -> str:
+    """Return a sentence that says what to install; raise the error if the module is our own."""
     if (error.name or 'ins_align').startswith('ins_align'):
         raise error
     name = (error.name or '').split('.')[0]
-    return UsageError(f'{error.name} is not installed: pip install {PACKAGES.get(name, name)}')
+    return f'{error.name} is not installed: pip install {PACKAGES.get(name, name)}'
 
 
 def run_simulate(arguments: argparse.Namespace) -> int:

@@ -154,13 +154,7 @@ def about(bag: str, text: str) -> str:
     return f'{name}: {text}'
 
 
-def check_writable(path: str, inputs: Sequence[str]) -> None:
-    """Raise UsageError, before the work, if an output cannot be written or spoils an input."""
-    if what := _in_the_way(Path(os.path.realpath(path)), list(map(os.path.realpath, inputs))):
-        raise UsageError(f'cannot write {path}: {what}')
-
-
-def _in_the_way(target: Path, inputs: Sequence[str]) -> str:
+def in_the_way(target: Path, inputs: Sequence[str]) -> str:
     """Return why nothing should be written there, or ''; links are resolved in all paths."""
     from ins_align.recordings.bag import begins_like_a_recording, STORAGE_NAME
 
