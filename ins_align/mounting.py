@@ -48,7 +48,6 @@ class FixedFrames:
     """The frame tree of /tf_static."""
 
     def __init__(self) -> None:
-        """Start without any frame."""
         self._parents: dict[str, tuple[str, Transform]] = {}
 
     def add(self, msg: Any) -> None:
@@ -81,11 +80,7 @@ class Mounting(NamedTuple):
 
 
 def find_mounting(lookup: Lookup, imu_frame: str, antenna_frame: str, config: Config) -> Mounting:
-    """
-    Look up the transforms that ``lever_arm_from_tf`` and ``base_frame`` ask for.
-
-    `imu_frame` and `antenna_frame` are the frame_ids of the IMU and the position messages.
-    """
+    """Look up what the parameters ask for between the frame_ids of IMU and position messages."""
     words: list[Event] = []
     missing: list[str] = []
     base, complete = None, True

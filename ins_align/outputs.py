@@ -112,11 +112,7 @@ def _naming(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def write_whole(path: str | os.PathLike[str], write: Callable[[IO[bytes]], Any]) -> None:
-    """
-    Write a file whole or not at all; `write` gets the open file.
-
-    The target of a link is replaced, not the link. What exists and is no file is not replaced.
-    """
+    """Write a file, or the target of a link, whole or not at all; `write` gets the open file."""
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():
         raise FileExistsError(errno.EEXIST, 'it is no file', str(path))

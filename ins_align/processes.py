@@ -43,8 +43,7 @@ def keep_to_one() -> None:
     """
     Limit linear algebra libraries that are not loaded yet to one thread, if nothing else is set.
 
-    The matrices here are too small to be shared out. More threads would only wait in a busy loop,
-    which takes processor time from other processes.
+    The matrices here are small: more threads would only wait in busy loops.
     """
     for variable in VARIABLES:
         os.environ.setdefault(variable, '1')

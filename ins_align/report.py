@@ -53,8 +53,7 @@ def format_table(rows: Sequence[Sequence[Any]], header: Sequence[str] = (),
     """
     Return a table as text, with the first column aligned to the left, the others to the right.
 
-    Floats are written with four significant digits, None as a dash. `indent` begins every line;
-    there is no newline at the end.
+    Floats have four significant digits, None is a dash. `indent` begins every line.
     """
     cells = [[_cell(cell) for cell in row] for row in rows]
     if header:
@@ -161,13 +160,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def plot(result: Result) -> Figure:
-    """
-    Draw the figure of a recording.
-
-    It shows the attitude with its sigma and the times when it was declared, the sigmas and their
-    thresholds, normalised innovations, biases, the track by state, and errors if there is a
-    reference.
-    """
+    """Draw attitude, sigmas, innovations, biases and track; errors if there is a reference."""
     history = _History(result)
     figure = new_figure(16.0, 11.0)
     figure.suptitle(f'{one_line(Path(result.bag).name or result.bag)}: {result.state_in_words}',
@@ -202,11 +195,7 @@ def plot(result: Result) -> Figure:
 
 
 class _History:
-    """
-    The epochs of a result as arrays over time.
-
-    Epochs without GNSS or without an attitude are rows of nan, so that no line is drawn across.
-    """
+    """Epochs as arrays; those without GNSS or attitude are nan, so that no line crosses them."""
 
     def __init__(self, result: Result) -> None:
         epochs = result.epochs

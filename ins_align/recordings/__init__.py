@@ -87,11 +87,10 @@ def max_message_bytes(msgtype: str) -> int:
 
 def unpack(data: bytes, compression: str, limit: int, damaged: bytes | None = None) -> bytes:
     """
-    Unpack data; if they were cut off, return what is left of them.
+    Unpack data, as far as they go; return `damaged` for damaged data.
 
     Raises a BagError if they unpack to more than `limit` bytes or the compression is not
-    supported. For damaged data it returns `damaged`; if that is None, the error of the library is
-    raised, of whatever type it is.
+    supported, and where `damaged` is None the error of the library, of whatever type.
     """
     if compression in ('', 'none'):
         return data

@@ -32,8 +32,7 @@ from typing import Any, NamedTuple
 from ins_align.recordings import (
     BagError, listed, MAX_CHUNK_BYTES, MAX_HELD_BYTES, max_message_bytes, MAX_METADATA_BYTES,
     MAX_TF_BYTES, MAX_TOPICS, max_unpacked_bytes, one_line, Topic, unpack, ZSTD_MAGIC, ZSTD_MODULE)
-from ins_align.recordings.salvage import MAGIC as MCAP_MAGIC
-from ins_align.recordings.salvage import SalvagedMcap
+from ins_align.recordings.salvage import MCAP_MAGIC, SalvagedMcap
 import numpy as np
 from rosbags import rosbag1, rosbag2
 from rosbags.rosbag2 import storage_mcap
@@ -100,9 +99,9 @@ class Bag:
             self.warnings.append(one_line(text))
 
     def blocks(self, topics: Sequence[Topic], start_ns: int | None = None,
-               stop_ns: int | None = None, size: int | None = None) -> Iterator[Block]:
+               stop_ns: int | None = None, size: int = BLOCK) -> Iterator[Block]:
         """
-        Yield the messages of some topics in recorded order, `size` (or `BLOCK`) at a time.
+        Yield the messages of some topics in recorded order, `size` at a time.
 
         `start_ns` and `stop_ns` bound the recorded time; the stop is exclusive. Without bounds, a
         warning is added at the end if the files count more messages.
@@ -112,7 +111,7 @@ class Bag:
         with _bag_errors(self.path):
             records = self._records(numbers, start_ns, stop_ns)
             found = 0
-            while group := list(itertools.islice(records, size or BLOCK)):
+            while group := list(itertools.islice(records, size)):
                 messages: list[list[bytes]] = [[] for _ in topics]
                 for number, _, data in group:
                     messages[number].append(data)
@@ -138,8 +137,7 @@ class Bag:
         sources = [reader.messages(chosen, start_ns, stop_ns) for reader in self._readers
                    if (chosen := [connection for connection in reader.connections
                                   if id(connection) in numbers])]
-        for connection, time_ns, data in (
-                sources[0] if len(sources) == 1 else heapq.merge(*sources, key=itemgetter(1))):
+        for connection, time_ns, data in heapq.merge(*sources, key=itemgetter(1)):
             if type(data) is not bytes:  # a database may hold text, numbers or NULL instead
                 data = b''
             elif len(data) > (limit := max_message_bytes(connection.msgtype)):
@@ -170,7 +168,6 @@ class Bag:
             try:
                 with _bag_errors(path):
                     readers.append(self._open_file(path, stack))
-                    stack.callback(readers[-1].close)
             except BagError as error:
                 errors.append(str(error))
         if not readers:
@@ -214,13 +211,11 @@ class Bag:
             path = self._unpack_file(path, stack)
         magic = _first_bytes(path)
         if magic.startswith(MCAP_MAGIC):
-            return self._open_mcap(path)
+            return self._open_mcap(path, stack)
         if magic.startswith(SQLITE_MAGIC):
             return self._open_sqlite(path, stack)
         if magic.startswith(ROSBAG1_MAGIC):
-            reader = _Rosbag1Reader(path)
-            reader.open()
-            return reader
+            return _opened(_Rosbag1Reader(path), stack)
         raise BagError('is no recording: neither mcap, sqlite3 nor ROS 1 bag' if magic else
                        'is empty')
 
@@ -242,17 +237,22 @@ class Bag:
                 self.warn(f'{path.name} was cut off or is damaged: it is read as far as it goes')
         return target
 
-    def _open_mcap(self, path: Path) -> Any:
-        """Open an mcap file with rosbags, or if that fails, read it as far as it goes."""
+    def _open_mcap(self, path: Path, stack: ExitStack) -> Any:
+        """Open an mcap file with rosbags, within limits; if that fails, as far as it goes."""
+        for name in ('lz4', 'zstd'):
+            storage_mcap.DECOMPRESSORS[name] = partial(_unpack_chunk, name)
         try:
-            return _open_whole_mcap(path)
+            reader = _opened(rosbag2.Reader(path), stack)
+            _check_chunks(reader.storage.chunks, max_unpacked_bytes(path.stat().st_size))
+            return reader
         except BagError:
             raise
         except Exception:  # damaged bytes cause errors of every kind in rosbags
-            reader = SalvagedMcap(path)
-        if not reader.complete:
+            salvaged = SalvagedMcap(path)
+        stack.callback(salvaged.close)
+        if not salvaged.complete:
             self.warn(f'{path.name} was cut off or is damaged: it is read as far as it goes')
-        return reader
+        return salvaged
 
     def _open_sqlite(self, path: Path, stack: ExitStack) -> Any:
         """Open a sqlite3 file with rosbags."""
@@ -269,24 +269,16 @@ class Bag:
             for table in ('topics', 'message_definitions'):
                 with suppress(sqlite3.OperationalError):  # there is no such table
                     _check_topics(*database.execute(f'SELECT count(*) FROM {table}').fetchone())
-        reader: Any = rosbag2.Reader(path)
-        reader.open()
+        reader = _opened(rosbag2.Reader(path), stack)
         with suppress(AttributeError):  # rosbags without apsw; `_records` checks lengths anyway
             reader.storage.dbconn.limit(SQLITE_LIMIT_LENGTH, MAX_TF_BYTES)
         return reader
 
 
-def _open_whole_mcap(path: Path) -> Any:
-    """Open an mcap file with rosbags, which is made to unpack within limits."""
-    for name in ('lz4', 'zstd'):
-        storage_mcap.DECOMPRESSORS[name] = partial(_unpack_chunk, name)
-    reader: Any = rosbag2.Reader(path)
+def _opened(reader: Any, stack: ExitStack) -> Any:
+    """Open a reader of rosbags, to be closed with the recording."""
     reader.open()
-    try:
-        _check_chunks(reader.storage.chunks, max_unpacked_bytes(path.stat().st_size))
-    except BaseException:
-        reader.close()
-        raise
+    stack.callback(reader.close)
     return reader
 
 

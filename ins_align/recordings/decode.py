@@ -190,11 +190,7 @@ def _typestore(encoding: str, msgtype: str, definition: str) -> Any:
 
 
 def deserialize(data: bytes, topic: Topic) -> Any:
-    """
-    Deserialise one message with rosbags.
-
-    Raises a MessageError if the bytes are no such message or the type is not defined.
-    """
+    """Deserialise a message; a MessageError says that it is damaged or its type not defined."""
     if topic.msgtype in DRIVER_TYPES and not topic.definition:
         raise MessageError(
             f'the recording has no definition of {type_in_words(topic.msgtype)}: record as mcap, '

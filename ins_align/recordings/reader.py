@@ -116,8 +116,8 @@ def _mounting(bag: Bag, topics: Topics, config: Config) -> Mounting:
                 with suppress(MessageError):
                     for transform in deserialize(data, topic).transforms:
                         frames.add(transform)
-    found = find_mounting(frames.lookup, _frame_id(bag, topics.imu), _frame_id(bag, topics.fix),
-                          config)
+    found = find_mounting(frames.lookup, frame_id_of(bag, topics.imu),
+                          frame_id_of(bag, topics.fix), config)
     if found.missing:
         raise BagError(f'{bag.path} has no transform {" and none ".join(found.missing)}: '
                        'lever_arm_from_tf and base_frame need /tf_static with them')
@@ -127,7 +127,7 @@ def _mounting(bag: Bag, topics: Topics, config: Config) -> Mounting:
     return found
 
 
-def _frame_id(bag: Bag, topic: Topic) -> str:
+def frame_id_of(bag: Bag, topic: Topic) -> str:
     """Return the first frame_id in the first messages of a topic; empty if there is none."""
     for data in bag.first_messages(topic):
         with suppress(MessageError, AttributeError):
@@ -211,11 +211,7 @@ def _required(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None
 
 def _choose(bag: Bag, what: str, groups: Sequence[list[str]], name: str | None,
             config: Config = Config()) -> Topic | None:
-    """
-    Return the topic with a name, or the only usable one of the first group of types that has any.
-
-    `what` is a key of OPTIONS. Returns None if no topic has one of these types.
-    """
+    """Return the topic with a name, or the only usable one of the first types that have any."""
     if name is not None:
         return _named(bag, what, list(dict.fromkeys(itertools.chain(*groups))), name)
     for types in groups:
@@ -262,11 +258,7 @@ def candidates(bag: Bag, types: Collection[str]) -> list[Topic]:
 
 
 def doubt(first: Sequence[bytes], topic: Topic, config: Config = Config()) -> str:
-    """
-    Return why a topic is not what its type promises; '' if it is.
-
-    Of its first messages the first one is judged that can be deserialised.
-    """
+    """Return why a topic is not what its type promises, judged by one of its messages, or ''."""
     if not first:
         return 'it has no messages'
     read = (deserialize_or_none(data, topic) for data in first)

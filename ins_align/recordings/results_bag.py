@@ -29,6 +29,7 @@ from ins_align.imu.prediction import Prediction
 from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import decode_imu, deserialize
+from ins_align.recordings.reader import frame_id_of
 from ins_align.results import Epoch, FOR_PLOTS, level_of, Result, State, Status, status_values
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -78,7 +79,7 @@ class _Results:
         assert result.topics is not None
         self._result, self._types = result, types
         self._topic, self._base = result.topics.imu, result.topics.base
-        self._imu_frame: str | None = None  # known from the first message on
+        self._imu_frame = ''
         self._state: State | None = None  # of the epoch before
         self._status_ns = -STATUS_PERIOD_NS
         nan = np.full(3, math.nan)
@@ -95,9 +96,6 @@ class _Results:
         last_ns, last_gyro = 0, np.zeros(3)
         time_ns = epoch_ns = 0
         for time_ns, data, stamp_ns, gyro, accel, good in self._samples():
-            if self._imu_frame is None:
-                header = getattr(deserialize(data, self._topic), 'header', None)
-                self._imu_frame = getattr(header, 'frame_id', '')
             # Not all epochs up to the stamp: it may be far ahead, or the clock is set back later.
             while epochs and 0 <= stamp_ns - epochs[0].stamp_ns <= MAX_GAP_NS:
                 epoch = epochs.popleft()
@@ -123,6 +121,7 @@ class _Results:
     def _samples(self) -> Iterator[tuple[int, Any, int, Any, Any, bool]]:
         """Yield recorded time, message, stamp, rate, specific force, and if the rate is valid."""
         with Bag(self._result.bag) as bag:
+            self._imu_frame = frame_id_of(bag, self._topic)
             for block in bag.blocks([self._topic]):
                 samples = decode_imu(block.messages[0], self._topic)
                 good = (np.abs(samples.gyro) < MAX_RATE).all(axis=1)
@@ -177,7 +176,7 @@ class _Results:
         return self._make(STATUS, self._header(status.stamp_ns or 0), [self._make(
             'diagnostic_msgs/msg/DiagnosticStatus', level_of(status.state),
             'ins_align: alignment', f'{status.state.value}: {status.reason}'.removesuffix(': '),
-            self._imu_frame or '', [self._make('diagnostic_msgs/msg/KeyValue', *each)
+            self._imu_frame, [self._make('diagnostic_msgs/msg/KeyValue', *each)
                                     for each in values.items()])])
 
     def _header(self, stamp_ns: int) -> Any:

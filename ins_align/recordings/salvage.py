@@ -27,7 +27,7 @@ from ins_align.recordings import (
 from rosbags.interfaces import (
     Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat)
 
-MAGIC = b'\x89MCAP0\r\n'
+MCAP_MAGIC = b'\x89MCAP0\r\n'
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 2, 3, 4, 5, 6
 _KINDS = {*range(1, 16), *range(128, 256)}  # of records; private from 128 on
 _RECORD_HEAD = struct.Struct('<BQ')  # kind and length
@@ -56,24 +56,20 @@ class SalvagedMcap:
             self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         schemas: dict[int, tuple[str, MessageDefinition]] = {}
         channels: dict[int, tuple[int, str, str]] = {}  # schema, topic, encoding
-        try:
-            for data, kind, begin, end in self._records():
-                if kind == _MESSAGE and end - begin >= _MESSAGE_HEAD.size:
-                    _, _, time_ns, _ = _MESSAGE_HEAD.unpack_from(data, begin)
-                    self.start_time = min(self.start_time, time_ns)
-                    self.end_time = max(self.end_time, time_ns + 1)
-                elif kind in (_SCHEMA, _CHANNEL) and end - begin <= MAX_DEFINITION_BYTES:
-                    record = data[begin:end]
-                    key, = _ID.unpack_from(record)
-                    if kind == _SCHEMA:
-                        name, encoding, text = _strings(record, 2, 3)
-                        schemas[key] = name, MessageDefinition(
-                            _FORMATS.get(encoding, MessageDefinitionFormat.NONE), text)
-                    else:
-                        channels[key] = _ID.unpack_from(record, 2)[0], *_strings(record, 4, 2)
-        except BaseException:
-            self.close()
-            raise
+        for data, kind, begin, end in self._records():
+            if kind == _MESSAGE and end - begin >= _MESSAGE_HEAD.size:
+                _, _, time_ns, _ = _MESSAGE_HEAD.unpack_from(data, begin)
+                self.start_time = min(self.start_time, time_ns)
+                self.end_time = max(self.end_time, time_ns + 1)
+            elif kind in (_SCHEMA, _CHANNEL) and end - begin <= MAX_DEFINITION_BYTES:
+                record = data[begin:end]
+                key, = _ID.unpack_from(record)
+                if kind == _SCHEMA:
+                    name, encoding, text = _strings(record, 2, 3)
+                    schemas[key] = name, MessageDefinition(
+                        _FORMATS.get(encoding, MessageDefinitionFormat.NONE), text)
+                else:
+                    channels[key] = _ID.unpack_from(record, 2)[0], *_strings(record, 4, 2)
         for channel, (schema, topic, encoding) in channels.items():
             self.connections.append(Connection(
                 channel, topic, *schemas.get(schema, _NO_SCHEMA), '', 0,
@@ -102,7 +98,7 @@ class SalvagedMcap:
         """Yield data, kind, start and end in the data of each record, also of those in chunks."""
         left = max_unpacked_bytes(len(self._file))
         whole = True
-        for kind, begin, end in _split(self._file, len(MAGIC)):
+        for kind, begin, end in _split(self._file, len(MCAP_MAGIC)):
             if kind != _CHUNK:
                 self.complete = kind == _FOOTER and whole
                 yield self._file, kind, begin, end

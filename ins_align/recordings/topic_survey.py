@@ -205,8 +205,6 @@ def read_candidates(bag: Bag) -> list[Recorded]:
     parts: dict[tuple[Topic, str], list[Columns]] = defaultdict(list)
     for block in bag.blocks(topics):
         for number, (topic, messages) in enumerate(zip(topics, block.messages)):
-            if not messages:
-                continue
             first[topic] += messages[:FIRST - len(first[topic])]
             counts[topic] += len(messages)
             times_ns = block.times_ns[block.topics == number]
