@@ -13,8 +13,6 @@
 # limitations under the License.
 """The command ``ins_align``: inspect and replay recordings, simulate, repeat experiments."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields

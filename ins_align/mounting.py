@@ -13,8 +13,6 @@
 # limitations under the License.
 """Where the antenna and the vehicle's base frame are on the robot, from its frame tree (TF)."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 import dataclasses

@@ -13,12 +13,10 @@
 # limitations under the License.
 """Alignment of recorded data: `replay` for recordings, `align` for arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 import os
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from ins_align.aligner import Aligner
 from ins_align.checks import InputChecks
@@ -31,9 +29,7 @@ from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings.motion_fit import fit_motion, MAX_DELAY_STD
 from ins_align.results import Epoch, in_order_of_time, Reference, Result, State
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 # `Aligner.update` is called after so many messages: an epoch costs less among many.
 MESSAGES = 2500
@@ -294,14 +290,14 @@ def _messages(name: str, given: Any, kind: type, unit_ns: float, config: Config)
         raise ValueError(f'the stamps of {name} must be nanoseconds, as those of the IMU, which '
                          'are integers: they look like another unit')
     known = table.shape[1] > 4
-    covariances = np.zeros((len(table), 6, 6))
+    covariances = np.zeros((len(table), 3, 3))
     if table.shape[1] == 7:
         # The square keeps the sign: a negative one means that it is not known.
         covariances[:, [0, 1, 2], [0, 1, 2]] = table[:, 4:] * np.abs(table[:, 4:])
     elif known:
-        covariances[:, :3, :3] = table[:, 4:].reshape(-1, 3, 3)
+        covariances = table[:, 4:].reshape(-1, 3, 3)
     if kind is Velocity:
         return messages.velocities(stamps_ns, '', table[:, 1:4],
                                    covariances if known else None, config)
     kinds = np.full(len(table), int(known))
-    return messages.fixes(stamps_ns, table[:, 1:4], covariances[:, :3, :3], kinds, 0 * kinds)
+    return messages.fixes(stamps_ns, table[:, 1:4], covariances, kinds, 0 * kinds)

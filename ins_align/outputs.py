@@ -13,8 +13,6 @@
 # limitations under the License.
 """What a command makes of a recording: its result, and output files, named and checked."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 import dataclasses

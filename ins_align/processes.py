@@ -13,8 +13,6 @@
 # limitations under the License.
 """Tasks in several processes, here or on a Dask cluster, and the threads that each may use."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool

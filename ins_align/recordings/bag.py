@@ -13,8 +13,6 @@
 # limitations under the License.
 """Opens recordings of every format with rosbags: their topics and serialised messages."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, ExitStack, suppress
 from functools import partial
@@ -87,7 +85,7 @@ class Bag:
                 self.topics = self._find_topics()  # those whose encoding is supported
             self._stack = stack.pop_all()
 
-    def __enter__(self) -> Bag:
+    def __enter__(self) -> 'Bag':
         return self
 
     def __exit__(self, *_: Any) -> None:

@@ -13,8 +13,6 @@
 # limitations under the License.
 """Decodes messages: of sensor_msgs/Imu many at once with numpy, all others with rosbags."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 import dataclasses

@@ -13,8 +13,6 @@
 # limitations under the License.
 """What a recording holds, found without an alignment, and the command that aligns it."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -36,11 +34,10 @@ from ins_align.gnss.motion import (
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings import BagError, printable
 from ins_align.recordings.bag import Bag
-from ins_align.recordings.imu_survey import survey_imu
 from ins_align.recordings.motion_fit import fit_motion
 from ins_align.recordings.reader import choose_topics
-from ins_align.recordings.topic_survey import (
-    read_candidates, Recorded, rounded, set_arguments, Surveyed)
+from ins_align.recordings.survey import (
+    read_candidates, Recorded, rounded, set_arguments, survey_imu, Surveyed)
 from ins_align.report import format_table
 import numpy as np
 

@@ -20,8 +20,6 @@ least-squares fit in each window gives rotation, v_0, biases and lever arm. The 
 likelihood is largest, with a noise of its own in each window; the residuals there show the noise.
 """
 
-from __future__ import annotations
-
 import math
 
 from ins_align.estimation.receiver import MOVING

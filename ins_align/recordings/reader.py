@@ -13,8 +13,6 @@
 # limitations under the License.
 """Chooses the topics of a recording that an alignment reads, and reads their messages."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 import dataclasses

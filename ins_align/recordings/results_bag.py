@@ -13,8 +13,6 @@
 # limitations under the License.
 """Writes results as a recording (mcap) with the topics of the node, to play with the input."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 import dataclasses

@@ -13,8 +13,6 @@
 # limitations under the License.
 """Reads an mcap file (https://mcap.dev/spec) that rosbags cannot open, as far as it goes."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 import mmap
 from pathlib import Path
