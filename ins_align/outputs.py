@@ -63,8 +63,8 @@ def process(task: Task, progress: Callable[[float], None] | None = None) -> Outc
     from ins_align.recordings import BagError
     from ins_align.report import plot, summary
 
-    def named(error: object) -> str:
-        return str(error).replace(str(task.arguments['path']), task.name or '.')
+    def named(text: object) -> str:
+        return about(task.name, str(text).replace(str(task.arguments['path']), task.name or '.'))
 
     try:
         result = replay(**task.arguments, progress=progress)
@@ -82,8 +82,7 @@ def process(task: Task, progress: Callable[[float], None] | None = None) -> Outc
         return not_aligned(task.name, named(error))
     except OSError as error:
         return not_aligned(task.name, f'cannot write {error.filename}: {error.strerror}')
-    warnings = tuple(about(task.name, named(text)) for text in result.warnings)
-    return Outcome(result.to_json(), summary(result), warnings)
+    return Outcome(result.to_json(), summary(result), tuple(map(named, result.warnings)))
 
 
 def survey(bag: str) -> Outcome:

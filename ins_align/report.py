@@ -58,12 +58,10 @@ def format_table(rows: Sequence[Sequence[Any]], header: Sequence[str] = (),
     cells = [[_cell(cell) for cell in row] for row in rows]
     if header:
         cells.insert(0, list(header))
-    width = max((len(row) for row in cells), default=0)
-    cells = [row + [''] * (width - len(row)) for row in cells]
-    widths = [max(len(row[column]) for row in cells) for column in range(width)]
-    lines = ['  '.join([row[0].ljust(widths[0])]
-                       + [cell.rjust(size) for cell, size in zip(row[1:], widths[1:])]).rstrip()
-             for row in cells if row]
+    columns = list(itertools.zip_longest(*cells, fillvalue=''))
+    widths = [max(map(len, column)) for column in columns]
+    lines = ['  '.join([first.ljust(widths[0]), *map(str.rjust, others, widths[1:])]).rstrip()
+             for first, *others in zip(*columns)]
     if header:
         lines.insert(1, '  '.join('-' * size for size in widths))
     return '\n'.join(indent + line for line in lines)
@@ -88,14 +86,12 @@ def summary(result: Result) -> str:
             ('declared', declared), ('initial', status.initial), ('final', status.current)):
         if attitude is None:
             continue
-        row = [name, f'{result.t_s(attitude):.1f}']
-        row += [f'{angle:.3f}' for angle in (
-            *attitude.roll_pitch_yaw_deg, attitude.heading_deg)]
-        row += [f'{sigma:.3f}' for sigma in attitude.sigma_deg]
-        if result.reference is not None:
-            row += ['-' if math.isnan(error) else f'{error:+.3f}'
-                    for error in result.reference.errors_deg(attitude)]
-        rows.append(row)
+        errors = () if result.reference is None else result.reference.errors_deg(attitude)
+        rows.append([
+            name, f'{result.t_s(attitude):.1f}',
+            *(f'{angle:.3f}' for angle in (
+                *attitude.roll_pitch_yaw_deg, attitude.heading_deg, *attitude.sigma_deg)),
+            *('-' if math.isnan(error) else f'{error:+.3f}' for error in errors)])
     if rows:
         header = ['attitude, deg', 'at, s', 'roll', 'pitch', 'yaw', 'heading', 'sigma e',
                   'n', 'u']

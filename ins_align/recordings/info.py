@@ -34,6 +34,7 @@ from ins_align.gnss.motion import (
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings import BagError, printable
 from ins_align.recordings.bag import Bag
+from ins_align.recordings.decode import short_name
 from ins_align.recordings.motion_fit import fit_motion
 from ins_align.recordings.reader import choose_topics
 from ins_align.recordings.survey import (
@@ -335,6 +336,6 @@ def describe(info: Info) -> str:
 
 def _row(topic: Recorded) -> list[str]:
     figures = topic.figures
-    return [topic.name, topic.msgtype.rsplit('/', 1)[-1], *(
+    return [topic.name, short_name(topic.msgtype), *(
         '-' if (value := figures.get(name)) is None else format(value, digits)
         for name, (_, digits) in COLUMNS.items())]
