@@ -115,8 +115,7 @@ class Bag:
                     messages[number].append(data)
                 found += len(group)
                 yield Block(np.array([time_ns for _, time_ns, _ in group], np.int64),
-                            np.array([number for number, _, _ in group]),
-                            [*map(_unpack_messages, messages, topics)])
+                            np.array([number for number, _, _ in group]), messages)
         counted = sum(connection.msgcount for reader in self._readers
                       for connection in reader.connections if id(connection) in numbers)
         if (start_ns, stop_ns) == (None, None) and found < counted:
@@ -125,22 +124,24 @@ class Bag:
 
     def first_messages(self, topic: Topic) -> Sequence[bytes]:
         """Return the first messages of a topic, at most `FIRST`."""
-        for block in self.blocks([topic], size=FIRST):
-            return block.messages[0]
-        return ()
+        block = next(self.blocks([topic], size=FIRST), None)
+        return block.messages[0] if block else ()
 
     def _records(self, numbers: Mapping[int, int], start_ns: int | None, stop_ns: int | None,
                  ) -> Iterator[tuple[int, int, bytes]]:
-        """Yield topic number, recorded time and message in recorded order; refuse long ones."""
+        """Yield topic number, recorded time and message, unpacked, in recorded order."""
         sources = [reader.messages(chosen, start_ns, stop_ns) for reader in self._readers
                    if (chosen := [connection for connection in reader.connections
                                   if id(connection) in numbers])]
         for connection, time_ns, data in heapq.merge(*sources, key=itemgetter(1)):
+            limit = max_message_bytes(connection.msgtype)
             if type(data) is not bytes:  # a database may hold text, numbers or NULL instead
                 data = b''
-            elif len(data) > (limit := max_message_bytes(connection.msgtype)):
+            elif len(data) > limit:
                 raise BagError(f'has a message of {len(data)} bytes or more on '
                                f'{connection.topic}, where {limit} are allowed')
+            elif data.startswith(ZSTD_MAGIC):  # messages may be compressed one by one
+                data = unpack(data, 'zstd', limit, damaged=b'')
             yield numbers[id(connection)], time_ns, data
 
     def _find_topics(self) -> tuple[Topic, ...]:
@@ -331,13 +332,6 @@ class _Rosbag1Reader(rosbag1.Reader):
         super().read_index_data(pos, indexes)
         if INDEX_ENTRY_BYTES * sum(map(len, indexes.values())) > self._size:
             raise ValueError('index larger than the file')
-
-
-def _unpack_messages(messages: list[bytes], topic: Topic) -> list[bytes]:
-    """Unpack the messages of a topic that are compressed; damaged ones become empty."""
-    limit = max_message_bytes(topic.msgtype)
-    return [unpack(message, 'zstd', limit, damaged=b'') if message.startswith(ZSTD_MAGIC)
-            else message for message in messages]
 
 
 def _first_bytes(path: Path) -> bytes:
