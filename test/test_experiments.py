@@ -178,7 +178,7 @@ def test_a_declared_run_is_judged_against_the_truth(monkeypatch):
     monkeypatch.setattr(declare, 'DURATION', 20.0)
     index = next(index for index, case in enumerate(map(declare.draw, range(500)))
                  if case[:2] == ('none', (('flight', 'navigation'),)))
-    result = common.run_case((declare.draw, index))
+    result = common.run_case((declare.draw(index), index))
     assert result['state'] == State.ALIGNED.value
     for moment in ('levelled', 'declared', 'final'):
         assert common.worst(result[moment]) < 5

@@ -19,26 +19,26 @@ Each prints its tables and writes ``NAME.md``, ``NAME.json`` and figures.
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
+import pkgutil
 
 from ins_align.config import UsageError
 
 # Title, function and default number of runs (0: it takes none), in the order of `all`.
 NAMES = {
-    'note': ("The note's experiment", 'bound.run_note', 100),
-    'bound': ('The estimator at the Cramer-Rao bound', 'bound.run', 100),
-    'declare': ('Declared means right', 'declare.run', 1000),
-    'declare-worse': ('IMUs worse than configured', 'declare.run_worse', 500),
-    'faults': ('What drivers get wrong', 'faults.run', 1000),
-    'weak-spots': ('Faults that are hard to see', 'weak_spots.run', 24),
-    'vehicle': ('The motion of a vehicle as a constraint', 'weak_spots.run_vehicle', 24),
-    'settings': ('Correct configurations of all kinds', 'declare.run_settings', 200),
-    'recordings': ('Real recordings', 'recordings.run', 0)}
+    'note': ("The note's experiment", 'bound:run_note', 100),
+    'bound': ('The estimator at the Cramer-Rao bound', 'bound:run', 100),
+    'declare': ('Declared means right', 'declare:run', 1000),
+    'declare-worse': ('IMUs worse than configured', 'declare:run_worse', 500),
+    'faults': ('What drivers get wrong', 'faults:run', 1000),
+    'weak-spots': ('Faults that are hard to see', 'weak_spots:run', 24),
+    'vehicle': ('The motion of a vehicle as a constraint', 'weak_spots:run_vehicle', 24),
+    'settings': ('Correct configurations of all kinds', 'declare:run_settings', 200),
+    'recordings': ('Real recordings', 'recordings:run', 0)}
 # Experiments that need recordings, and those that use them where there are some.
 NEED_DATA, TAKE_DATA = ('recordings',), ('vehicle', 'recordings')
 # Not part of `all`: it measures the machine too and needs ROS. Its runs are minutes of data.
-MEASUREMENTS = {'bench': ('Speed', 'bench.run', 60)}
+MEASUREMENTS = {'bench': ('Speed', 'bench:run', 60)}
 
 
 class ExperimentError(UsageError):
@@ -68,20 +68,15 @@ def run(name: str, out_dir: str | Path, data_dir: str | Path | None = None,
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ExperimentError(f'cannot write to {out}: {error.strerror}') from None
+    from ins_align.experiments.common import Report     # after the checks: it loads scipy
+
     for each in NAMES if name == 'all' else (name,):
         if each in NEED_DATA and data_dir is None:
             print(f'{each}: left out, it needs recordings (--data DIR)')
-        else:
-            _run(each, out, Path(data_dir) if data_dir and each in TAKE_DATA else None, runs, jobs)
-
-
-def _run(name: str, out: Path, data: Path | None, runs: int | None, jobs: int | None) -> None:
-    from ins_align.experiments.common import Report
-
-    title, path, default = (NAMES | MEASUREMENTS)[name]
-    runs = runs or default
-    module, function = path.split('.')
-    report = Report(name, title, out, (f' --runs {runs}' if default else '')
-                    + (' --data DIR' if data else ''))
-    experiment = getattr(importlib.import_module(f'ins_align.experiments.{module}'), function)
-    report.write(experiment(report, runs, jobs, data))
+            continue
+        title, path, default = (NAMES | MEASUREMENTS)[each]
+        data, number = Path(data_dir) if data_dir and each in TAKE_DATA else None, runs or default
+        report = Report(each, title, out, (f' --runs {number}' if default else '')
+                        + (' --data DIR' if data else ''))
+        experiment = pkgutil.resolve_name(f'ins_align.experiments.{path}')
+        report.write(experiment(report, number, jobs, data))

@@ -173,15 +173,7 @@ def epoch_rows() -> list[JsonDict]:
 
 # The processes beside the node
 
-def _types() -> dict[str, Any]:
-    """Return the topics to which the node subscribes, and their types."""
-    from geometry_msgs.msg import TwistWithCovarianceStamped
-    from sensor_msgs.msg import Imu, NavSatFix
-
-    return {'/imu/data_raw': Imu, '/fix': NavSatFix, '/fix_velocity': TwistWithCovarianceStamped}
-
-
-def _spin(name: str) -> None:
+def _spin(name: str, node: Any, types: dict[str, Any]) -> None:
     """Run the node ``bare``, ``republish`` or ``listen``."""
     import rclpy
     from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -189,34 +181,29 @@ def _spin(name: str) -> None:
     def nothing(msg: Any) -> None:
         pass
 
-    node, types = rclpy.create_node(name), _types()
     imu_type = types['/imu/data_raw']
     if name == 'listen':
         for topic in '/republish/imu', '/ins_align/imu':
             node.create_subscription(imu_type, topic, nothing, 100, raw=True)
-    else:
-        for topic, kind in types.items():
-            take = nothing
-            if name == 'republish' and kind is imu_type:
-                take = node.create_publisher(imu_type, '~/imu', 100).publish
-            node.create_subscription(kind, topic, take, QoSProfile(
-                depth=2000 if kind is imu_type else 200,
-                reliability=ReliabilityPolicy.BEST_EFFORT))
+        types = {}
+    for topic, kind in types.items():
+        take = nothing
+        if name == 'republish' and kind is imu_type:
+            take = node.create_publisher(imu_type, '~/imu', 100).publish
+        node.create_subscription(kind, topic, take, QoSProfile(
+            depth=2000 if kind is imu_type else 200, reliability=ReliabilityPolicy.BEST_EFFORT))
     # The timer wakes the executor, which would miss a signal that comes between two waits.
     node.create_timer(1.0, lambda: None)
     rclpy.spin(node)
 
 
-def _play(bag: str) -> None:
+def _play(bag: str, node: Any, types: dict[str, Any]) -> None:
     """Publish the messages of a recording at the times at which they were recorded."""
-    import rclpy
     from rosbags.highlevel import AnyReader
 
-    types = _types()
     with AnyReader([Path(bag)]) as reader:
         script = [(connection.topic, time_ns, data) for connection, time_ns, data
                   in reader.messages() if connection.topic in types]
-    node = rclpy.create_node('play')
     publish = {topic: node.create_publisher(kind, topic, 1000).publish
                for topic, kind in types.items()}
     time.sleep(2.0)     # for publishers and subscribers to discover each other
@@ -228,15 +215,20 @@ def _play(bag: str) -> None:
 
 def main(name: str, *arguments: str) -> int:
     """Run one of the processes beside the node until it is interrupted."""
+    from geometry_msgs.msg import TwistWithCovarianceStamped
     import rclpy
     from rclpy.executors import ExternalShutdownException
+    from sensor_msgs.msg import Imu, NavSatFix
 
     rclpy.init()
+    node = rclpy.create_node(name)
+    # The topics to which the node subscribes.
+    types = {'/imu/data_raw': Imu, '/fix': NavSatFix, '/fix_velocity': TwistWithCovarianceStamped}
     with suppress(ExternalShutdownException):
         if name == 'play':
-            _play(*arguments)
+            _play(*arguments, node, types)
         else:
-            _spin(name)
+            _spin(name, node, types)
     return 0
 
 

@@ -89,11 +89,6 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     return {'runs': runs, 'results': results}
 
 
-def _lever_arm(seed: int) -> JsonDict:
-    """Draw the true lever arm of a run in which it is unknown."""
-    return {'lever_arm': LEVER_STD * np.random.default_rng([3, seed]).standard_normal(3)}
-
-
 def run_exact(task: tuple[Case, int]) -> JsonDict:
     """
     Run a case with a seed, and return the errors of the attitude at t0 at each of K epochs.
@@ -103,7 +98,8 @@ def run_exact(task: tuple[Case, int]) -> JsonDict:
     """
     case, seed = task
     if 'lever_arm_std' in case.config:      # drawn in each run, while that of the bound is fixed
-        case = case._replace(drawn=_lever_arm)
+        lever_arm = LEVER_STD * np.random.default_rng([3, seed]).standard_normal(3)
+        case = case._replace(simulate=case.simulate | {'lever_arm': lever_arm})
     simulation, stream, aligner = prepare(case, seed)
     rows = []
     for epoch in itertools.chain(*follow(aligner, stream)):

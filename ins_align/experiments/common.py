@@ -14,9 +14,8 @@
 """
 What the experiments share: cases and their runs, errors against truth, tables and pages.
 
-A case describes a simulation, what spoils its messages, and the configuration of an aligner. A run
-is a case with a seed: the aligner takes the messages, and its attitudes are compared with the
-truth. An experiment lists its cases or draws them; a table has a row for all runs of a name.
+A run is a `Case` with a seed: the aligner takes the messages, and its attitudes are compared with
+the truth. An experiment lists its cases or draws them; a table has a row for all runs of a name.
 """
 
 from __future__ import annotations
@@ -55,11 +54,10 @@ Groups = list[tuple[str, list[JsonDict]]]       # a name and its runs, for each 
 def parallel(function: Callable[[Any], Any], groups: Sequence[Sequence[Any]], jobs: int | None,
              name: str = '') -> list[list[Any]]:
     """
-    Apply a function to the tasks of several groups in parallel; return the results by group.
+    Apply a function to the tasks of several groups as `run_all` does; return results by group.
 
-    Works as `run_all` does, but raises the first exception. Tasks that share a trajectory should
-    follow each other, because a process caches the last few. On a terminal a progress bar shows
-    the name.
+    Raises the first exception. Tasks that share a trajectory should follow each other, because a
+    process caches the last few. On a terminal a progress bar shows the name.
     """
     from tqdm import tqdm
 
@@ -111,11 +109,9 @@ def setup(random: Random) -> JsonDict:
             'mount_rpy_deg': random.uniform(-20, 20, 3).tolist()}
 
 
-def run_case(task: tuple[Case | Callable[[int], Case], int]) -> JsonDict:
-    """Run a case, or the one that a function draws from the seed, and judge it."""
+def run_case(task: tuple[Case, int]) -> JsonDict:
+    """Run a case with a seed, and judge it."""
     case, seed = task
-    if not isinstance(case, Case):
-        case = case(seed)
     simulation, stream, aligner = prepare(case, seed)
     epochs = [*itertools.chain(*follow(aligner, stream))]
     return outcome(case.name, simulation, stream, aligner, epochs)
@@ -199,9 +195,8 @@ def error_of(attitude: Attitude, C_true: Array, extra_std_deg: Any = 0.0) -> Jso
     Compare an attitude with the true ``C_nb``.
 
     `extra_std_deg` (3,), the sigma of the truth itself about east, north and up, is added in
-    quadrature. The result has the errors about these axes as ``angles_deg`` (3,), their normalised
-    squared error ``nees``, and tilt and heading in degrees and in stated sigmas; the sigmas of the
-    tilt are those of the worse of its two axes.
+    quadrature. Returns the errors about these axes (``angles_deg``), their normalised square
+    ``nees``, and tilt and heading in degrees and in sigmas, for the tilt those of its worse axis.
     """
     phi = log_so3(C_true @ attitude.C_nb.T)
     covariance = attitude.covariance + np.diag(np.radians(np.broadcast_to(extra_std_deg, 3)) ** 2)
@@ -260,10 +255,9 @@ def while_aligned(epochs: Sequence[Epoch], start_ns: int, true: Truth,
     Judge the current attitude in all epochs that are aligned.
 
     `start_ns` is the stamp of the first IMU sample; `std_deg` (3,) is the sigma of the truth about
-    east, north and up. The result has errors at the first declaration (``first``, a list) and its
-    time in s (``declared_s``), the number of epochs with known truth, the largest errors, how many
-    epochs are ``beyond`` each of `SIGMA_LIMITS`, the time beyond the last of these, and the part
-    of the time that is aligned.
+    east, north and up. ``first`` is a list of the errors at the first declaration, ``declared_s``
+    its time; ``beyond`` counts epochs with known truth above each of `SIGMA_LIMITS`, ``beyond_s``
+    is the time above the last of these.
     """
     stamps = np.array([epoch.stamp_ns for epoch in epochs], np.int64)
     lasts_s = np.clip(np.diff(stamps, append=stamps[-1:]) / SECOND, 0.0, LONGEST)

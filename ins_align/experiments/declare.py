@@ -56,7 +56,7 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run the three parts of ``declare``; `runs` is for the first, the others have fewer."""
     silent_seeds = range(SILENT_SEED, SILENT_SEED + max(runs // SILENT_PART, 1))
     [found, *silent] = parallel(run_case, [
-        [(draw, index) for index in range(runs)],
+        [(draw(index), index) for index in range(runs)],
         *([(case, seed) for seed in silent_seeds] for case in SILENT)], jobs, 'declare')
     waits = time_to_heading(max(runs // TIME_PART, 1), jobs)
     report.text(
@@ -228,7 +228,7 @@ COMBINATIONS: tuple[tuple[str, ...], ...] = (
 
 def run_worse(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``declare-worse``."""
-    [found] = parallel(run_case, [[(draw_worse, seed) for seed in range(runs)]],
+    [found] = parallel(run_case, [[(draw_worse(seed), seed) for seed in range(runs)]],
                        jobs, 'declare-worse')
     report.text(
         f'{runs} runs of {DURATION:g} s over all scenarios ({", ".join(CAMPAIGN_SCENARIOS)}), '
@@ -269,8 +269,8 @@ MEASURED: dict[str, JsonDict] = {
 
 def run_settings(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run ``settings``."""
-    [found] = parallel(run_case, [[(draw_settings, seed) for seed in range(runs)]], jobs,
-                       'settings')
+    [found] = parallel(run_case, [[(draw_settings(seed), seed) for seed in range(runs)]],
+                       jobs, 'settings')
     report.text(
         f'{runs} runs without faults that are configured correctly, except that half of the '
         f'receivers do not state their noise: motions ({", ".join(MOVING)}) after up to three '

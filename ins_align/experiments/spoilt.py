@@ -20,8 +20,9 @@ notes the counters of the aligner that it determines.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 import itertools
 from operator import itemgetter
 from typing import Any
@@ -96,12 +97,11 @@ class Stream:
         """Draw a time, ns; `low` and `high` are parts of the duration."""
         return self.first + int(random.uniform(low, high) * (self.last - self.first))
 
-    def windows(self, random: Random, number: int, shortest: float,
-                longest: float) -> list[Window]:
-        """Draw windows whose lengths are within limits, s."""
-        starts = [self.moment(random) for _ in range(number)]
-        return [(start, start + int(random.uniform(shortest, longest) * SECOND))
-                for start in starts]
+    def windows(self, random: Random, number: tuple[int, int],
+                length: tuple[float, float]) -> list[Window]:
+        """Draw windows; number (the upper end excluded) and length (s) are from ranges."""
+        starts = [self.moment(random) for _ in range(random.integers(*number))]
+        return [(start, start + int(random.uniform(*length) * SECOND)) for start in starts]
 
     def seconds(self, name: str) -> Array:
         """Return the arrivals of messages, s since the start."""
@@ -110,12 +110,6 @@ class Stream:
     def keep(self, name: str, chosen: np.ndarray) -> None:
         """Drop all messages but the chosen ones."""
         setattr(self, name, getattr(self, name)[chosen])
-
-    def lose(self, names: Iterable[str], windows: Iterable[Window]) -> None:
-        """Drop the messages with stamps within windows."""
-        for window in windows:
-            for name in names:
-                self.keep(name, ~within(getattr(self, name), window))
 
     def add_error(self, name: str, chosen: np.ndarray, error: Array) -> None:
         """Add ENU errors, one each or one for all, to chosen positions (m) or velocities (m/s)."""
@@ -133,23 +127,19 @@ class Stream:
         reason why a message cannot be used.
         """
         fix = self.fix
-        payloads = {'fix': fixes(*(fix[name] for name in fix.dtype.names[1:])),
-                    'velocity': self._velocities(config),
-                    'update': [None] * len(self.updates), 'reset': [None] * len(self.resets)}
-        arrivals = {**{name: getattr(self, name)['arrival'] for name in SENSORS},
-                    'update': self.updates, 'reset': self.resets}
-        events = sorted(((int(time), kind, index) for kind, times in arrivals.items()
-                         for index, time in enumerate(times)), key=itemgetter(0))
+        nothing = itertools.repeat(None)
+        events = sorted(((int(time), kind, payload) for kind, times, payloads in (
+            ('imu', self.imu['arrival'], itertools.count()),
+            ('fix', fix['arrival'], fixes(*(fix[name] for name in fix.dtype.names[1:]))),
+            ('velocity', self.velocity['arrival'], self._velocities(config)),
+            ('update', self.updates, nothing), ('reset', self.resets, nothing))
+            for time, payload in zip(times, payloads)), key=itemgetter(0))
         for kind, block in itertools.groupby(events, itemgetter(1)):
-            times, _, indices = zip(*block)
-            if kind == 'imu':
-                for start in range(0, len(indices), self.batch):
-                    batch = self.imu[list(indices[start:start + self.batch])]
-                    yield (int(batch['arrival'][-1]), kind,
-                           (batch['stamp'], batch['gyro'], batch['accel']))
-                continue
-            for time, index in zip(times, indices):
-                payload = payloads[kind][index]
+            while some := [*itertools.islice(block, self.batch if kind == 'imu' else 1)]:
+                time, _, payload = some[-1]
+                if kind == 'imu':
+                    batch = self.imu[[index for _, _, index in some]]
+                    payload = batch['stamp'], batch['gyro'], batch['accel']
                 yield time, 'reject' if isinstance(payload, str) else kind, payload
 
     def _velocities(self, config: Config) -> list[Any]:
@@ -196,6 +186,14 @@ def directions(random: Random, number: int) -> Array:
     """Draw unit vectors, shape (number, 3)."""
     vectors = random.standard_normal((number, 3))
     return vectors / np.linalg.norm(vectors, axis=1)[:, None]
+
+
+def _lose(stream: Stream, random: Random, names: Sequence[str], number: tuple[int, int],
+          length: tuple[float, float]) -> None:
+    """Drop the messages with stamps within some windows."""
+    for window in stream.windows(random, number, length):
+        for name in names:
+            stream.keep(name, ~within(getattr(stream, name), window))
 
 
 # Faults of GNSS
@@ -347,7 +345,7 @@ def _imu_out_of_order(stream: Stream, random: Random) -> None:
 def _imu_missing(stream: Stream, random: Random) -> None:
     """Drop single samples, and many in a row."""
     stream.imu = np.delete(stream.imu, choose_rows(random, stream.imu, 0.01, 0.2))
-    stream.lose(['imu'], stream.windows(random, random.integers(0, 4), 0.05, 1.5))
+    _lose(stream, random, ['imu'], (0, 4), (0.05, 1.5))
 
 
 def _imu_silent(stream: Stream, random: Random) -> None:
@@ -375,9 +373,10 @@ def _imu_spikes(stream: Stream, random: Random) -> None:
                                      * directions(random, len(chosen)))
 
 
-def _freeze(stream: Stream, windows: list[Window], *fields: str) -> None:
-    """Let fields of IMU samples repeat those of the first sample in each window."""
-    for window in windows:
+def _freeze(stream: Stream, random: Random, fields: Sequence[str], number: tuple[int, int],
+            length: tuple[float, float]) -> None:
+    """Let fields of IMU samples repeat those of the first sample in each of some windows."""
+    for window in stream.windows(random, number, length):
         chosen = np.flatnonzero(within(stream.imu, window))
         for name in fields:
             stream.imu[name][chosen] = stream.imu[name][chosen[0]]
@@ -404,8 +403,10 @@ def _clock_loop(stream: Stream, random: Random) -> None:
     stream.expected['clock_jumps'] = 1
 
 
-def _set_clock(stream: Stream, moment: int, shift: int, **expected: int) -> None:
-    """Shift all stamps from `moment` on by `shift`, both in ns."""
+def _set_clock(stream: Stream, random: Random, shift: int, latest: float = 0.6,
+               **expected: int) -> None:
+    """Shift all stamps from some moment on by `shift` (ns)."""
+    moment = stream.moment(random, 0.2, latest)
     for rows in stream.imu, stream.fix, stream.velocity:
         rows['stamp'][rows['stamp'] >= moment] += shift
     stream.clock = [moment + shift, stream.last + shift + SECOND], [0, shift, 0]
@@ -415,7 +416,7 @@ def _set_clock(stream: Stream, moment: int, shift: int, **expected: int) -> None
 def _clock_step(stream: Stream, random: Random) -> None:
     """Set the clock by less than counts as late or as an outage."""
     shift = int(random.choice([-1, 1]) * random.uniform(0.02, 0.9) * SECOND)
-    _set_clock(stream, stream.moment(random, 0.2, 0.8), shift)
+    _set_clock(stream, random, shift, 0.8)
 
 
 def _resets(stream: Stream, random: Random) -> None:
@@ -439,8 +440,7 @@ def _several(stream: Stream, random: Random) -> None:
 FAULTS: dict[str, Callable[[Stream, Random], Any]] = {
     'none': lambda stream, random: None,
     'outliers': _outliers,
-    'outages': lambda stream, random: stream.lose(GNSS, stream.windows(
-        random, random.integers(1, 4), 2.0, 15.0)),
+    'outages': partial(_lose, names=GNSS, number=(1, 4), length=(2.0, 15.0)),
     'position jumps': _position_jump, 'fix at 0, 0': _null_island, 'no fix': _no_fix,
     'status unknown': _unknown_status, 'GNSS nan, inf': _broken_gnss,
     'covariance 0, -1, nan': _unknown_covariance, 'covariance nonsense': _nonsense_covariance,
@@ -451,30 +451,25 @@ FAULTS: dict[str, Callable[[Stream, Random], Any]] = {
         [18 * SECOND, -HOUR, HOUR, -stream.first, 24 * HOUR]))),
     'GNSS clock seconds off': lambda stream, random: _gnss_clock(stream, int(
         random.choice([-1, 1]) * random.uniform(0.2, 5.0) * SECOND)),
-    'vertical absent, told': lambda stream, random: vertical_absent(
-        stream, random, velocity_vertical='absent'),
+    'vertical absent, told': partial(vertical_absent, velocity_vertical='absent'),
     'vertical absent, not told': vertical_absent,
     'velocity of a body': _body_frame, 'IMU jitter': _imu_jitter, 'IMU twice': _imu_duplicates,
     'IMU out of order': _imu_out_of_order, 'IMU samples missing': _imu_missing,
-    'IMU gap': lambda stream, random: stream.lose(['imu'], stream.windows(
-        random, random.integers(1, 3), 2.1, 6.0)),
+    'IMU gap': partial(_lose, names=['imu'], number=(1, 3), length=(2.1, 6.0)),
     'IMU starts late': lambda stream, random: stream.keep(
         'imu', stream.imu['stamp'] > stream.moment(random, 0.05, 0.3)),
     'IMU falls silent': _imu_silent, 'IMU nan, inf, huge': _imu_broken, 'IMU spikes': _imu_spikes,
-    'IMU stuck': lambda stream, random: _freeze(stream, stream.windows(
-        random, random.integers(1, 3), 1.0, 15.0), 'gyro', 'accel'),
-    'IMU stamps stand still': lambda stream, random: _freeze(stream, stream.windows(
-        random, random.integers(1, 4), 0.05, 3.0), 'stamp'),
+    'IMU stuck': partial(_freeze, fields=('gyro', 'accel'), number=(1, 3), length=(1.0, 15.0)),
+    'IMU stamps stand still': partial(
+        _freeze, fields=['stamp'], number=(1, 4), length=(0.05, 3.0)),
     'IMU stamps wild': _imu_wild_stamps,
     'accelerations in g': lambda stream, random: np.divide(
         stream.imu['accel'], STANDARD_GRAVITY, out=stream.imu['accel']),
     'rates in deg/s': lambda stream, random: np.degrees(
         stream.imu['gyro'], out=stream.imu['gyro']),
     'clock loops': _clock_loop,
-    'clock back 1 h': lambda stream, random: _set_clock(
-        stream, stream.moment(random, 0.2, 0.6), -HOUR, clock_jumps=1),
-    'clock forward 1 h': lambda stream, random: _set_clock(
-        stream, stream.moment(random, 0.2, 0.6), HOUR, clock_jumps=0),
+    'clock back 1 h': partial(_set_clock, shift=-HOUR, clock_jumps=1),
+    'clock forward 1 h': partial(_set_clock, shift=HOUR, clock_jumps=0),
     'clock steps': _clock_step, 'resets': _resets, 'updates at random': _random_updates,
     'three of these': _several}
 # Faults that can be combined: they do not change the clock or units.

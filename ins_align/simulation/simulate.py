@@ -48,7 +48,6 @@ TOPICS = {'/imu/data_raw': 'sensor_msgs/msg/Imu', '/reference/imu': 'sensor_msgs
           '/fix': 'sensor_msgs/msg/NavSatFix',
           '/fix_velocity': 'geometry_msgs/msg/TwistWithCovarianceStamped',
           '/tf_static': 'tf2_msgs/msg/TFMessage'}
-PACKAGES = ('builtin_interfaces/', 'std_msgs/', 'geometry_msgs/', 'sensor_msgs/', 'tf2_msgs/')
 
 _TRUTH_STD = 1e-6  # rad, stated on the reference topic, where zero would mean unknown
 
@@ -197,7 +196,13 @@ def _gnss(args: Arguments, trajectory: Trajectory, C_vb: Array, lever_b: Array,
           streams: list[np.random.Generator]) -> dict[str, Any]:
     """Return the fields of `Simulation` that hold what the receiver sends."""
     scale = 0.0 if args.ideal else 1.0
-    stamps, time = _gnss_epochs(args)
+    count = max(math.floor((args.duration - args.gnss_phase) * args.gnss_rate + 1e-6) + 1, 0)
+    stamps = np.rint((args.gnss_phase + np.arange(count) / args.gnss_rate) * 1e9).astype(np.int64)
+    seconds = stamps * 1e-9
+    received = seconds >= args.gnss_delay
+    for start, end in args.outages:
+        received &= (seconds < start) | (seconds >= end)
+    stamps, time = stamps[received], seconds[received] - args.gnss_delay
     lla, velocity = trajectory.antenna(time, C_vb, lever_b)
     vertical = args.velocity_std_vertical
     velocity_sigma = np.array([args.velocity_std, args.velocity_std,
@@ -225,18 +230,6 @@ def _gnss(args: Arguments, trajectory: Trajectory, C_vb: Array, lever_b: Array,
             'gnss_arrival_ns': gnss_stamps_ns + round(args.gnss_latency * 1e9),
             'lla_deg': lla, 'velocity': velocity, 'velocity_covariance': velocity_covariance,
             'position_covariance': np.diag(position_sigma ** 2), 'outlier': outlier}
-
-
-def _gnss_epochs(args: Arguments) -> tuple[np.ndarray, Array]:
-    """Return stamps, ns, and true instants of measurement, s, since the start."""
-    count = max(math.floor((args.duration - args.gnss_phase) * args.gnss_rate + 1e-6) + 1, 0)
-    stamps = np.rint((args.gnss_phase + np.arange(count) / args.gnss_rate) * 1e9).astype(
-        np.int64)
-    seconds = stamps * 1e-9
-    received = seconds >= args.gnss_delay
-    for start, end in args.outages:
-        received &= (seconds < start) | (seconds >= end)
-    return stamps[received], seconds[received] - args.gnss_delay
 
 
 def gauss_markov(time: Array, std: float, correlation_time: float,
@@ -286,8 +279,7 @@ def _write_messages(simulation: Simulation, path: Path, storage: str, tf: bool) 
     from rosbags.typesys import get_typestore, Stores
 
     typestore = get_typestore(Stores.ROS2_JAZZY)
-    ros = SimpleNamespace(**{name.split('/')[-1]: kind for name, kind in typestore.types.items()
-                             if name.startswith(PACKAGES)})
+    ros = SimpleNamespace(**{name.split('/')[-1]: kind for name, kind in typestore.types.items()})
     streams = [_imu_messages(simulation, ros), _gnss_messages(simulation, ros)]
     if tf:
         streams.insert(0, _static_transforms(simulation, ros))
