@@ -32,7 +32,7 @@ from ins_align.experiments.common import (
 from ins_align.experiments.spoilt import SECOND
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.messages import Fix, Velocity
-from ins_align.gnss.motion import series_of, track
+from ins_align.gnss.motion import series_of, track, velocity_from_positions
 from ins_align.offline import align
 from ins_align.recordings import BagError
 from ins_align.recordings.decode import ImuSamples
@@ -142,22 +142,13 @@ def run_window(task: tuple[Path, float, float, JsonDict]) -> JsonDict:
 def _moves(stamps: np.ndarray, fixes: list[Fix], velocities: list[Velocity], **imu: Array) -> bool:
     """Return whether the horizontal velocity, or that of positions, changes much in a minute."""
     measured = [m for m in velocities if np.isfinite(m.velocity).all()]
-    if measured:
-        times = np.array([m.stamp_ns for m in measured])
-        v = np.array([m.velocity[:2] for m in measured])
-    else:
-        rows = np.array([[m.stamp_ns - stamps[0], m.latitude_deg, m.longitude_deg, m.altitude_m]
-                         for m in fixes]).reshape(-1, 4)
-        rows = rows[np.isfinite(rows).all(axis=1)]
-        if len(rows) < 3:
-            return False
-        time, places = track(series_of(rows[:, 0] / SECOND, rows[:, 1:]))
-        # Differences over half a second, because fixes are noisy.
-        step = max(1, int(round(0.25 / np.median(np.diff(time)))))
-        times = stamps[0] + np.rint(time[step:-step] * SECOND).astype(np.int64)
-        v = ((places[2 * step:] - places[:-2 * step])[:, :2]
-             / (time[2 * step:] - time[:-2 * step])[:, None])
-    v = v[times <= times[:1] + round(MOTION_TIME * SECOND)]
+    rows = [(m.stamp_ns - stamps[0], *m.velocity) for m in measured] or [
+        (m.stamp_ns - stamps[0], m.latitude_deg, m.longitude_deg, m.altitude_m) for m in fixes]
+    table = np.array(rows, float).reshape(-1, 4)
+    table = table[np.isfinite(table).all(axis=1)]
+    series = series_of(table[:, 0] / SECOND, table[:, 1:])
+    times, v = series if measured else velocity_from_positions(track(series))
+    v = v[times <= times[:1] + MOTION_TIME, :2]
     # The extents in these directions contain the largest change to 1 %.
     angles = np.radians(np.arange(0.0, 180.0, 15.0))
     extents = np.ptp(v @ [np.cos(angles), np.sin(angles)], axis=0) if len(v) else np.zeros(1)
