@@ -30,7 +30,8 @@ from typing import Any
 from ins_align.config import Config
 from ins_align.experiments import dense
 from ins_align.experiments.common import (
-    bound_of, Case, error_of, follow, GRADES, JsonDict, parallel, prepare, Report, run_cases)
+    ANGLES, bound_of, Case, error_of, follow, GRADES, JsonDict, parallel, prepare, Report,
+    run_cases)
 from ins_align.geometry.rotation import Array, roll_pitch_yaw
 from ins_align.report import new_figure
 import numpy as np
@@ -149,7 +150,7 @@ def results_of(case: Case, bound: dense.Bound, runs: list[JsonDict]) -> list[Jso
 def target_row(title: str, results: list[JsonDict]) -> JsonDict:
     """Return the table row on how the cases of one title meet the targets."""
     row: JsonDict = {'case': title, 'figures': len(results)}
-    for angle in ('tilt', 'heading'):
+    for angle in ANGLES:
         ratios = [each[f'{angle}_ratio'] for each in results]
         row |= {f'{angle} met': sum(ratio <= RATIO_LIMIT for ratio in ratios),
                 f'{angle} beyond chance': sum(
@@ -165,9 +166,8 @@ def target_row(title: str, results: list[JsonDict]) -> JsonDict:
 
 def result_row(result: JsonDict) -> JsonDict:
     """Return the table row of one case at one time."""
-    row = {'case': '{title}, {scenario}, {grade}'.format(**result),
-           't, s': f'{result["time"]:g}'}
-    for angle in ('tilt', 'heading'):
+    row = {'case': '{title}, {scenario}, {grade}'.format(**result), 't, s': f'{result["time"]:g}'}
+    for angle in ANGLES:
         row |= {f'{angle}, deg': f'{result[f"{angle}_deg"]:.2g}',
                 f'{angle} bound': f'{result[f"{angle}_bound_deg"]:.2g}',
                 f'{angle} ratio': f'{result[f"{angle}_ratio"]:.2f}'}

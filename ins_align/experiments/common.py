@@ -87,10 +87,10 @@ class Case(NamedTuple):
 
 
 def run_cases(function: Callable[[Any], Any], cases: Sequence[Case], runs: int, jobs: int | None,
-              ) -> Groups:
+              first: int = 0) -> Groups:
     """Apply a function to each case with each of its seeds; return the results by name."""
     return list(zip((case.name for case in cases), parallel(function, [
-        [(case, seed) for seed in range(max(1, runs // case.part))] for case in cases], jobs,
+        [(case, first + k) for k in range(max(1, runs // case.part))] for case in cases], jobs,
         'runs')))
 
 

@@ -34,7 +34,7 @@ from ins_align.aligner import State
 from ins_align.config import CHIP_THRESHOLDS, Config, PRESETS
 from ins_align.experiments.common import (
     aligned_row, bound_of, Case, cell, combination, event_row, follow, GRADES, groups_of,
-    JsonDict, parallel, prepare, Report, run_case, setup)
+    JsonDict, parallel, prepare, Report, run_case, run_cases, setup)
 from ins_align.experiments.spoilt import Random, Stream, vertical_absent
 from ins_align.simulation.arguments import imu_errors_of
 from ins_align.simulation.simulate import CAMPAIGN_SCENARIOS
@@ -48,17 +48,13 @@ THRESHOLD_DEG = 1.0
 WAIT_LIMIT = 1.5        # target: median time to a declaration over that of the bound, at most
 # First seeds of the second and third part; the three parts share none.
 SILENT_SEED, TIME_SEED = 100_000, 200_000
-# One run of the second and third part for this many of the first.
-SILENT_PART, TIME_PART = 80, 10
 
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run the three parts of ``declare``; `runs` is for the first, the others have fewer."""
-    silent_seeds = range(SILENT_SEED, SILENT_SEED + max(runs // SILENT_PART, 1))
-    [found, *silent] = parallel(run_case, [
-        [(draw(index), index) for index in range(runs)],
-        *([(case, seed) for seed in silent_seeds] for case in SILENT)], jobs, 'declare')
-    waits = time_to_heading(max(runs // TIME_PART, 1), jobs)
+    [found] = parallel(run_case, [[(draw(index), index) for index in range(runs)]], jobs, 'declare')
+    silent = run_cases(run_case, SILENT, runs, jobs, SILENT_SEED)
+    waits = time_to_heading(runs, jobs)
     report.text(
         f'{runs} runs of {DURATION:g} s over all scenarios ({", ".join(CAMPAIGN_SCENARIOS)}), '
         'grades of IMU and faults, none of which is configured, with random heading, latitude, '
@@ -73,13 +69,14 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         report.table(title, [event_row(*group, kind) for group in groups])
     report.table(
         f'MEMS for {SILENT_DURATION:g} s without a change of velocity: LEVELLED, and ALIGNED',
-        [{**event_row(case.name, group, 'levelled'),
+        [{**event_row(name, group, 'levelled'),
           'ALIGNED': sum(bool(each['declared']) for each in group),
           'least heading sigma, deg': cell(
               min, (each['least_heading_sigma_deg'] for each in group), '.1f')}
-         for case, group in zip(SILENT, silent)])
+         for name, group in silent])
     time_table(report, waits)
-    return {'runs': found, 'silent': [*itertools.chain(*silent)], 'time_to_heading': waits}
+    return {'runs': found, 'silent': [each for _, group in silent for each in group],
+            'time_to_heading': waits}
 
 
 # Part 1: faults
@@ -135,7 +132,7 @@ def _mount(seed: int) -> JsonDict:
 
 # Motions in which the heading cannot be observed.
 SILENT = tuple(Case(scenario, ((scenario, 'mems'),), None, {'duration': SILENT_DURATION},
-                    drawn=_mount) for scenario in ('straight', 'static'))
+                    part=80, drawn=_mount) for scenario in ('straight', 'static'))
 
 
 # Part 3: time
@@ -146,14 +143,12 @@ def time_to_heading(runs: int, jobs: int | None) -> list[JsonDict]:
              for kind in itertools.product((*CAMPAIGN_SCENARIOS, 'robot'), GRADES, (True, False))]
     [crossings] = parallel(crossing_time, [cases], jobs, 'bounds')
     reachable = [each for each in zip(cases, crossings) if each[1] is not None]
-    seeds = range(TIME_SEED, TIME_SEED + runs)
-    times = parallel(run_time, [[(case, seed) for seed in seeds] for case, _ in reachable], jobs,
-                     'times')
+    times = run_cases(run_time, [case for case, _ in reachable], runs, jobs, TIME_SEED)
     waits = []
-    for (case, bound_s), declared_s in zip(reachable, times):
+    for (case, bound_s), (_, declared_s) in zip(reachable, times):
+        [(scenario, grade)] = case.motions
         # A run that is not declared counts as infinitely long.
         median_s = float(np.median([np.inf if t is None else t for t in declared_s]))
-        [(scenario, grade)] = case.motions
         waits.append({'scenario': scenario, 'imu': grade, 'exact': case.exact,
                       'bound_s': bound_s, 'median_s': median_s, 'ratio': median_s / bound_s,
                       'declared_s': declared_s})
@@ -165,7 +160,7 @@ def time_case(scenario: str, grade: str, exact: bool) -> Case:
     # The declaration is to wait for the heading, not for the tilt.
     config = {'tilt_std_threshold': THRESHOLD_DEG} if exact else {
         'lever_arm_std': Config.lever_arm_std, 'gnss_delay_std': Config.gnss_delay_std}
-    return Case('time', ((scenario, grade),), None, {'duration': HORIZON}, config, exact=exact)
+    return Case('time', ((scenario, grade),), None, {'duration': HORIZON}, config, 10, exact=exact)
 
 
 def crossing_time(case: Case) -> float | None:

@@ -221,8 +221,7 @@ def design_of(path: Path, lever_b: Array, positions: bool = False) -> Array:
     return H.reshape(-1, SIZE)
 
 
-def noise_covariance(path: Path, noise: ImuNoise, stated: Array,
-                     positions: bool = False) -> Array:
+def noise_covariance(path: Path, noise: ImuNoise, stated: Array, positions: bool = False) -> Array:
     """
     Return the covariance of all measurements from IMU random walks and GNSS noise, (3 K, 3 K).
 
@@ -248,8 +247,7 @@ def noise_covariance(path: Path, noise: ImuNoise, stated: Array,
     X = ((B @ path.M).reshape(3 * n, 7) @ B.reshape(3 * n, 7).T).reshape(n, 3, n, 3)
     trace = np.einsum('iaja->ij', X)
     V = -noise.angle_random_walk ** 2 * X.transpose(0, 3, 2, 1)
-    diagonal = (noise.angle_random_walk ** 2 * trace
-                + noise.velocity_random_walk ** 2 * pushed)
+    diagonal = noise.angle_random_walk ** 2 * trace + noise.velocity_random_walk ** 2 * pushed
     for axis in range(3):
         V[:, axis, :, axis] += diagonal
     V = V.reshape(3 * n, 3 * n)

@@ -146,8 +146,7 @@ class Arguments:
     gnss_delay: float = _gnss(0.0, 'measurements are older than their stamp by this', 's', 0.0,
                               _MAXIMA['gnss_delay'])
     velocity_std: float = _gnss(0.1, 'white noise of the velocity, 1 sigma, horizontal', 'm/s')
-    velocity_std_vertical: float | None = _gnss(
-        None, 'and vertical; default: the same', 'm/s')
+    velocity_std_vertical: float | None = _gnss(None, 'and vertical; default: the same', 'm/s')
     position_std: float = _gnss(2.5, 'white noise of the position, 1 sigma, horizontal; vertical '
                                 'twice that', 'm')
     velocity_drift_std: float = _gnss(
@@ -158,8 +157,7 @@ class Arguments:
         'm')
     gnss_correlation: float = _gnss(60.0, 'time constant of the errors that last', 's', 1e-3)
     outlier_rate: float = _gnss(0.0, 'part of the epochs that are spoilt', '1', 0.0, 1.0)
-    outlier_velocity: float = _gnss(
-        5.0, 'by how much they are, in a random direction', 'm/s')
+    outlier_velocity: float = _gnss(5.0, 'by how much they are, in a random direction', 'm/s')
     outlier_position: float = _gnss(50.0, 'by how much they are, in a random direction', 'm')
     velocity_frame: str = _gnss('enu', 'ned: the receiver sends north-east-down',
                                 choices=('enu', 'ned'))
@@ -203,8 +201,8 @@ class Arguments:
     def imu_noise(self) -> ImuNoise:
         """Return the noise of the IMU and the sigmas of its constant errors, in SI units."""
         noise = PRESETS[self.imu_grade] if isinstance(self.imu_grade, str) else self.imu_grade
-        own = {name: getattr(self, name, None) for name in ImuNoise._fields}
-        return noise._replace(**{name: value for name, value in own.items() if value is not None})
+        return noise._replace(**{name: value for name in ImuNoise._fields
+                                 if (value := getattr(self, name, None)) is not None})
 
 
 def _is_number(value: Any) -> bool:

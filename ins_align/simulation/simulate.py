@@ -354,12 +354,10 @@ def _gnss_messages(simulation: Simulation, ros: SimpleNamespace) -> _Messages:
 
 def noise_parameters(noise: ImuNoise) -> dict[str, float]:
     """Return the noise of an IMU as parameters of `Config`."""
-    return {'angle_random_walk': 60 * math.degrees(noise.angle_random_walk),
-            'velocity_random_walk': 60 * noise.velocity_random_walk,
-            'gyro_bias_std': math.degrees(noise.gyro_bias_std),
-            'accel_bias_std': float(noise.accel_bias_std),
-            'gyro_scale_std': float(noise.gyro_scale_std),
-            'rate_random_walk': 60 * math.degrees(noise.rate_random_walk)}
+    arw, vrw, gyro_bias, accel_bias, gyro_scale, rate_walk = map(float, noise)
+    return dict(zip(ImuNoise._fields, (
+        60 * math.degrees(arw), 60 * vrw, math.degrees(gyro_bias), accel_bias, gyro_scale,
+        60 * math.degrees(rate_walk))))
 
 
 def _parameter_file(simulation: Simulation) -> str:
