@@ -199,15 +199,11 @@ def time_table(report: Report, waits: list[JsonDict]) -> None:
 
 PAIR = ' and '
 _MEMS = PRESETS['mems']
-# Three times what the estimator assumes of misalignments and of the accelerometers' scale factors:
-# 0.3 times the sigma of the gyros' scale factors.
-_MATRIX_STD = 3 * 0.3 * _MEMS.gyro_scale_std
 # Each fault sets arguments of `simulate`.
 WORSE: dict[str, JsonDict] = {
     'accelerometer bias x 10': {'accel_bias_std': 10 * _MEMS.accel_bias_std},
-    'scale, misalignment x 3': {
-        'gyro_scale_std': 3 * _MEMS.gyro_scale_std, 'gyro_misalignment_std': _MATRIX_STD,
-        'accel_scale_std': _MATRIX_STD, 'accel_misalignment_std': _MATRIX_STD},
+    'scale, misalignment x 3': imu_errors_of(
+        _MEMS._replace(gyro_scale_std=3 * _MEMS.gyro_scale_std, rate_random_walk=0.0)),
     'noise x 3': {'imu_grade': _MEMS._replace(
         angle_random_walk=3 * _MEMS.angle_random_walk,
         velocity_random_walk=3 * _MEMS.velocity_random_walk)},
