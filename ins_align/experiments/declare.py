@@ -52,7 +52,7 @@ SILENT_SEED, TIME_SEED = 100_000, 200_000
 
 def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
     """Run the three parts of ``declare``; `runs` is for the first, the others have fewer."""
-    [found] = parallel(run_case, [[(draw(index), index) for index in range(runs)]], jobs, 'declare')
+    [found] = parallel(run_case, [[(draw(seed), seed) for seed in range(runs)]], jobs, 'declare')
     silent = run_cases(run_case, SILENT, runs, jobs, SILENT_SEED)
     waits = time_to_heading(runs, jobs)
     report.text(

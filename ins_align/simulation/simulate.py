@@ -170,11 +170,13 @@ def _imu(args: Arguments, trajectory: Trajectory, C_vb: Array,
         for scale_std, misalignment_std in (
             (args.gyro_scale_std, args.gyro_misalignment_std),
             (args.accel_scale_std, args.accel_misalignment_std)))
-    walk = _random_walk(trajectory.stamps_ns * 1e-9, scale * noise.rate_random_walk, streams[0])
+    time, shape = trajectory.stamps_ns * 1e-9, truth_gyro.shape
+    steps = np.sqrt(np.diff(time, prepend=time[0]))[:, None]
+    walk = np.cumsum(scale * noise.rate_random_walk * steps * streams[0].standard_normal(shape),
+                     axis=0)
     gyro_std = scale * noise.angle_random_walk * math.sqrt(args.imu_rate)
     accel_std = scale * noise.velocity_random_walk * math.sqrt(args.imu_rate)
     sign = np.array(AXIS_SIGNS[args.flip_axis])
-    shape = truth_gyro.shape
     gyro = sign * AXIS_SIGNS[args.flip_gyro] * (
         truth_gyro @ gyro_matrix.T + gyro_bias + walk
         + gyro_std * streams[1].standard_normal(shape))
@@ -240,12 +242,6 @@ def gauss_markov(time: Array, std: float, correlation_time: float,
     for k in range(1, len(drive)):
         drive[k] += decay[k] * drive[k - 1]
     return drive
-
-
-def _random_walk(time: Array, density: float, random: np.random.Generator) -> Array:
-    """Return a random walk (n, 3) that begins at 0."""
-    steps = np.sqrt(np.diff(time, prepend=time[0]))[:, None]
-    return np.cumsum(density * steps * random.standard_normal((len(time), 3)), axis=0)
 
 
 def write_bag(simulation: Simulation, path: str | os.PathLike, storage: str = 'mcap',
