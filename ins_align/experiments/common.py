@@ -150,29 +150,26 @@ def follow(aligner: Aligner, stream: Stream) -> Iterator[list[Epoch]]:
     epochs, it yields the status as one epoch without GNSS, so that times without GNSS count.
     """
     due = 0.0
-    for now, kind, payload in stream.messages(aligner.config):
+    for now, kind, payload in itertools.chain(stream.messages(aligner.config),
+                                              [(stream.last, 'end', None)]):
         if kind in SENSORS:
             give(aligner, kind, payload)
         elif kind == 'reject':
             aligner.reject(payload)
-        if stream.between or kind in ('update', 'reset') or (
-                now >= due and not stream.updates.size):
-            yield _epochs(aligner, aligner.update(), stream.between)
-            due = now + UPDATE_EVERY * SECOND
+        if not (stream.between or kind in ('update', 'reset', 'end')
+                or now >= due and not stream.updates.size):
+            continue
+        epochs = aligner.flush() if kind == 'end' else aligner.update()
+        stamp_ns = aligner.newest_imu_ns
+        if stamp_ns is not None and (stream.between or not epochs):
+            status = aligner.status()
+            current = aligner.attitude_now() if stream.between else status.current
+            epochs = [Epoch(stamp_ns, math.nan, status.state, status.initial, current,
+                            np.full(3, np.nan), status.gyro_bias, status.accel_bias, dry=True)]
+        yield epochs
+        due = now + UPDATE_EVERY * SECOND
         if kind == 'reset':
             aligner.reset()
-    yield _epochs(aligner, aligner.flush(), stream.between)
-
-
-def _epochs(aligner: Aligner, epochs: list[Epoch], between: bool) -> list[Epoch]:
-    """Return the epochs of an update, or the status as one epoch, as `follow` says."""
-    stamp_ns = aligner.newest_imu_ns
-    if stamp_ns is None or (epochs and not between):
-        return epochs
-    status = aligner.status()
-    return [Epoch(stamp_ns, math.nan, status.state, status.initial,
-                  aligner.attitude_now() if between else status.current, np.full(3, np.nan),
-                  status.gyro_bias, status.accel_bias, dry=True)]
 
 
 def config_for(simulation: Simulation, **changes: Any) -> Config:

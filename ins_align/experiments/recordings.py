@@ -178,10 +178,13 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
         raise ExperimentError(f'no recording with {REFERENCE_TOPIC} in {data}')
     tasks: dict[str, list[Any]] = {}
     for path in paths:
-        name = load(path).name
-        tasks |= {f'{name}, {method}': windows_of(path, config)
-                  for method, config in methods_of(path).items()}
-        tasks[f'{name}, bank, all of it'] = [(path, 0.0, load(path).duration, {})]
+        recording = load(path)
+        measured = any(isinstance(message, Velocity) for _, message in recording.gnss)
+        note = {'method': 'vif' if measured else 'pif'}
+        for method, config in (('note', {**note, 'free_start': False}), ('centred', note),
+                               ('bank', {'method': 'bank'})):
+            tasks[f'{recording.name}, {method}'] = windows_of(path, config)
+        tasks[f'{recording.name}, bank, all of it'] = [(path, 0.0, recording.duration, {})]
     groups = dict(zip(tasks, parallel(run_window, list(tasks.values()), jobs, 'windows')))
     every = [each for name, group in groups.items() for each in group if name.endswith('bank')]
     report.text(
@@ -200,13 +203,6 @@ def run(report: Report, runs: int, jobs: int | None, data: Path | None) -> Any:
             times_row(name, [each for each in group if each['moves']] or group)
             for name, group in groups.items()])
     return groups
-
-
-def methods_of(path: Path) -> dict[str, JsonDict]:
-    """Return the parameters of each method, with pif instead of vif if there are no velocities."""
-    measured = any(isinstance(message, Velocity) for _, message in load(path).gnss)
-    note = {'method': 'vif' if measured else 'pif'}
-    return {'note': {**note, 'free_start': False}, 'centred': note, 'bank': {'method': 'bank'}}
 
 
 # Rows of tables, each from a name and the results of its windows

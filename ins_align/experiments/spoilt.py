@@ -20,7 +20,7 @@ notes the counters of the aligner that it determines.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 import itertools
@@ -126,12 +126,17 @@ class Stream:
         Kinds are the names of the arrays, 'update', 'reset', and 'reject', whose content is the
         reason why a message cannot be used.
         """
-        fix = self.fix
-        nothing = itertools.repeat(None)
+        fix, sent, nothing = self.fix, self.velocity, itertools.repeat(None)
+        stated = None if config.velocity_type == 'TwistStamped' else sent['covariance']
+        try:
+            measured: Iterable[Any] = velocities(
+                sent['stamp'], ''.join(set(sent['frame_id'])), sent['velocity'], stated, config)
+        except MessageError:
+            measured = itertools.repeat('velocity_body_frame')
         events = sorted(((int(time), kind, payload) for kind, times, payloads in (
             ('imu', self.imu['arrival'], itertools.count()),
             ('fix', fix['arrival'], fixes(*(fix[name] for name in fix.dtype.names[1:]))),
-            ('velocity', self.velocity['arrival'], self._velocities(config)),
+            ('velocity', sent['arrival'], measured),
             ('update', self.updates, nothing), ('reset', self.resets, nothing))
             for time, payload in zip(times, payloads)), key=itemgetter(0))
         for kind, block in itertools.groupby(events, itemgetter(1)):
@@ -141,16 +146,6 @@ class Stream:
                     batch = self.imu[[index for _, _, index in some]]
                     payload = batch['stamp'], batch['gyro'], batch['accel']
                 yield time, 'reject' if isinstance(payload, str) else kind, payload
-
-    def _velocities(self, config: Config) -> list[Any]:
-        """Return the velocities, or instead of each the reason why it cannot be used."""
-        rows = self.velocity
-        stated = None if config.velocity_type == 'TwistStamped' else rows['covariance']
-        try:
-            return velocities(rows['stamp'], ''.join(set(rows['frame_id'])), rows['velocity'],
-                              stated, config)
-        except MessageError:
-            return ['velocity_body_frame'] * len(rows)
 
 
 def stream_of(simulation: Simulation, between: bool = False) -> Stream:
