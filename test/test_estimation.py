@@ -428,6 +428,13 @@ def test_minutes_without_gnss_feign_no_attitude(scenario):
         assert len(errors) > 60 and max(errors) < chi2.ppf(0.9999, 3)
 
 
+def test_gnss_that_stops_before_the_start_and_comes_back_starts():
+    s = simulated('static', duration=530.0, gnss_rate=4.0, imu_rate=10.0, outages=((0.6, 525.0),))
+    epochs = aligned(s)[1]
+    assert not any(epoch.current for epoch in epochs if epoch.t_s < 525.0)
+    assert epochs[-1].current is not None
+
+
 # Rivals
 
 def mirrored(s, signs):

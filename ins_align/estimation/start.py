@@ -120,7 +120,7 @@ class Start:
         epochs = self.epochs
         kind = 0 if sum(epoch.v_n is not None for epoch in epochs) >= FIRST_EPOCHS else 1
         use = np.array([epoch.position_measured if kind else epoch.v_n is not None
-                        for epoch in epochs])
+                        for epoch in epochs], bool)
         variance = self._variance(kind)
         use &= variance <= UNCERTAIN ** 2 * np.min(variance[use], initial=np.inf)
         if np.count_nonzero(use) < FIRST_EPOCHS + kind or (kind and not use_position):
