@@ -37,8 +37,7 @@ def apply(matrix: Array, vectors: Array) -> Array:
     """
     Return ``matrix @ vector``, shapes (..., m, n) and (..., n), with leading axes that broadcast.
 
-    Each product is computed separately: in one of a matrix with many vectors, the last bit depends
-    on their number.
+    One by one: in a product of a matrix with many vectors, the last bit depends on their number.
     """
     return (matrix @ vectors[..., None])[..., 0]
 
@@ -58,11 +57,7 @@ def product(left: Array, right: Array) -> Array:
 
 
 def by_row(matrix: Array, vectors: Array) -> Array:
-    """
-    Return the derivative of ``matrix @ X @ vector`` to X, row by row, shape (..., 3, 9).
-
-    The matrix has the shape (..., 3, 3), the vector (..., 3).
-    """
+    """Return the derivative of ``matrix @ X @ vector`` to X, row by row, shape (..., 3, 9)."""
     return (matrix[..., None] * vectors[..., None, None, :]).reshape(matrix.shape[:-1] + (9,))
 
 
@@ -81,13 +76,11 @@ def skew(vector: ArrayLike) -> Array:
 
 def cross(a: ArrayLike, b: ArrayLike) -> Array:
     """
-    Return the cross product over the last axis; leading axes broadcast.
+    Return the cross product over the last axis, in the memory order of the larger argument.
 
-    On small arrays this is several times faster than numpy.cross. The result has the memory order
-    of the larger argument.
+    On small arrays this is several times faster than numpy.cross.
     """
-    a = np.asarray(a, dtype=float)
-    b = np.asarray(b, dtype=float)
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     result = np.empty_like(a if a.size > b.size else b, shape=np.broadcast(a, b).shape)
     result[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
     result[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
@@ -155,8 +148,7 @@ def log_so3(matrix: ArrayLike) -> Array:
     """
     Return rotation vectors, shape (..., 3), of rotation matrices, angle in [0, pi].
 
-    If all angles are below a right angle they are computed from sine and cosine, otherwise from
-    quaternions, which keep full precision near pi.
+    Unless all angles are below a right angle, by quaternions, which are precise near pi.
     """
     m = np.asarray(matrix, dtype=float)
     cosine = 0.5 * (np.einsum('...ii', m) - 1.0)
@@ -174,8 +166,7 @@ def log_so3(matrix: ArrayLike) -> Array:
 
 def _arctan2(y: Array, x: Array) -> Array:
     """Return arctan2 of contiguous copies: with numpy 1.26 the last bit depends on strides."""
-    angle: Array = np.arctan2(np.array(y), np.array(x))
-    return angle
+    return np.asarray(np.arctan2(np.array(y), np.array(x)))
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
@@ -197,15 +188,11 @@ def quaternion_from_matrix(matrix: ArrayLike) -> Array:
     trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
     # Row i of this symmetric matrix is 4 q_i q.
     k = np.empty(m.shape[:-2] + (4, 4))
-    for i in range(3):
-        k[..., i, i] = 1 + 2 * m[..., i, i] - trace
+    k[..., :3, :3] = m + m.swapaxes(-1, -2)
+    for i, row, column in (0, 2, 1), (1, 0, 2), (2, 1, 0):
+        k[..., i, i] = 1 + k[..., i, i] - trace
+        k[..., i, 3] = k[..., 3, i] = m[..., row, column] - m[..., column, row]
     k[..., 3, 3] = 1 + trace
-    k[..., 0, 1] = k[..., 1, 0] = m[..., 1, 0] + m[..., 0, 1]
-    k[..., 0, 2] = k[..., 2, 0] = m[..., 2, 0] + m[..., 0, 2]
-    k[..., 1, 2] = k[..., 2, 1] = m[..., 2, 1] + m[..., 1, 2]
-    k[..., 0, 3] = k[..., 3, 0] = m[..., 2, 1] - m[..., 1, 2]
-    k[..., 1, 3] = k[..., 3, 1] = m[..., 0, 2] - m[..., 2, 0]
-    k[..., 2, 3] = k[..., 3, 2] = m[..., 1, 0] - m[..., 0, 1]
     largest = np.argmax(np.diagonal(k, axis1=-2, axis2=-1), axis=-1)
     q = np.take_along_axis(k, largest[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
@@ -250,11 +237,7 @@ def orthonormalized(matrix: Array) -> Array:
 
 
 def cumulative_rotations(steps: Array) -> Array:
-    """
-    Return ``steps[0] @ steps[1] @ ... @ steps[k]`` for every k, shape (..., n, 3, 3).
-
-    No bit of the products depends on the other leading axes.
-    """
+    """Return ``steps[0] @ ... @ steps[k]`` for every k, shape (..., n, 3, 3), one by one."""
     steps = np.ascontiguousarray(np.moveaxis(steps, -3, 0))
     total = steps.copy()
     for before, step, after in zip(total[:-1], steps[1:], total[1:]):
