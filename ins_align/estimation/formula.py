@@ -298,7 +298,7 @@ class NoteMethod:
 
     def sensor_errors(self) -> SensorErrors:
         """Return zeros."""
-        return SensorErrors.none()
+        return SensorErrors.from_vector(np.zeros(24))
 
     def learnt(self) -> None:
         """Return nothing: only the attitude is estimated."""

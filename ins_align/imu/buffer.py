@@ -11,12 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""
-The queue of IMU samples: sorted by stamp and cut into steps between GNSS epochs.
-
-Each step comes with its white noise: what is stated, what is measured beyond that, and what gaps,
-jitter of stamps, saturation and gravity at an unknown place add to it.
-"""
+"""The queue of IMU samples: sorted by stamp and cut into steps between GNSS epochs, with noise."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -39,8 +34,7 @@ _LIMITS = np.repeat([MAX_RATE, MAX_ACCELERATION], 3)[:, None]
 MAX_GAP_NS = 500_000_000
 NO_SAMPLE = f'no IMU sample for more than {MAX_GAP_NS * 1e-9:g} s'
 SAME_VALUES = 'the IMU sends the same values again and again'
-# Samples that are kept before those still wanted: two for interpolation, the others for the check
-# for spikes.
+# Samples kept before those still wanted: two for interpolation, the others to find spikes.
 KEPT_BEFORE = SPIKE_BEFORE + 4
 # The clock was set back once this many samples in a row are behind the newest one, increase, and
 # belong to a time of which other samples had already come.
@@ -66,21 +60,20 @@ class Silence(NamedTuple):
 
 class ImuBuffer:
     """
-    IMU samples that are not integrated yet, sorted by their stamps.
+    IMU samples that are not integrated yet, sorted by their stamps and counted in `counts`.
 
-    Samples may arrive out of order by up to `lateness_ns`. `counts` counts them, by names that
-    begin with ``imu``. `stated` is the least noise that the sensors are taken to have.
+    Samples may arrive out of order by up to `lateness_ns`. `stated` is the noise that the sensors
+    have at least.
     """
 
     def __init__(self, lateness_ns: int, counts: Counter[str],
                  stated: ImuNoise = ImuNoise(0.0, 0.0, 0.0, 0.0)) -> None:
-        """Start empty."""
         self._lateness_ns = lateness_ns
         self._reach_ns = max(lateness_ns, MAX_GAP_NS)
         self._counts = counts
         self._stated = np.array(stated[:2])
-        # The sorted samples: stamps, (N,), strictly increasing, ns; angular rate, rad/s, and
-        # specific force, m/s^2, (N, 6), in Fortran order so that each axis is contiguous.
+        # The sorted samples: stamps, (N,), ns; angular rate, rad/s, and specific force, m/s^2,
+        # (N, 6), in Fortran order so that each axis is contiguous.
         self.stamps = np.zeros(0, np.int64)
         self.samples = np.zeros((0, 6), order='F')
         # Stamps and samples, one or many at a time, that are not sorted into these yet.
@@ -209,8 +202,8 @@ class ImuBuffer:
         """
         Return the stamp up to which epochs can be cut; None while there are too few samples.
 
-        No late sample can precede it any more; `last`: no more samples will come at all. Checks
-        the samples up to there, for `silence` and the noise of steps.
+        No late sample can precede it any more; `last`: no more will come. Checks the samples up to
+        there, for `silence` and the noise of steps.
         """
         self.consolidate(last)
         if self.newest_ns is None or self.stamps.size < 4:
@@ -230,10 +223,9 @@ class ImuBuffer:
 
     def rates_since(self, stamp_ns: int) -> tuple[Index, Array, Array, float]:
         """
-        Return the angular rates after a stamp, rad/s, without spikes.
+        Return stamps, (N,), and rates, (N, 3), rad/s, after a stamp, without spikes.
 
-        Stamps, shape (N,), rates, (N, 3), the rate at the stamp itself, (3,), and the median
-        interval between samples, s.
+        Also the rate at the stamp itself, (3,), and the median interval between samples, s.
         """
         self.consolidate()
         first = int(np.searchsorted(self.stamps, stamp_ns, side='right'))

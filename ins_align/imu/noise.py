@@ -11,12 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""
-Faults of IMU samples, and the noise that they add.
-
-Spikes, repeated samples, the end of the sensors' range, lost samples, jitter of stamps, measured
-white noise, wrong units.
-"""
+"""Faults of IMU samples and the noise that they add, measured white noise, wrong units."""
 
 import math
 
@@ -27,26 +22,25 @@ import numpy as np
 # vehicle falls, flies loops (up to 6 g) or the unit is wrong.
 FORCE_RANGE = 4.0, 60.0
 FORCE_TIME = 5.0
-# A spike differs from the mean of its neighbours by at least this much (rad/s, m/s^2), and by this
-# many times as much as the neighbours differ from each other and as earlier samples differ from
-# the mean of theirs. Of the latter the one of this rank counts, from below, among so many samples
-# before the spike: three are larger, as many as another spike makes.
+# A spike differs from the mean of its neighbours by at least this much (rad/s, m/s^2), and this
+# many times as much as the neighbours from each other and as earlier samples from the mean of
+# theirs: of so many before it the one of this rank, as another spike makes three large ones.
 SPIKE_RATE, SPIKE_FORCE = 0.5, 5.0
 SPIKE_RATIO = 12.0
 SPIKE_BEFORE, SPIKE_RANK = 12, 7
 # An IMU is stuck that has repeated the same six values this often and for this long (ns).
 STUCK_SAMPLES, STUCK_NS = 8, 250_000_000
 # The largest value of an axis is the end of its range if it is at least this large (rad/s, m/s^2),
-# more than at rest, and has come this often while so many other axes changed, and this many times
-# as often as the next smaller value: with a coarse resolution smaller values repeat, too. The true
-# motion may exceed the end by this share.
+# and has come this often while so many other axes changed, and this many times as often as the
+# next smaller value (with a coarse resolution smaller values repeat, too). The true motion may
+# exceed the end by this share.
 END_RATE, END_FORCE = 0.5, 15.0
 END_TIMES, END_CHANGING, PILED_UP = 5, 3, 4
 BEYOND_END = 0.5
 # The attitude is lost when the gyros may have missed this angle (rad).
 BLIND_ANGLE = 0.35
-# A step this many times the usual one holds lost samples; the motion that they may have missed
-# (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
+# A step this many times the usual one lost samples, which may have missed so much motion (angular
+# acceleration, rad/s^2, and jerk, m/s^3).
 GAP_STEPS = 2.5
 GAP_ANGULAR_ACCELERATION, GAP_JERK = 2.0, 20.0
 # Samples come in bunches, stamped on arrival, where the median step is less than this share of
@@ -104,7 +98,6 @@ class RangeCheck:
     """Detects an IMU at the end of its range, where an extreme value comes again and again."""
 
     def __init__(self) -> None:
-        """Start with no samples."""
         # For the six axes, then for the axes reversed: the two largest values so far, and how
         # often each has come.
         self._times = [{end: 0} for end in 2 * (3 * [END_RATE] + 3 * [END_FORCE])]
@@ -114,12 +107,10 @@ class RangeCheck:
         # Of the last sample at the end of the range: when the gyros were within it before, ns, and
         # the angle missed since, in whole multiples of `BLIND_ANGLE`.
         self._since_ns, self._angles = 0, 0.0
-        # Stamps of M samples at the end of the range, ns, and noise densities of the motion that
-        # gyros and accelerometers may miss until the next sample, (M, 2), rad/sqrt(s) and
-        # m/s/sqrt(s).
+        # Stamps of M samples at the end of the range, ns, and noise densities, (M, 2), of the
+        # motion that gyros and accelerometers may miss until the next, rad/sqrt(s), m/s/sqrt(s).
         self.stamps, self.densities = np.zeros(0, np.int64), np.zeros((0, 2))
-        # Stamps at which the gyros may have missed another `BLIND_ANGLE` since they were last
-        # within the range, ns.
+        # Stamps at which the gyros may have missed another `BLIND_ANGLE`, ns.
         self.blind: list[int] = []
 
     def add(self, stamps: Index, samples: Array) -> None:
@@ -150,10 +141,10 @@ class RangeCheck:
 
     def beyond(self, stamps: Index, ends_ns: Index, dt: Array) -> Array:
         """
-        Return noise densities, shape (2, K, n), of motion beyond the range, for steps.
+        Return the noise densities, shape (2, K, n), of motion beyond the range.
 
-        `stamps` are those of the samples, `ends_ns`, (K + 1,), the ends of the intervals, and
-        `dt`, (K, n), the steps in them.
+        `stamps` are those of samples, `ends_ns`, (K + 1,), and `dt`, (K, n), ends and steps of
+        intervals.
         """
         beyond = np.zeros((2,) + dt.shape)
         inside = slice(*np.searchsorted(self.stamps, ends_ns[[0, -1]]))
@@ -168,10 +159,9 @@ class RangeCheck:
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop what was found before a stamp."""
-        if self.stamps.size:
-            kept = self.stamps >= stamp_ns
-            self.stamps, self.densities = self.stamps[kept], self.densities[kept]
-            self.blind = [blind_ns for blind_ns in self.blind if blind_ns >= stamp_ns]
+        kept = self.stamps >= stamp_ns
+        self.stamps, self.densities = self.stamps[kept], self.densities[kept]
+        self.blind = [blind_ns for blind_ns in self.blind if blind_ns >= stamp_ns]
 
     def _at_end(self, samples: Array) -> np.ndarray:
         """Return which values are at the end of the range, shape (N, 6)."""
@@ -200,10 +190,10 @@ def white_noise(stamps_ns: Index, samples: Array, first: Index, last: Index) -> 
     """
     Return the white noise densities of gyros and accelerometers in K windows of the data.
 
-    Third divided differences remove what is quadratic over four samples, as motion is, and keep
-    what is new in each sample. Vibration counts as noise. `first` and `last`, (K,), are indices of
-    a window's first sample and of the one after its last; samples are (N, 6). Returns means over
-    the axes, (K, 2), rad/sqrt(s) and m/s/sqrt(s); 0 for fewer than eight samples.
+    Third divided differences remove what is quadratic over four samples, as motion is; vibration
+    counts as noise. `first` and `last`, (K,), are indices of a window's first sample and of the
+    one after its last; samples are (N, 6). Returns means over the axes, (K, 2), rad/sqrt(s) and
+    m/s/sqrt(s); 0 for fewer than eight samples.
     """
     count = last - first - 3
     enough = count >= 5
@@ -230,11 +220,11 @@ def white_noise(stamps_ns: Index, samples: Array, first: Index, last: Index) -> 
 
 def gap_and_jitter(stamps_ns: Index, first: Index, last: Index, dt: Array) -> tuple[Array, Array]:
     """
-    Return two factors for the noise of steps, `dt` of shape (K, n): of lost samples and of jitter.
+    Return two factors, (K, n), for the noise of steps, `dt`: of lost samples and of jitter.
 
-    A noise density is the first times an angular acceleration or jerk that samples may have
-    missed, and the second times the change of the samples per second. The usual step and jitter
-    are those in K windows of the stamps, as in `white_noise`.
+    A noise density is the first times an angular acceleration or jerk, and the second times the
+    change of the samples per second. K windows of the stamps, as in `white_noise`, show the usual
+    step and jitter.
     """
     steps, last = np.diff(stamps_ns) * 1e-9, last - 1
     count = (last - first)[:, None]
@@ -267,7 +257,6 @@ class ForceCheck:
     """Checks whether the mean specific force is plausible; `fault` is the result in words."""
 
     def __init__(self) -> None:
-        """Start with no samples."""
         self._sum = self._seconds = 0.0
         self.fault = ''
 

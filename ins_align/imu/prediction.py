@@ -47,7 +47,6 @@ class Prediction:
     def __init__(self, attitude: Attitude, gyro_bias: Array, gyro_matrix: Array,
                  gyro_bias_std: float, angle_random_walk: float, rate: Array,
                  interval: float) -> None:
-        """Start at the epoch."""
         self.stamp_ns = self._epoch_ns = attitude.stamp_ns
         x, y, z, w = attitude.quaternion_xyzw.tolist()
         self._quaternion = x, y, z, w
@@ -122,7 +121,6 @@ class Follower:
     """
 
     def __init__(self) -> None:
-        """Begin without an attitude."""
         self._samples: deque[tuple[int, Sequence[float]]] = deque(maxlen=HISTORY)
         self._prediction: Prediction | None = None
 

@@ -49,11 +49,6 @@ class SensorErrors(NamedTuple):
     accel_matrix: Array     # (3, 3)
 
     @staticmethod
-    def none() -> 'SensorErrors':
-        """Return the errors of perfect sensors, zero."""
-        return SensorErrors.from_vector(np.zeros(24))
-
-    @staticmethod
     def from_vector(vector: Array) -> 'SensorErrors':
         """Return the errors in a vector, shape (24,), with the matrices row by row."""
         return SensorErrors(vector[:3], vector[3:12].reshape(3, 3), vector[12:15],

@@ -65,8 +65,7 @@ def recent_motion(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Recent:
     rungs = np.searchsorted(stamps_ns, epochs_ns[:, None] - ages, side='right') - 1
     first = np.clip(rungs[:, -1], 0, last - 1)
     most = np.max(last - first)
-    # In Fortran order, so that the components of vectors are contiguous in memory.
-    step = (first + np.arange(most)[:, None]).T
+    step = (first + np.arange(most)[:, None]).T     # in Fortran order: components are contiguous
     inside = step < last[:, None]
     step = np.minimum(step, last[:, None] - 1)
     begin, end = ((stamps_ns[step.T + k] - epochs_ns).T * 1e-9 for k in (0, 1))
@@ -107,7 +106,7 @@ def _seen_from_epoch(dt: Array, rate: Array, force: Array) -> Array:
     return np.concatenate([force, rate], axis=-1)
 
 
-def interpolated(integrals: Array, age: float) -> tuple[Array, Array, Array]:
+def interpolated(integrals: Array, age: float) -> tuple[Array, ...]:
     """
     Return a force or rate at an age, and its integral and double integral from age 0, each (K, 3).
 
@@ -120,9 +119,7 @@ def interpolated(integrals: Array, age: float) -> tuple[Array, Array, Array]:
     trapezoids[1:step] += AGE_STEP
     trapezoids[step] += 0.5 * (AGE_STEP + rest)
     # The weights begin with the step at age 0, where the integrals are 0.
-    value, integral, double_integral = (weights[1:] @ integrals
-                                        for weights in (value, there, trapezoids))
-    return value, integral, double_integral
+    return tuple(weights[1:] @ integrals for weights in (value, there, trapezoids))
 
 
 def smoothed(integrals: Array, age: float) -> tuple[Array, Array]:
@@ -146,5 +143,4 @@ def _cubic(age: float, apart: int) -> tuple[Array, Array, Array]:
     weights = np.zeros((3, 1 + AGE_COUNT))
     weights[:, apart * first + apart * np.arange(4)] = np.array(
         [[1, x, x * x, x ** 3], [0, 1, 2 * x, 3 * x * x], [0, 0, 2, 6 * x]]) @ CUBIC
-    change, bend = weights[1] / (apart * AGE_STEP), weights[2] / (apart * AGE_STEP) ** 2
-    return weights[0], change, bend
+    return weights[0], weights[1] / (apart * AGE_STEP), weights[2] / (apart * AGE_STEP) ** 2
