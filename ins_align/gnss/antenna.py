@@ -33,32 +33,25 @@ FIX_JUMPS_BELIEVED = 5
 # A place older than this (s) is not carried on with the velocity.
 MAX_CARRIED = 60.0
 _UNKNOWN_VERTICAL_STD = 1e3     # m/s
-# A variance this many times smaller than the usual one, which is the median of this many epochs
-# or the configured variance if that is less, is not believed: a receiver whose sigma is ten times
-# better will repeat it. In the first epoch 1 mm (1 mm/s) and more is believed.
+# A variance this many times smaller than the usual one, the median of this many epochs or the
+# configured one if that is less, is not believed: a receiver that is ten times better repeats it.
+# In the first epoch 1 mm (1 mm/s) and more is believed.
 BETTER_THAN_USUAL, USUAL_EPOCHS = 100.0, 11
 BEST_VARIANCE = 1e-6
 # Velocity and position are compared over this distance (m), and at least so many sigmas.
 MIN_DISTANCE = 10.0
 DISTANCE_SIGMAS = 8.0
-# A mismatch of more than this share of the distance is not noise. This many in a row are a fault,
-# and fewer where all would fit with east and north exchanged.
-MAX_MISMATCH = 0.5
+# A mismatch of more than this share of the distance is not noise, if this many fixes in a row
+# agree to within it. This many mismatches in a row are a fault, and fewer where all would fit with
+# east and north exchanged.
+MAX_MISMATCH, AGREEING = 0.5, 3
 FAULT_MISMATCHES, FAULT_MISMATCHES_AS_NED = 4, 3
-# At the end of the distance this many fixes in a row have to agree to within the same share of it.
-AGREEING = 3
 
 
 class Antenna:
-    """
-    Follows the antenna from epoch to epoch, with or without a fix in each.
-
-    Counts what is not believed: ``fix_jump``, ``fix_covariance``, ``velocity_covariance``,
-    ``velocity_no_vertical``.
-    """
+    """Follows the antenna from epoch to epoch, and counts what is not believed."""
 
     def __init__(self, config: Config, counts: Counter[str]) -> None:
-        """Start with no place known."""
         self._config = config
         self._counts = counts
         self._place: Place | None = None
@@ -169,18 +162,16 @@ class StatedNoise:
     """
     Covariances of a receiver: those stated, as far as they are believed, or those configured.
 
-    `std` and `std_vertical` are the configured sigmas, for messages without a covariance;
-    `unknown_std` is that of a vertical that is not measured. `counter` is the name that counts
-    covariances which are not believed.
+    `std` and `std_vertical` are the configured sigmas, `unknown_std` that of a vertical that is
+    not measured; `counter` counts covariances which are not believed.
     """
 
     def __init__(self, std: float, std_vertical: float, unknown_std: float, counts: Counter[str],
                  counter: str) -> None:
         self._default = np.diag([std ** 2, std ** 2, std_vertical ** 2])
-        self._variances = self._default.diagonal().tolist()
         self._unknown_variance = unknown_std ** 2
         self._counts, self._counter = counts, counter
-        self._recent: list[deque[float]] = [deque(maxlen=USUAL_EPOCHS) for _ in self._variances]
+        self._recent: list[deque[float]] = [deque(maxlen=USUAL_EPOCHS) for _ in range(3)]
 
     def covariance(self, stated: Array | None, vertical: bool = True) -> Array:
         """Return the covariance to use, (3, 3), ENU; `vertical`: the vertical is measured."""
@@ -195,7 +186,7 @@ class StatedNoise:
         """Return a stated covariance with variances that are too small replaced by usual ones."""
         factors = []
         for variance, recent, default in zip(covariance.diagonal().tolist(), self._recent,
-                                             self._variances):
+                                             self._default.diagonal().tolist()):
             recent.append(variance)
             usual = default
             if (default > BETTER_THAN_USUAL * variance
@@ -213,7 +204,6 @@ class VelocityCheck:
     """Checks the frame and the axes of the velocity against the change of position."""
 
     def __init__(self) -> None:
-        """Start with nothing compared."""
         self._origin: Place | None = None
         # Horizontal vectors are complex numbers: east is the real part, north the imaginary one.
         self._path = 0j                     # integral of the velocity since the origin
@@ -221,8 +211,7 @@ class VelocityCheck:
         self._recent: deque[tuple[complex, complex]] = deque(maxlen=AGREEING)
         self._anchor: tuple[complex, complex] | None = None
         self._last: tuple[float, complex] | None = None     # time and velocity
-        self.bad_in_a_row = 0
-        self._as_ned_in_a_row = 0
+        self._bad_in_a_row = self._as_ned_in_a_row = 0
 
     def add(self, time: float, place: Place, v_n: Array, position_std: float) -> None:
         """Take an epoch with position and velocity (ENU); seconds, radians, metres."""
@@ -254,7 +243,7 @@ class VelocityCheck:
         self._origin = None                   # the next distance begins here
         if as_ned and not bad:
             return                            # towards north-east both frames are the same
-        self.bad_in_a_row = self.bad_in_a_row + 1 if bad else 0
+        self._bad_in_a_row = self._bad_in_a_row + 1 if bad else 0
         self._as_ned_in_a_row = self._as_ned_in_a_row + 1 if as_ned else 0
 
     @property
@@ -263,7 +252,7 @@ class VelocityCheck:
         if self._as_ned_in_a_row >= FAULT_MISMATCHES_AS_NED:
             return ('the GNSS velocity contradicts the change of position, and would fit it with '
                     'north and east exchanged: set velocity_frame to the other one (enu, ned)')
-        if self.bad_in_a_row < FAULT_MISMATCHES:
-            return ''
-        return ('the GNSS velocity contradicts the change of position: check that it is given in '
-                'a world frame (velocity_frame) and in m/s')
+        if self._bad_in_a_row >= FAULT_MISMATCHES:
+            return ('the GNSS velocity contradicts the change of position: check that it is given '
+                    'in a world frame (velocity_frame) and in m/s')
+        return ''

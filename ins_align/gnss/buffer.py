@@ -11,13 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""
-The queue of GNSS messages: sorted by stamp and paired.
-
-Messages may arrive late, twice, out of order or invalid. Those that cannot be used are counted by
-reason. An epoch is released once the IMU is far enough ahead of it, so that results depend on the
-messages and not on when the queue is read.
-"""
+"""The queue of GNSS messages: sorted by stamp, paired, those of no use counted by reason."""
 
 from collections import Counter
 import math
@@ -55,9 +49,8 @@ class GnssBuffer:
     """
     GNSS messages that are not used yet, by stamp.
 
-    `counts` counts them, and also epochs that only repeat the one before (``gnss_repeated``) or
-    are later than the last IMU sample (``gnss_after_imu``), and velocities of a receiver that has
-    no fix (``velocity_no_fix``).
+    `counts` counts them, and also epochs that only repeat the one before or are later than the
+    last IMU sample, and velocities of a receiver without a fix.
     """
 
     def __init__(self, lateness_ns: int, counts: Counter[str], earliness_ns: int = 0) -> None:
@@ -114,9 +107,9 @@ class GnssBuffer:
         """
         Return the epochs up to a stamp, in order, and remove them from the queue.
 
-        No message up to `due_ns` can still come, by default up to the stamp; it is not before it.
-        A fix or a velocity alone waits while its other half may come, and so do all later ones.
-        `last`: no more messages will come; those after the stamp are dropped.
+        No message up to `due_ns`, by default the stamp, can still come. A fix or a velocity alone
+        waits while its other half may come, and so do all later ones. `last`: no more messages
+        will come; those after the stamp are dropped.
         """
         due_ns = upto_ns if due_ns is None else due_ns
         stamps = sorted(self._pending)
@@ -152,11 +145,7 @@ class GnssBuffer:
         return released
 
     def _repeats(self, fix: Fix | None, velocity: Velocity | None) -> bool:
-        """
-        Return whether a moving epoch has the values of the one before, to the last bit.
-
-        No receiver measures that: a driver sends its last message again.
-        """
+        """Return whether a moving epoch is exactly the one before: a driver sends it again."""
         before, self._last_values = self._last_values, ()
         if fix is not None and velocity is not None:
             v_n = velocity.velocity.tolist()

@@ -47,11 +47,10 @@ def _microseconds_ns(msg: Any) -> int:
 
 class Receiver(NamedTuple):
     """
-    How to read position and velocity in a message of one type.
+    Where position and velocity are in a message: fields, with factors to the units stated here.
 
-    Each value is a field of the message, with the factor to the unit stated here. Standard
-    deviations are horizontal, per axis, then vertical; a single one is for both, and without any
-    the configured ones are used.
+    Standard deviations are horizontal, per axis, then vertical; a single one is for both, and
+    without any the configured ones are used.
     """
 
     stamp: Callable[[Any], int]  # ns
@@ -98,10 +97,10 @@ DRIVER_TYPES = (*RECEIVERS, *INERTIAL_UNITS)
 
 def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velocity]:
     """
-    Convert a message of one of `RECEIVERS`.
+    Convert a message of one of `RECEIVERS`; sigmas that are not stated are those of `config`.
 
-    `config` has the standard deviations that are not stated. Raises NoTimeError if the receiver
-    does not know the time yet, and MessageError if a field is missing or in another unit.
+    Raises NoTimeError if the receiver does not know the time yet, and MessageError if a field is
+    missing or in another unit.
     """
     row = RECEIVERS[msgtype]
     try:

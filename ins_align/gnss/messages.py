@@ -38,13 +38,12 @@ def enu_from_ned(vectors: Array) -> Array:
 
 ENU_FROM_NED = enu_from_ned(np.eye(3))
 
-# Names of body frames, from REP-105 and drivers, as a whole word of the frame_id. A GNSS driver
-# has "gps", "gnss", "antenna" or a world frame there.
+# Names of body frames, from REP-105 and drivers, as a whole word of the frame_id.
 _BODY_FRAME = re.compile(r'(?:^|[_\-/.])(?:base|body|chassis|footprint|imu|ins|vehicle)\d*'
                          r'(?:$|[_\-/.])', re.IGNORECASE)
 
-# Variances (m^2 or m^2/s^2) below that of a micrometre are placeholders. Others are limited to
-# those of a tenth of a millimetre and of a kilometre, so that matrices can be inverted.
+# Variances (m^2 or m^2/s^2) below the first are placeholders. Others are limited, so that matrices
+# can be inverted.
 SMALLEST_VARIANCE = 1e-12
 MIN_VARIANCE, MAX_VARIANCE = 1e-8, 1e6
 MIN_EIGENVALUE = 1e-9  # of a correlation matrix; less may be rounding of an impossible one
@@ -132,9 +131,9 @@ def sound_covariance(sent: Array | None, default_std: Sequence[float] = ()) -> A
     """
     Return a covariance, (3, 3), that is symmetric and positive definite; None: it is unknown.
 
-    A variance that is 0 (or less than that of any sensor), negative (-1 marks "unknown") or not
-    finite is unknown. The default sigma replaces it unless all three are unknown; without default
-    sigmas a single unknown one makes all unknown. Impossible correlations are dropped.
+    A variance that is tiny, negative (-1 marks "unknown") or not finite is unknown. The default
+    sigma replaces it unless all three are unknown; without default sigmas a single unknown one
+    makes all unknown. Impossible correlations are dropped.
     """
     if sent is None:
         return None
@@ -168,9 +167,9 @@ def stamp_from_msg(msg: Any) -> int:
 
 def imu_from_msg(msg: Any) -> tuple[int, np.ndarray, np.ndarray]:
     """Return stamp, ns, angular rate, rad/s, and specific force, m/s^2, of sensor_msgs/Imu."""
-    rate, force = msg.angular_velocity, msg.linear_acceleration
-    return (stamp_from_msg(msg), np.array([rate.x, rate.y, rate.z]),
-            np.array([force.x, force.y, force.z]))
+    rate, force = (np.array([vector.x, vector.y, vector.z])
+                   for vector in (msg.angular_velocity, msg.linear_acceleration))
+    return stamp_from_msg(msg), rate, force
 
 
 def fixes_from_msgs(msgs: Sequence[Any]) -> list[Fix]:
@@ -185,10 +184,9 @@ def fixes_from_msgs(msgs: Sequence[Any]) -> list[Fix]:
 def fixes(stamps_ns: ArrayLike, places: ArrayLike, covariances: np.ndarray,
           covariance_types: ArrayLike, status: ArrayLike) -> list[Fix]:
     """
-    Return fixes from the columns of N messages, with types and status as in sensor_msgs/NavSatFix.
+    Return fixes from the columns of N messages, as in sensor_msgs/NavSatFix.
 
-    Places, (N, 3), are latitude and longitude, degrees, and altitude, m; covariances, (N, 3, 3),
-    m^2, are as sent.
+    Places, (N, 3), are latitude, longitude, degrees, and altitude, m; covariances are (N, 3, 3).
     """
     columns = (stamps_ns, *np.asarray(places, float).T, covariance_types, status)
     return [Fix(stamp, latitude, longitude, altitude,
@@ -214,8 +212,7 @@ def velocities_from_msgs(msgs: Sequence[Any], config: Config) -> list[Velocity]:
 
 def frame_of_velocity(msg: Any, velocity_type: str) -> str:
     """Return the frame_id of the velocity in a message."""
-    frame: str = msg.child_frame_id if velocity_type == 'Odometry' else msg.header.frame_id
-    return frame
+    return str(msg.child_frame_id if velocity_type == 'Odometry' else msg.header.frame_id)
 
 
 def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
@@ -223,9 +220,8 @@ def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
     """
     Return velocities from the columns of N messages with the same frame_id, `frame`.
 
-    `linear`, (N, 3), m/s, is ENU unless ``config.velocity_frame`` is ned. Of covariances, which
-    may be those of twists, (N, 6, 6), the first three rows and columns are used, as in
-    `sound_covariance`. Raises MessageError if `frame` is a body frame and
+    `linear`, (N, 3), m/s, is ENU unless ``config.velocity_frame`` is ned. Covariances may be those
+    of twists, (N, 6, 6). Raises MessageError if `frame` is a body frame and
     ``config.velocity_frame`` is auto.
     """
     if config.velocity_frame == 'auto' and _BODY_FRAME.search(frame):

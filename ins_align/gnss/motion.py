@@ -88,9 +88,8 @@ def without_wild_positions(positions: Series) -> Series:
     """
     Leave out positions that are far from the median of the five around them.
 
-    Far is half of the distance over which velocity and position are compared: smaller errors
-    matter no more than noise does. The median follows steady motion of any speed. The first two
-    and the last two positions cannot be judged and stay.
+    Far is half of the distance over which velocity and position are compared. The first two and
+    the last two positions cannot be judged and stay.
     """
     vectors = positions.vectors
     if vectors.shape[0] < 5:
@@ -160,8 +159,8 @@ def find_manoeuvres(velocities: Series) -> tuple[float, float | None]:
     """
     Find changes of the horizontal velocity, which make a heading observable.
 
-    Takes two velocities or more, as from `on_grid` or `velocity_from_positions`. Returns the
-    largest change within MANOEUVRE_TIME, m/s, and when the first of MANOEUVRE_SPEED begins, s.
+    Returns the largest within MANOEUVRE_TIME, m/s, and when the first of MANOEUVRE_SPEED begins,
+    s. Velocities are two or more, every GRID s.
     """
     times, v = velocities.times, velocities.vectors[:, :2]
     largest = 0.0
@@ -206,7 +205,7 @@ def _compared_distance(positions: Series) -> float:
 def _mean_direction(numbers: np.ndarray) -> complex:
     """Return the mean of complex numbers, each divided by its magnitude."""
     lengths = np.abs(numbers)
-    return complex(np.sum(numbers / np.where(lengths > 0.0, lengths, np.inf)) / lengths.size)
+    return complex(np.mean(numbers / np.where(lengths > 0.0, lengths, np.inf)))
 
 
 def _grid(times: Array) -> Array:
