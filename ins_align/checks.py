@@ -11,16 +11,12 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""
-Checks of units, coordinates and clocks that need no alignment, for node, replay and info.
-
-Their results are sentences that tell what to set or to change.
-"""
+"""Checks of units, coordinates and clocks that need no alignment; they say what to change."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import fields, replace
 import math
 
@@ -54,9 +50,9 @@ def degrees_fault(too_fast: bool, times: Array, gyro: Array, accel: Array, veloc
     """
     Return in words that the angular rates are in deg/s, or ''.
 
-    They are if they are `too_fast`, or if the specific force shows it: rotated by the rates and
-    integrated over some seconds, it is as long as the change of velocity less gravity, whatever
-    the attitude and the axes are. Rates that are 57 times too large make it shorter.
+    They are if they are `too_fast`, or if the specific force, rotated by the rates and integrated
+    over some seconds, is shorter than the change of velocity less gravity: right rates make it as
+    long, whatever the attitude and the axes are.
 
     `times` are increasing, s, shape (N,); `gyro`, rad/s, and `accel`, m/s^2, are means over GRID s
     around them, shape (N, 3); `velocities` are as from `on_grid`.
@@ -119,11 +115,7 @@ def beyond_the_poles(latitude_deg: float, longitude_deg: float) -> bool:
 
 
 def lateness_advice(lateness: float, delay: float = 0.0) -> tuple[str, str]:
-    """
-    Return advice for GNSS messages that are `lateness` s late, and the gnss_lateness to set.
-
-    `delay`, s, is negative where gnss_delay corrects a clock that is behind.
-    """
+    """Return advice for messages that are late beyond gnss_delay, s, and the gnss_lateness."""
     other_delay = max(delay - lateness, -MAX_DELAY)
     value = f'{min(math.ceil(2.0 * lateness) / 2.0 + 0.5, MAX_LATENESS):g}'
     return (f'GNSS messages come up to {lateness:.1f} s later than newer IMU samples: set '
@@ -157,20 +149,17 @@ class InputChecks:
             if place := count + self._newest_ns.size:
                 self._late.append(
                     (int(newest[place - 1]) - message.stamp_ns) * 1e-9 + self._delay)
-            self._add_gnss(message)
+            message, fault = usable(message)
+            numbers = numbers_of(message)
+            if not fault:
+                rows = self._velocities if isinstance(message, Velocity) else self._fixes
+                rows.append((message.stamp_ns * 1e-9, *numbers))
+            elif isinstance(message, Fix) and beyond_the_poles(*numbers[:2]):
+                self._beyond_the_poles += 1
         if stamps_ns.size:
             # Not the newest of all: the IMU's clock may have been set back.
             self._newest_ns = stamps_ns.max(keepdims=True)
             self._add_imu(stamps_ns, gyro, accel)
-
-    def _add_gnss(self, message: Fix | Velocity) -> None:
-        message, fault = usable(message)
-        numbers = numbers_of(message)
-        if not fault:
-            rows = self._velocities if isinstance(message, Velocity) else self._fixes
-            rows.append((message.stamp_ns * 1e-9, *numbers))
-        elif isinstance(message, Fix) and beyond_the_poles(*numbers[:2]):
-            self._beyond_the_poles += 1
 
     def _add_imu(self, stamps_ns: Index, gyro: Array, accel: Array) -> None:
         rates = np.abs(gyro).max(axis=1)
@@ -187,11 +176,7 @@ class InputChecks:
             del self._cells[next(iter(self._cells))]
 
     def judge(self, status: Status) -> Status:
-        """
-        Return a status that is a FAULT if units or coordinates are wrong.
-
-        Its reason also says that GNSS messages come too late. An ALIGNED status is not changed.
-        """
+        """Return a status with what is wrong, faults first; an ALIGNED one is not changed."""
         if status.state is State.ALIGNED:
             return status
         if faults := self.faults():
@@ -200,7 +185,7 @@ class InputChecks:
 
     def faults(self) -> list[str]:
         """Return a sentence for each fault of units or coordinates."""
-        fixes, velocities = self._gnss()
+        fixes, velocities = map(_series, (self._fixes, self._velocities))
         motion = on_grid(velocities) if velocities.times.size > 1 else velocity_from_positions(
             track(fixes))
         cells = sorted(self._cells)
@@ -214,15 +199,9 @@ class InputChecks:
 
     def velocities(self) -> Series:
         """Return the latest velocities, ENU, m/s, or those that positions show if none came."""
-        fixes, velocities = self._gnss()
-        return velocities if velocities.times.size else differences(track(fixes))
-
-    def _gnss(self) -> tuple[Series, Series]:
-        """Return the latest positions, degrees and m, and velocities, ENU, m/s."""
-        fixes, velocities = (
-            series_of(*np.split(np.array(rows), [1], axis=1)) if rows else EMPTY
-            for rows in (self._fixes, self._velocities))
-        return fixes, velocities
+        if self._velocities:
+            return _series(self._velocities)
+        return differences(track(_series(self._fixes)))
 
     def late_messages(self) -> list[str]:
         """Return a sentence if GNSS messages come too late, else nothing."""
@@ -230,3 +209,8 @@ class InputChecks:
         if len(late) >= max(MIN_LATE, LATE_SHARE * len(self._late)) and max(late) < MAX_LATENESS:
             return [lateness_advice(float(np.quantile(late, 0.99)), self._delay)[0]]
         return []
+
+
+def _series(rows: Collection[tuple[float, ...]]) -> Series:
+    """Return a series of rows that begin with the time."""
+    return series_of(*np.split(np.array(rows), [1], axis=1)) if rows else EMPTY

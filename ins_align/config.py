@@ -86,11 +86,10 @@ def _parameter(default: Any, description: str, unit: str = '', minimum: float | 
 @dataclass(frozen=True)
 class Config:
     """
-    All parameters, checked.
+    All parameters, checked, with their description in each field's metadata (see `_parameter`).
 
-    Each field's metadata holds ``description``, ``unit``, ``minimum`` and ``maximum`` (inclusive;
-    None if it is not a number), ``choices`` and ``read_only``. A ConfigError is raised if a value
-    is of the wrong type, out of range or in contradiction to another one.
+    A ConfigError is raised if a value is of the wrong type, out of range or in contradiction to
+    another one.
     """
 
     lever_arm: tuple[float, float, float] = _parameter(
@@ -223,13 +222,9 @@ class Config:
     @property
     def imu_noise(self) -> ImuNoise:
         """Noise of the IMU in SI units: the figures above 0, and the preset for the others."""
-        own = _imu_noise(self.angle_random_walk, self.velocity_random_walk,
-                         self.gyro_bias_std, self.accel_bias_std, self.gyro_scale_std,
-                         self.rate_random_walk)
-        if self.imu_grade == 'custom':
-            return own
-        return ImuNoise(*(given or preset for given, preset
-                          in zip(own, PRESETS[self.imu_grade])))
+        own = _imu_noise(*(getattr(self, name) for name in ImuNoise._fields))
+        preset = PRESETS.get(self.imu_grade, own)
+        return ImuNoise(*(given or usual for given, usual in zip(own, preset)))
 
 
 def config_from_mapping(values: Mapping[str, Any]) -> Config:
@@ -244,26 +239,24 @@ def without_unknown(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str
     """
     Return the values of known parameters, and a warning for each unknown name.
 
-    Unknown names are no error, because a file may hold parameters of other nodes, but they may be
-    misspelt. The parameters that rclpy declares on every node are left out without a warning.
+    An unknown name may be misspelt, or a parameter of another node in the same file.
     """
     known = [field.name for field in dataclasses.fields(Config)]
     sentences = []
     for name in sorted(str(name) for name in values if name not in known):
-        if name.split('.')[0] in RCLPY_PARAMETERS:
-            continue
-        close = difflib.get_close_matches(name, known)
-        hint = f': did you mean {" or ".join(close)}?' if close else ''
-        sentences.append(f'parameter {reprlib.repr(name)} is not known{hint}')
+        if name.split('.')[0] not in RCLPY_PARAMETERS:
+            close = difflib.get_close_matches(name, known)
+            hint = f': did you mean {" or ".join(close)}?' if close else ''
+            sentences.append(f'parameter {reprlib.repr(name)} is not known{hint}')
     return {name: value for name, value in values.items() if name in known}, sentences
 
 
 def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
-    Read the parameters of this node from a ROS 2 parameter file; return unchecked values by name.
+    Read a ROS 2 parameter file; return the unchecked values of this node by name.
 
-    The YAML has ``ros__parameters`` below the node's name or a wildcard (``/**``). A ConfigError
-    is raised if the file cannot be read, or holds parameters for no node of this name or for two.
+    A ConfigError is raised if the file cannot be read, or holds ``ros__parameters`` for no node of
+    this name or wildcard (``/**``), or for two nodes of this name.
     """
     try:
         with open(path, 'rb') as file:
@@ -280,14 +273,14 @@ def load_params(path: str | os.PathLike[str]) -> dict[str, Any]:
     if len(nodes) > 1:
         raise ConfigError(f'{path} holds parameters for {" and ".join(nodes)}: leave only those '
                           'of one of them')
+    if not found:
+        raise ConfigError(f'{path} holds no parameters for this node: expected '
+                          f'"{NODE_NAME}:" or "/**:" with "ros__parameters:" below')
     for node, content in found:
         if not isinstance(content, dict):
             raise ConfigError(f'{path}: ros__parameters of {node} must be a mapping of names '
                               'to values')
         values.update(content)
-    if not found:
-        raise ConfigError(f'{path} holds no parameters for this node: expected '
-                          f'"{NODE_NAME}:" or "/**:" with "ros__parameters:" below')
     return values
 
 
@@ -342,8 +335,7 @@ def checked(field: dataclasses.Field[Any], value: Any) -> Any:
     Return a value, checked and converted to the type of the field's default.
 
     A field takes one of its ``choices``, a name, a number, or as many numbers as its default or
-    its ``names`` has; numbers are in ``unit``, from ``minimum`` to ``maximum``. A ConfigError says
-    what is expected.
+    its ``names`` has. A ConfigError says what is expected.
     """
     metadata, default = field.metadata, field.default
     if choices := metadata['choices']:

@@ -287,9 +287,8 @@ class Result:
         if not aligned:
             return state
         after = f'after {aligned[0].first.t_s:.1f} s'
-        if self.aligned and len(aligned) == 1:
-            return f'{state} {after}'
-        return f'{state} (first ALIGNED {after}, declarations: {len(aligned)})'
+        return (f'{state} {after}' if self.aligned and len(aligned) == 1 else
+                f'{state} (first ALIGNED {after}, declarations: {len(aligned)})')
 
     def __repr__(self) -> str:
         now = self.current
