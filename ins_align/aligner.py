@@ -69,7 +69,6 @@ class Aligner:
     """
 
     def __init__(self, config: Config | None = None, base: Transform | None = None) -> None:
-        """Start without messages."""
         self.config = Config() if config is None else config
         self._base = base
         self._counts: Counter[str] = Counter()      # messages and epochs, by outcome
@@ -82,7 +81,7 @@ class Aligner:
         self._forget_all()
 
     def _forget_all(self) -> None:
-        """Forget everything but the counts, events and finished epochs."""
+        """Drop the queues and all that was learnt; counts, events and finished epochs stay."""
         lateness_ns = round(self.config.gnss_lateness * 1e9) + max(self._delay_ns, 0)
         self._imu = ImuBuffer(lateness_ns, self._counts, self.config.imu_noise)
         self._gnss = GnssBuffer(lateness_ns, self._counts, max(-self._delay_ns, 0))
@@ -135,12 +134,9 @@ class Aligner:
         if self._imu.add(stamp_ns, gyro, accel):
             return
         since = self._imu.held
-        # Epochs from before the jump, which an earlier `update` could have returned.
-        self._process()
-        self._counts['clock_jumps'] += 1
         # Sensor errors that were learnt are dropped: if a recording is played again, they come
         # from the same data and are no independent prior.
-        self._start_over('the clock of the IMU jumped back')
+        self._start_over('clock_jumps', 'the clock of the IMU jumped back')
         for held_ns, values in since:
             self._imu.add(held_ns, values[:3], values[3:])
 
@@ -160,20 +156,20 @@ class Aligner:
     def reject(self, reason: str, why: str = '') -> None:
         """Count a message that the caller could not use; `why`, in words, is an event once."""
         self._counts[reason] += 1
-        if self.config.use_velocity is False and reason.startswith('velocity'):
+        if not why or (self.config.use_velocity is False and reason.startswith('velocity')):
             return
-        self._refusal = why or self._refusal
-        if why and why not in self._warned and len(self._warned) < MAX_WARNINGS:
+        self._refusal = why
+        if why not in self._warned and len(self._warned) < MAX_WARNINGS:
             self._warned.add(why)
             self._events.append(Event(Severity.WARNING, why))
 
     def reset(self, reason: str = 'on request') -> None:
         """Start over from nothing, for a reason in words."""
-        self._process()                             # messages before it are counted
-        self._counts['resets'] += 1
-        self._start_over(reason)
+        self._start_over('resets', reason)
 
-    def _start_over(self, why: str) -> None:
+    def _start_over(self, counter: str, why: str) -> None:
+        self._process()     # whatever came before, so that results do not depend on `update`
+        self._counts[counter] += 1
         self._announce_restart(why)
         self._forget_all()
 
@@ -195,8 +191,8 @@ class Aligner:
         """
         Process the queued messages that no late one can precede; return the new epochs.
 
-        With `dry`, epochs without measurement that divide an outage are returned as well. `last`
-        says that no more messages come, so that all that are queued are processed.
+        With `dry` also those without measurement that divide an outage. `last`: no more messages
+        come, so that all are processed.
         """
         self._process(last)
         done, self._done = self._done, []
@@ -340,18 +336,15 @@ class Aligner:
         if self._first_fix_ns is None or not (epoch.position_measured or epoch.v_n is not None):
             return
         config = self.config
+        alone = epoch.v_n is None
         wanted = config.use_velocity is not False
-        alone = not wanted or (config.use_velocity == 'auto' and config.method != 'vif'
-                               and epoch.stamp_ns - self._first_fix_ns >= NO_VELOCITY_NS)
         no_velocity = self._unused_velocities()
-        if epoch.v_n is None and not alone:
+        if alone and wanted and (
+                config.use_velocity is True or config.method == 'vif'
+                or epoch.stamp_ns - self._first_fix_ns < NO_VELOCITY_NS):
             self._wait(State.WAITING_FOR_GNSS, 'no GNSS velocity yet', no_velocity)
             return
-        # With velocities, positions gain little, and they hurt where their errors wander or their
-        # stamps are a few milliseconds off.
-        use_position = config.use_position is True or (
-            config.use_position == 'auto' and epoch.v_n is None)
-        if epoch.v_n is None and not use_position:
+        if alone and config.use_position is False:
             self._wait(State.WAITING_FOR_GNSS, 'no GNSS velocity yet, and use_position is false')
             return
         if self._imu.stamps[0] > epoch.stamp_ns:
@@ -362,12 +355,15 @@ class Aligner:
         self._last_ns = self._start_ns = epoch.stamp_ns
         if self._first_t0_ns is None:
             self._first_t0_ns = epoch.stamp_ns
-        self._without_velocity = bool(no_velocity) and wanted and epoch.v_n is None
+        self._without_velocity = bool(no_velocity) and wanted and alone
         imu = preintegrate(*self._imu.start(epoch.stamp_ns))
         if config.method == 'bank':
+            # With velocities, positions gain little, and they hurt where their errors wander or
+            # their stamps are a few milliseconds off.
+            use_position = alone or config.use_position is True
             self._method = Bank(config, epoch, imu, use_position, self._learnt, self._base)
         else:
-            self._method = NoteMethod(config, epoch, imu, epoch.v_n is None)
+            self._method = NoteMethod(config, epoch, imu, alone)
         self._judge(epoch, self._method)
 
     def _bridge_outage(self, upto_ns: int) -> None:
@@ -428,16 +424,16 @@ class Aligner:
         return int(self._imu.stamps[-1]) if self._imu.stamps.size else None
 
     def attitude_now(self) -> Attitude | None:
-        """
-        Return the current attitude, propagated with the gyros to the newest IMU sample.
-
-        None before there is an attitude, and after a time in which the IMU measured too little.
-        """
+        """Return the attitude of `prediction`."""
         prediction = self.prediction()
         return None if prediction is None else prediction.attitude()
 
     def prediction(self) -> Prediction | None:
-        """Return a prediction that stands at the newest IMU sample; None as `attitude_now`."""
+        """
+        Return the current attitude, carried on with the gyros to the newest IMU sample.
+
+        None before there is an attitude, and after a time in which the IMU measured too little.
+        """
         current, method = self._current, self._method
         if current is None or method is None:
             return None

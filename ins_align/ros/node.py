@@ -76,7 +76,6 @@ class ReasonLog:
     """Decides when a state with its reason is worth a line in the log."""
 
     def __init__(self) -> None:
-        """Start with nothing logged."""
         self._logged: dict[str, float] = {}  # text without numbers to when it was logged last, s
         self._last = ''  # the one that was logged last
 
@@ -123,7 +122,6 @@ class AlignmentNode(Node):
     """
 
     def __init__(self) -> None:
-        """Declare the parameters, then open the topics."""
         # Overrides are declared untyped first, so that [1, 1, 1] is as good as [1.0, 1.0, 1.0].
         try:
             super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True)
