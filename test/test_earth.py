@@ -13,6 +13,8 @@
 # limitations under the License.
 """The Earth against python-ins, closed forms and finite differences."""
 
+from functools import partial
+
 from ins_align.geometry import earth
 from ins_align.geometry.rotation import apply
 from ins_align.gnss.messages import ENU_FROM_NED
@@ -106,25 +108,25 @@ def test_earth_turns_eastward():
 
 
 def test_frozen_level_starts_as_the_level_and_turns_with_the_earth():
-    level = earth.LocalLevel(*RADIANS[1, :2])
-    assert np.allclose(level.matrix(0.0, *RADIANS[1, :2]), np.eye(3), atol=1e-15)
-    turned = Rotation.from_matrix(level.matrix(100.0, *RADIANS[1, :2])).as_rotvec()
+    start = RADIANS[1, :2]
+    assert np.allclose(earth.matrix_n0n(start, 0.0, *start), np.eye(3), atol=1e-15)
+    turned = Rotation.from_matrix(earth.matrix_n0n(start, 100.0, *start)).as_rotvec()
     assert np.allclose(turned, 100.0 * earth.earth_rate_n(RADIANS[1, 0]), atol=1e-14)
 
 
 def test_frozen_level_is_smooth_across_the_antimeridian():
     latitude = np.radians(-18.0)
-    level = earth.LocalLevel(latitude, np.radians(179.9999))
-    across = level.matrix(5.0, latitude, np.radians(np.array([180.0, -180.0, -179.9999])))
+    across = earth.matrix_n0n((latitude, np.radians(179.9999)), 5.0, latitude,
+                              np.radians(np.array([180.0, -180.0, -179.9999])))
     assert np.allclose(across[0], across[1], atol=1e-15)
     assert np.linalg.norm(across[2] - across[0]) < 4e-6
 
 
 def test_inertial_velocity_is_the_derivative_of_inertial_position():
-    level = earth.LocalLevel(*RADIANS[1, :2])
+    level = partial(earth.matrix_n0n, RADIANS[1, :2])
 
     def position(time, latitude, longitude, altitude):
-        return level.matrix(time, latitude, longitude) @ earth.position_n(latitude, altitude)
+        return level(time, latitude, longitude) @ earth.position_n(latitude, altitude)
 
     v_n = np.array([120.0, -80.0, 5.0])
     rn, _, rp = reference.principal_radii(PLACES[2, 0], PLACES[2, 2])
@@ -133,7 +135,7 @@ def test_inertial_velocity_is_the_derivative_of_inertial_position():
     ahead, behind = (position(time + d, *(RADIANS[2] + d * rate)) for d in (h, -h))
     numeric = (ahead - behind) / (2 * h)
     latitude, longitude, altitude = RADIANS[2]
-    velocity = level.matrix(time, latitude, longitude) @ (
+    velocity = level(time, latitude, longitude) @ (
         v_n + earth.ground_velocity_n(latitude, altitude))
     assert np.allclose(velocity, numeric, atol=1e-6)
 
@@ -142,11 +144,11 @@ def test_gravitation_is_that_of_python_ins_and_turned_with_the_earth():
     for place, degrees in zip(RADIANS, PLACES):
         if degrees[2] > 1000.0:
             continue  # its gravity is linear in height
-        level = earth.LocalLevel(*RADIANS[1, :2])
         C_n0e = earth.matrix_en(*RADIANS[1, :2]).T
         expected = C_n0e @ Rotation.from_euler('z', earth.EARTH_RATE * 50.0).apply(
             reference.gravitation_ecef(degrees))
-        found = level.matrix(50.0, *place[:2]) @ earth.gravitation_n(place[0], place[2])
+        found = (earth.matrix_n0n(RADIANS[1, :2], 50.0, *place[:2])
+                 @ earth.gravitation_n(place[0], place[2]))
         assert np.allclose(found, expected, atol=2e-5)
 
 

@@ -194,13 +194,12 @@ class ClosedForm:
 
 
 def test_positions_alone_are_the_integrated_velocity_form():
-    from ins_align.geometry.earth import gravity_n, LocalLevel
+    from ins_align.geometry.earth import gravity_n, matrix_n0n
     course, end = ClosedForm(), 100.0
     start = course.lla(0.0)
-    level = LocalLevel(*start[:2])
 
     def turned(t, vector):
-        return level.matrix(t, *course.lla(t)[:2]) @ vector
+        return matrix_n0n(start[:2], t, *course.lla(t)[:2]) @ vector
 
     def integrand(t):
         lla, v_n = course.lla(t), course.v_n(t)

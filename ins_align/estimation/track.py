@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 from ins_align.estimation.states import Measured
 from ins_align.geometry.earth import (
-    earth_rate_n, gravitation_n, gravity_n, ground_velocity_n, LocalLevel, position_n)
+    earth_rate_n, gravitation_n, gravity_n, ground_velocity_n, matrix_n0n, position_n)
 from ins_align.geometry.rotation import Array, cross, running_sum
 from ins_align.gnss.messages import AntennaEpoch, velocities_of
 import numpy as np
@@ -38,7 +38,7 @@ class InertialTrack:
     relative to the position at t0, against rounding.
     """
 
-    n0: LocalLevel
+    origin: tuple[float, float]  #: latitude and longitude at t0, radians
     time: Array  #: (...), s since t0
     C_n0n: Array  #: (..., 3, 3)
     still_v: Array  #: (..., 3), s_v of an antenna that rests on the Earth here, m/s
@@ -55,7 +55,7 @@ class InertialTrack:
         """Start at t0, with the antenna there: radians and metres."""
         zero = np.zeros(3)
         return InertialTrack(
-            LocalLevel(latitude, longitude), np.zeros(()), np.eye(3), zero, zero,
+            (latitude, longitude), np.zeros(()), np.eye(3), zero, zero,
             gravity_n(latitude, altitude), gravitation_n(latitude, altitude), zero, zero,
             position_n(latitude, altitude), ground_velocity_n(latitude, altitude))
 
@@ -77,7 +77,7 @@ class InertialTrack:
             With a leading axis of K.
 
         """
-        C_n0n = self.n0.matrix(time, latitude, longitude)
+        C_n0n = matrix_n0n(self.origin, time, latitude, longitude)
 
         def seen(vector_n: Array) -> Array:
             return (C_n0n @ vector_n[..., None])[..., 0]
@@ -93,7 +93,7 @@ class InertialTrack:
             self.int_int_gravitation,
             h * (int_gravitation - steps) + h * h / 6 * (2 * before + gravitation))
         return InertialTrack(
-            self.n0, time, C_n0n, seen(ground_velocity) - self.origin_v - int_gravitation,
+            self.origin, time, C_n0n, seen(ground_velocity) - self.origin_v - int_gravitation,
             (seen(position_n(latitude, altitude)) - self.origin_r
              - time[:, None] * self.origin_v - int_int_gravitation),
             seen(gravity_here), gravitation, int_gravitation, int_int_gravitation,

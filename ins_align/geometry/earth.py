@@ -137,17 +137,11 @@ def ground_velocity_n(latitude: ArrayLike, altitude: ArrayLike) -> Array:
     return cross(earth_rate_n(latitude), position_n(latitude, altitude))
 
 
-class LocalLevel:
+def matrix_n0n(origin: tuple[float, float], time: ArrayLike, latitude: ArrayLike,
+               longitude: ArrayLike) -> Array:
     """
-    The non-rotating frame n0: the local level frozen at a start position and instant.
+    Return ``C_n0n(t) = C_en(0)^T Rz(W t) C_en(t)``, shape (..., 3, 3), `time` s after t0.
 
-    ``C_n0n(t) = C_en(0)^T Rz(W t) C_en(t)`` needs no integration (docs, "Theory").
+    n0 is the local level frozen at t0, at `origin`; no integration is needed (docs, "Theory").
     """
-
-    def __init__(self, latitude: float, longitude: float) -> None:
-        """Freeze the local level where the antenna is at t0, radians."""
-        self._C_n0e = matrix_en(latitude, longitude).T
-
-    def matrix(self, time: ArrayLike, latitude: ArrayLike, longitude: ArrayLike) -> Array:
-        """Return ``C_n0n``, shape (..., 3, 3), at `time` seconds since t0."""
-        return self._C_n0e @ matrix_earth_turned(time) @ matrix_en(latitude, longitude)
+    return matrix_en(*origin).T @ matrix_earth_turned(time) @ matrix_en(latitude, longitude)
