@@ -192,10 +192,9 @@ class Status(Nuisance):
 
 class Reference:
     """
-    The reference attitude of a recording, to compare with.
+    The reference attitude of a recording, from parts of stamps, ns, and quaternions.
 
-    Each part, of one or more in any order, is stamps, ns, and quaternions as from
-    `ImuSamples.orientations`. Of equal stamps the first counts.
+    Parts may be in any order. Of equal stamps the first counts.
     """
 
     def __init__(self, *parts: tuple[np.ndarray, np.ndarray]) -> None:
@@ -205,12 +204,13 @@ class Reference:
 
     def attitude_at(self, stamp_ns: int) -> Array | None:
         """Return ``C_nb``, shape (3, 3), interpolated; None outside and in long gaps."""
-        after = int(np.searchsorted(self._stamps_ns, stamp_ns))
-        if after < len(self._stamps_ns) and self._stamps_ns[after] == stamp_ns:
+        stamps_ns = self._stamps_ns
+        after = int(np.searchsorted(stamps_ns, stamp_ns))
+        if stamp_ns in stamps_ns[after:after + 1]:
             return matrix_from_quaternion(self._quaternions[after])
-        if not 0 < after < len(self._stamps_ns):
+        if not 0 < after < len(stamps_ns):
             return None
-        start, end = self._stamps_ns[after - 1:after + 1].tolist()
+        start, end = stamps_ns[after - 1:after + 1].tolist()
         if end - start > MAX_REFERENCE_GAP_NS:
             return None
         C_before, C_after = matrix_from_quaternion(self._quaternions[after - 1:after + 1])

@@ -14,8 +14,7 @@
 """
 The attitude between epochs, carried on with the gyroscopes sample by sample.
 
-It computes with plain numbers, because the node does this for each IMU message and numpy takes
-several times as long for vectors of three.
+In plain numbers, as the node needs it at each IMU message: numpy takes several times as long.
 """
 
 from collections import deque
@@ -39,9 +38,8 @@ class Prediction:
     An attitude that gyroscopes carry on from an epoch.
 
     The rate is ``measured - gyro_matrix @ measured - gyro_bias``, rad/s, with a constant error of
-    sigma `gyro_bias_std`. The Earth rate is not taken off and counts as an error, too.
-    `angle_random_walk` is in rad/sqrt(s), `rate` is the one measured at the epoch, shape (3,),
-    and `interval` the usual time between samples, s.
+    sigma `gyro_bias_std`; the Earth rate counts as an error, too. `angle_random_walk` is in
+    rad/sqrt(s), `rate` the one measured at the epoch, (3,), `interval` the usual one of samples, s.
     """
 
     def __init__(self, attitude: Attitude, gyro_bias: Array, gyro_matrix: Array,
@@ -62,9 +60,8 @@ class Prediction:
         """
         Carry on to a sample (rad/s), with the mean of its rate and that of the last one.
 
-        Return whether the attitude is now that at the sample. It is not if the sample is old or
-        invalid, and never again after a gap longer than `MAX_GAP_NS`, in which the rotation is
-        unknown. A shorter gap adds to the covariance, as in the filters.
+        Return whether the attitude is now that at the sample: not if this is old or invalid, and
+        never again after a gap of `MAX_GAP_NS`. A shorter one adds to the covariance.
         """
         x, y, z = gyro
         if not (0 < stamp_ns - self.stamp_ns <= MAX_GAP_NS
@@ -113,12 +110,7 @@ class Prediction:
 
 
 class Follower:
-    """
-    Carries the latest prediction to each sample as it arrives.
-
-    A prediction comes late, standing at an earlier sample; it is carried over the samples that
-    have arrived since, of which `HISTORY` are kept.
-    """
+    """Carries the latest prediction, which comes late, to each sample as it arrives."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, Sequence[float]]] = deque(maxlen=HISTORY)
@@ -129,8 +121,7 @@ class Follower:
         self._prediction = None
         if prediction is None:
             return
-        # From the newest sample back: the same stamp may also have come before the clock was set
-        # back.
+        # From the newest sample back: before the clock was set back, the stamp may have come, too.
         since = []
         for sample in reversed(self._samples):
             if sample[0] == prediction.stamp_ns:

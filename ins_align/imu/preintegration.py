@@ -14,9 +14,8 @@
 """
 Preintegration of IMU samples over the intervals between GNSS epochs.
 
-ROS gives angular rate and specific force at instants, with jitter and gaps. In a step, the time
-between neighbouring samples, both are taken as cubics; a GNSS stamp inside a step splits it. All
-samples of an interval, and all intervals of a batch, are handled as arrays.
+In a step, the time between neighbouring samples, angular rate and specific force are taken as
+cubics; a GNSS stamp inside a step splits it.
 """
 
 from dataclasses import dataclass
@@ -95,8 +94,8 @@ class Intervals:
         Return the intervals with the signs of sensors changed, with leading axes (K, M).
 
         `signs`, shape (M, 4), are 1 or -1 for the gyros x, y, z and for all accelerometers; if
-        none is changed, the leading axes are (K, 1), to be broadcast. The result is of second
-        order in an interval's rotation, for constant rate and force: enough to tell signs apart.
+        none is changed, the leading axes are (K, 1). The result is of second order in an
+        interval's rotation, for constant rate and force: enough to tell signs apart.
         """
         gyro, accel = signs[:, :3], signs[:, 3:]
         wider = {name: array[:, None] for name, array in vars(self).items()}
@@ -145,9 +144,8 @@ def split_at_epochs(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Steps
     """
     Cut samples, (N, 6), rad/s and m/s^2, into the K intervals between K + 1 epochs.
 
-    Values at an epoch are interpolated with the cubic of the neighbouring samples and their
-    central differences. Stamps increase strictly, and all epochs lie between the first and the
-    last one; two equal epochs make an interval of zero length.
+    Values at an epoch are those of the cubic by the neighbouring samples and their central
+    differences. All epochs lie between the first and the last stamp and may be equal.
     """
     samples = samples.T
     slopes = _slopes(samples, np.diff(stamps_ns) * 1e-9)
@@ -163,8 +161,7 @@ def split_at_epochs(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Steps
              + t * (1 - t) * (bend1 - bend0)) / h
     # In the columns, the samples and then the epochs.
     known = np.block([[samples, value], [slopes, slope]])
-    # The ends of an interval's steps: its start, the samples inside it, and its end, repeated as
-    # padding.
+    # The ends of an interval's steps: its start, the samples inside, and its end, as padding too.
     first = np.searchsorted(stamps_ns, epochs_ns[:-1], side='right')
     last = np.searchsorted(stamps_ns, epochs_ns[1:], side='left')
     inner = first + np.arange(-1, max(int(np.max(last - first)), 0) + 1)[:, None]
@@ -278,8 +275,7 @@ def _derivatives(dt: Array, turns: Array, u: Array, rate: Array,
 
     A gyro bias turns the rest of the interval by minus the integral of the attitude, `turns` of
     each step, (K, n, 3, 3); an entry of a matrix acts as a bias times the mean rate or force of
-    the step, (K, n, 3). `u`, (K, n, 3), is the velocity gained in each step. A few steps are taken
-    as one, with an error of second order in their motion.
+    the step, (K, n, 3). `u`, (K, n, 3), is the velocity gained in each step.
     """
     def together(values: Array) -> Array:
         sums = values[:, ::DERIVATIVE_STEPS].copy(order='K')
@@ -324,8 +320,7 @@ def _of_gyros(variance: Array, v_rest: Array, p_rest: Array) -> Array:
     for i in range(7):
         moment[:, i, i:] = moment[:, i:, i] = _total(weighted[..., i, None] * rest[..., i:])
     eye = np.eye(3)
-    # 3 x 3 blocks of 3 x 3 each.
-    Q = np.zeros((variance.shape[0], 3, 3, 3, 3))
+    Q = np.zeros((variance.shape[0], 3, 3, 3, 3))       # blocks are [:, i, :, j]
     Q[:, 0, :, 0] = moment[:, :1, :1] * eye
     turned = skew(moment[:, 0, 1:].reshape(-1, 2, 3))
     Q[:, 1:, :, 0], Q[:, 0, :, 1:] = -turned, turned.transpose(0, 2, 1, 3)
@@ -344,7 +339,7 @@ def _of_accelerometers(variance: Array, dt: Array, remaining: Array) -> Array:
     the time that remains after the middle of the step, (K, n).
     """
     Q = np.zeros((variance.shape[0], 3, 3, 3, 3))
-    # dt^2 / 12 is the variance within the step itself
+    # dt^2 / 12 is the variance within the step itself.
     v, vp, p = (np.cumsum(variance * weight, axis=1)[:, -1]
                 for weight in (1.0, remaining, remaining ** 2 + dt ** 2 / 12))
     blocks = np.array([[v, vp], [vp, p]]).transpose(2, 0, 1)

@@ -14,9 +14,8 @@
 """
 Recent motion: integrals of the IMU samples from a moment before a GNSS epoch up to it.
 
-A delayed receiver measures where the antenna was and how fast it moved some time before the stamp,
-the age. The integrals of specific force and angular rate over the age lead from the epoch back to
-that moment. They are tabulated at ages ("rungs") close enough to follow a walker's steps.
+A delayed receiver measures where the antenna was some time before the stamp, the age. Integrals
+over the age lead back there, at ages ("rungs") close enough to follow a walker's steps.
 """
 
 from functools import lru_cache
@@ -49,15 +48,10 @@ def recent_motion(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Recent:
     """
     Integrate samples, (N, 6), rad/s and m/s^2, over the time before each of K epochs.
 
-    A rate that changes its axis makes the rotation vector differ from its integral [Bortz1971]_.
-    Before the first sample, and before the last gap, the mean since then is used. There has to be
-    a sample before and after each epoch.
-
-    References
-    ----------
-    .. [Bortz1971] J. E. Bortz, "A new mathematical formulation for strapdown inertial
-       navigation", IEEE Transactions on Aerospace and Electronic Systems 7(1), 1971.
-
+    A rate that changes its axis makes the rotation vector differ from its integral (J. E. Bortz,
+    "A new mathematical formulation for strapdown inertial navigation", IEEE Transactions on
+    Aerospace and Electronic Systems 7(1), 1971). Before the first sample and the last gap, the
+    mean since then is used. There has to be a sample before and after each epoch.
     """
     samples = samples.T
     ages = (AGES / 1e-9).astype(np.int64)

@@ -14,8 +14,7 @@
 """
 What the node reads: IMU messages as bytes, the GNSS topics and their faults, /tf_static.
 
-Turning every IMU sample into a Python message and back costs several times as much as the
-alignment itself, so the node reads the serialised message and replaces its orientation in a copy.
+Turning every IMU sample into a Python message and back costs several times as much as aligning.
 """
 
 from __future__ import annotations
@@ -109,8 +108,7 @@ class Gate(ReentrantCallbackGroup):
     """
     A callback group whose subscription the executor passes over while the gate is closed.
 
-    A turn of the executor takes longer than the work on a message. While no message is urgent,
-    messages wait in the subscription's queue, and one turn takes many.
+    A turn of the executor takes longer than the work on a message: messages wait for each other.
     """
 
     is_open = False
@@ -133,11 +131,7 @@ def queued(subscription: Subscription) -> list[tuple[Any, int]]:
 
 
 def gnss_topics(config: Config) -> dict[str, type]:
-    """
-    Return the GNSS topics to read, with their message types.
-
-    A ConfigError says that the package of the configured type is not installed.
-    """
+    """Return the types of the GNSS topics; ConfigError: their package is not installed."""
     if config.fix_type == 'NavSatFix':
         return {FIX_TOPIC: NavSatFix, VELOCITY_TOPIC: VELOCITY_TYPES[config.velocity_type]}
     package = LIVE_TYPES[config.fix_type].partition('/')[0]
@@ -167,10 +161,9 @@ def inputs_in_words(node: Node, inputs: Mapping[str, type], config: Config) -> s
 def topic_faults(node: Node, inputs: Mapping[str, type], expected: Sequence[str],
                  ) -> Iterator[str]:
     """
-    Yield what is wrong with the publishers of the topics that a node reads, in words.
+    Yield in words what is wrong with the publishers of topics, given with their types.
 
-    `inputs` are message types by topic. A topic that nobody publishes is a fault only if it is
-    `expected`.
+    A topic that nobody publishes is a fault only if it is `expected`.
     """
     for topic, msg_type in inputs.items():
         name = node.resolve_topic_name(topic)

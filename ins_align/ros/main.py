@@ -32,8 +32,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """
     Run the node until it is interrupted; `args` are by default those of the process.
 
-    Returns the exit status: 0 after an interruption, 2 if an argument or a parameter is wrong, or
-    without a ROS installation.
+    Returns the exit status: 0, or 2 for a wrong argument or parameter, or without ROS.
     """
     keep_to_one()  # more threads would cost several times as much
 

@@ -11,11 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""
-The ROS 2 node: subscribes to the sensors, feeds the aligner, publishes its results.
-
-All decisions about the alignment are made in the aligner, which `ins_align replay` runs as well.
-"""
+"""The ROS 2 node: feeds the aligner, which decides everything, and publishes its results."""
 
 from __future__ import annotations
 
@@ -64,8 +60,8 @@ IMU_DEPTH = 2000  # 10 s at 200 Hz, so that no sample is lost while the machine 
 GNSS_DEPTH = 200
 PERIOD = 0.2  # s, between rounds of the worker: many messages at a time cost less
 STATUS_PERIOD = 1.0  # s
-# After so long without a sample, by the clock of this machine, the IMU is silent: the status says
-# so, and another IMU may take its place (s).
+# After so long without a sample (s), by the clock of this machine, the status says so, and another
+# IMU may take its place.
 IMU_SILENT = 1.0
 LOG_AGAIN = 10.0  # s after which a reason that has not changed may be logged again
 _NUMBER = re.compile(r'[-+]?\d[\d.]*(?:e[-+]?\d+)?')
@@ -83,9 +79,8 @@ class ReasonLog:
         """
         Return whether to log a text at time `now`, s; if so, it counts as logged.
 
-        Numbers in the text are ignored. It is logged if it differs from the text logged last, or
-        if `again` says to repeat it, but not within `LOG_AGAIN` after it was logged.
-        With `logged` it has been logged in any case, and only counts.
+        It is if it differs in more than numbers from the one logged last, or if `again` says to
+        repeat it, but not within `LOG_AGAIN`. With `logged` it has been logged already.
         """
         kind = _NUMBER.sub('#', text)
         self._logged = {other: when for other, when in self._logged.items()
@@ -115,10 +110,9 @@ class AlignmentNode(Node):
     Feeds an `Aligner` from topics and publishes the attitude that it declares.
 
     The executor's thread puts messages into an inbox. While somebody listens to `~/imu`, it takes
-    each IMU message at once and publishes it with the latest attitude of the worker, carried on
-    with the gyros; otherwise it takes IMU messages several times a second, which costs half. The
-    worker, a thread of its own that no callback waits for, aligns several times a second. A
-    parameter that is wrong is a ConfigError.
+    each IMU message at once and publishes it with the worker's latest attitude, carried on with
+    the gyros; otherwise it takes them several times a second, which costs half. The worker, a
+    thread that no callback waits for, aligns. A parameter that is wrong is a ConfigError.
     """
 
     def __init__(self) -> None:
@@ -136,7 +130,7 @@ class AlignmentNode(Node):
         # From the executor to the worker: time of reception, ns, and a message or a request.
         self._inbox: deque[tuple[int, Any]] = deque()
         # From the worker to the executor, replaced as a whole: the attitude that ~/imu carries on,
-        # None where there is none, and the frame_id of its IMU.
+        # if there is one, and the frame_id of its IMU.
         self._prediction: tuple[Prediction | None, str | None] = None, None
         # The executor's:
         self._follower = Follower()
@@ -280,11 +274,11 @@ class AlignmentNode(Node):
                 if self._accepts_frame(item.frame_id, received_ns):
                     self._aligner.add_imu(item.stamp_ns, item.gyro, item.accel)
                     self._unchecked.append(item)
-            elif isinstance(item, Fix):
-                self._aligner.add_fix(item)
-                self._unchecked_gnss.append((len(self._unchecked), item))
-            elif isinstance(item, Velocity):
-                self._aligner.add_velocity(item)
+            elif isinstance(item, (Fix, Velocity)):
+                if isinstance(item, Fix):
+                    self._aligner.add_fix(item)
+                else:
+                    self._aligner.add_velocity(item)
                 self._unchecked_gnss.append((len(self._unchecked), item))
             else:
                 item()
@@ -312,8 +306,7 @@ class AlignmentNode(Node):
         """
         Return whether a sample is of the IMU that is aligned.
 
-        An IMU with a new frame_id takes its place, or an earlier one while it is silent; then the
-        alignment starts over.
+        An IMU with a new frame_id takes its place, or an earlier one while it is silent.
         """
         if frame_id != self._imu_frame:
             silent = received_ns - self._imu_received_ns > IMU_SILENT * 1e9
@@ -348,8 +341,8 @@ class AlignmentNode(Node):
             return
         self._declared = attitude
         if attitude is None:
-            # Who subscribes later must not get an attitude that no longer holds, which needs a new
-            # publisher; who has subscribed before must have got it.
+            # Who subscribes later must not get an attitude that no longer holds: a new publisher
+            # has none. Who has subscribed before must have got it.
             self._attitude_publisher.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
             self.destroy_publisher(self._attitude_publisher)
             self._attitude_publisher = self._open_attitude_topic()
@@ -437,8 +430,8 @@ class AlignmentNode(Node):
             self._subscribe_to(msg_type, topic, partial(self._on_gnss, topic), GNSS_DEPTH)
 
     def _publish_on(self, msg_type: type, topic: str, qos: QoSProfile | int) -> Publisher:
-        # The executor would wait for every event handler at each IMU message. None is needed: a
-        # subscriber whose QoS asks for more than is offered here warns on its own side.
+        # The executor would wait for every event handler at each IMU message, and none is needed:
+        # a subscriber whose QoS asks for more warns on its own side.
         return self.create_publisher(
             msg_type, topic, qos,
             event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
