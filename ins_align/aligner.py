@@ -12,16 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-The aligner: messages in, attitudes and states out.
+The aligner: messages in, attitudes and states out, in eight steps (docs, "Design").
 
-A message is processed in eight steps: 1 the caller turns it into numbers (`gnss.messages`,
-`ros.inputs`, `recordings.decode`); 2 it is queued until no late message can precede it; 3 GNSS
-messages become an epoch of the antenna; 4 the IMU samples before the epoch are preintegrated;
-5 the method, as a rule the bank of filters, propagates and updates; 6 the rival hypotheses are
-compared; 7 the declaration decides on the state; 8 an `Epoch` is returned.
-
-An epoch is processed when the IMU is `gnss_lateness` ahead of it, so that the results depend on
-the messages alone and not on when `update` is called.
+In step 1 the caller has turned messages into numbers. An epoch is processed when the IMU is
+`gnss_lateness` ahead of it, so that results do not depend on when `update` is called.
 """
 
 from collections import Counter
@@ -44,8 +38,7 @@ import numpy as np
 
 __all__ = ['Aligner', 'Attitude', 'Epoch', 'State', 'Status']
 
-# During a GNSS outage an epoch without measurement is inserted at this interval, which bounds the
-# queues (ns).
+# Interval of epochs without measurement in a GNSS outage, which bounds the queues (ns).
 DRY_INTERVAL_NS = 2_000_000_000
 # An alignment starts with positions alone if no velocity came for this long after the first (ns).
 NO_VELOCITY_NS = 2_000_000_000
@@ -63,9 +56,9 @@ class Aligner:
     """
     In-motion alignment from messages, taken in the order of their arrival.
 
-    `config` is by default `Config()`. `base` transforms from the vehicle's base frame to the IMU
-    frame; it is used with ``vehicle`` and by default is the identity. The attribute `declared` is
-    the initial attitude as it was declared, or None while none is declared.
+    `base` transforms from the vehicle's base frame to the IMU frame; it is used with ``vehicle``
+    and by default is the identity. The attribute `declared` is the initial attitude as it was
+    declared, or None while none is declared.
     """
 
     def __init__(self, config: Config | None = None, base: Transform | None = None) -> None:

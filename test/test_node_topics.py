@@ -22,7 +22,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TwistStamped, Vector3Stamped
 from ins_align.config import Config, ConfigError
 from ins_align.geometry.rotation import matrix_from_quaternion, roll_pitch_yaw
-from ins_align.ros.inputs import gnss_from_msg, gnss_topics
+from ins_align.ros.inputs import gnss_from_msg, gnss_topics, message_class
 from ins_align.ros.node import ReasonLog
 from ins_align.simulation.simulate import simulate
 from node_harness import (
@@ -179,14 +179,15 @@ def test_receiver_messages_need_their_package_and_bring_the_velocity(monkeypatch
     config = Config(fix_type='GPSFix')
     monkeypatch.setitem(sys.modules, 'gps_msgs.msg', None)
     monkeypatch.setitem(sys.modules, 'gps_msgs', None)
+    assert gnss_topics(config) == {'fix': 'gps_msgs/msg/GPSFix'}
     with pytest.raises(ConfigError, match='gps_msgs is not installed: sudo apt install ros-'):
-        gnss_topics(config)
+        message_class('gps_msgs/msg/GPSFix')
 
     class GPSFix(SimpleNamespace):
         pass
 
     monkeypatch.setitem(sys.modules, 'gps_msgs.msg', SimpleNamespace(GPSFix=GPSFix))
-    assert gnss_topics(config) == {'fix': GPSFix}
+    assert message_class('gps_msgs/msg/GPSFix') is GPSFix
     message = GPSFix(
         header=Header(stamp=Time(sec=12)), status=SimpleNamespace(status=0), latitude=48.0,
         longitude=11.0, altitude=300.0, position_covariance=np.zeros(9),

@@ -22,13 +22,14 @@ import subprocess
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ins_align.config import Config
+from ins_align.gnss.drivers import VELOCITY_TYPES
 from ins_align.gnss.messages import (
     fixes_from_msgs, imu_from_msg, MessageError, velocities_from_msgs)
 from ins_align.recordings import bag as bags
 from ins_align.recordings import BagError, Topic
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import (
-    decode_gnss, decode_imu, deserialize, FIX_TYPE, Refused, VELOCITY_TYPES)
+    decode_gnss, decode_imu, deserialize, FIX_TYPE, Refused)
 from ins_align.recordings.reader import choose_topics
 import numpy as np
 import pytest

@@ -89,10 +89,12 @@ RECEIVERS = {
         {'s_variance_m_s': 1.0}, has_velocity=lambda msg: bool(msg.vel_ned_valid)),
 }
 INERTIAL_UNITS = ('px4_msgs/msg/SensorCombined',)
-# The types which the node can read, by the parameter fix_type.
-LIVE_TYPES = {name.rsplit('/', 1)[-1]: name
-              for name in ('gps_msgs/msg/GPSFix', 'ublox_msgs/msg/NavPVT')}
 DRIVER_TYPES = (*RECEIVERS, *INERTIAL_UNITS)
+VELOCITY_TYPES = ('geometry_msgs/msg/TwistWithCovarianceStamped', 'geometry_msgs/msg/TwistStamped',
+                  'nav_msgs/msg/Odometry', 'geometry_msgs/msg/Vector3Stamped')
+# The types which the node can read, by the parameters fix_type and velocity_type.
+LIVE_TYPES = {name.rsplit('/', 1)[-1]: name for name in (
+    'sensor_msgs/msg/NavSatFix', 'gps_msgs/msg/GPSFix', 'ublox_msgs/msg/NavPVT', *VELOCITY_TYPES)}
 
 
 def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velocity]:

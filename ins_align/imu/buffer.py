@@ -79,8 +79,8 @@ class ImuBuffer:
         # Stamps and samples, one or many at a time, that are not sorted into these yet.
         self._new: list[tuple[ArrayLike, ArrayLike]] = []
         self.newest_ns: int | None = None           # stamp of the newest sample accepted
-        # Samples that wait until later ones show whether the clock has changed: one far ahead of
-        # the newest sample, or some in a row behind it.
+        # They wait until later ones show whether the clock has changed: a sample far ahead of the
+        # newest, or some in a row behind it.
         self.held: list[tuple[int, tuple[float, ...]]] = []
         # Samples up to here have been cut; those that arrive after that are late.
         self.used_ns = -(1 << 62)
@@ -136,12 +136,8 @@ class ImuBuffer:
             self.newest_ns = stamp_ns
 
     def _set_back(self, far: bool) -> bool:
-        """
-        Return whether the samples held behind the newest one are of a clock that was set back.
-
-        `far`: they are further behind than samples may arrive out of order.
-        """
-        if far:
+        """Return whether the clock of the held samples, `far` behind or not, was set back."""
+        if far:                                 # beyond the lateness
             return len(self.held) > 1           # a single one is late
         if len(self.held) < SET_BACK_SAMPLES:
             return False
@@ -288,8 +284,8 @@ class ImuBuffer:
         """
         Return what `preintegrate` takes for the intervals that end at K increasing epochs.
 
-        The first begins at the last epoch that was cut. `gravity_drift` is the noise in each that
-        comes from gravity at an unknown place, m/s/sqrt(s).
+        The first begins at the last epoch that was cut. `gravity_drift` is noise in each,
+        m/s/sqrt(s).
         """
         stamps = self.stamps
         ends_ns = np.array([self.used_ns, *epochs_ns])

@@ -39,7 +39,7 @@ class Prediction:
 
     The rate is ``measured - gyro_matrix @ measured - gyro_bias``, rad/s, with a constant error of
     sigma `gyro_bias_std`; the Earth rate counts as an error, too. `angle_random_walk` is in
-    rad/sqrt(s), `rate` the one measured at the epoch, (3,), `interval` the usual one of samples, s.
+    rad/sqrt(s), `rate`, (3,), is measured at the epoch, `interval` is between samples, s.
     """
 
     def __init__(self, attitude: Attitude, gyro_bias: Array, gyro_matrix: Array,

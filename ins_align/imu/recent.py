@@ -84,10 +84,10 @@ def recent_motion(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Recent:
 
 def _seen_from_epoch(dt: Array, rate: Array, force: Array) -> Array:
     """
-    Return forces in the body frame at the epoch, and rates of the rotation vector up to it.
+    Return forces in the body frame at the epoch, and rates of the rotation vector, (K, n, 6).
 
-    `dt` are the lengths of the steps before each epoch, shape (K, n, 1), s; rate and force, in the
-    body frame of the step, are (K, n, 3). Returns both in one array, (K, n, 6), force first.
+    `dt` are the steps before each epoch, (K, n, 1), s; rate and force, in the body frame of the
+    step, are (K, n, 3).
     """
     turn = dt * rate
     turned = np.cumsum(turn, axis=1)
@@ -127,8 +127,8 @@ def _cubic(age: float, apart: int) -> tuple[Array, Array, Array]:
     """
     Return weights of the rungs, from age 0 on, in a cubic and its two derivatives at an age.
 
-    The cubic goes through four rungs near the age, `apart` rungs from each other: more for a
-    negative age, so that it is extrapolated by no more than their distance.
+    It goes through four rungs near the age, `apart` rungs from each other: more for a negative
+    age, so that it is extrapolated by no more than their distance.
     """
     apart = min(max(math.ceil(-age / AGE_STEP), apart), AGE_COUNT // 3)
     x = age / (apart * AGE_STEP)

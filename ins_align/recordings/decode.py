@@ -21,7 +21,8 @@ from typing import Any, NamedTuple
 
 from ins_align.config import Config
 from ins_align.gnss.drivers import (
-    DRIVER_TYPES, imu_from_driver, INERTIAL_UNITS, receiver_from_msg, RECEIVERS, type_in_words)
+    DRIVER_TYPES, imu_from_driver, INERTIAL_UNITS, receiver_from_msg, RECEIVERS, type_in_words,
+    VELOCITY_TYPES)
 from ins_align.gnss.messages import (
     Fix, fixes_from_msgs, imu_from_msg, MessageError, velocities_from_msgs, Velocity)
 from ins_align.recordings import Topic
@@ -33,8 +34,6 @@ TF_TYPE = 'tf2_msgs/msg/TFMessage'
 # Types whose definition is read from the recording; rosbags has none of TF in ROS 1.
 DEFINED_TYPES = {*DRIVER_TYPES, TF_TYPE}
 VECTOR_TYPE = 'geometry_msgs/msg/Vector3Stamped'  # not always a velocity
-VELOCITY_TYPES = ('geometry_msgs/msg/TwistWithCovarianceStamped', 'geometry_msgs/msg/TwistStamped',
-                  'nav_msgs/msg/Odometry', VECTOR_TYPE)
 # Kinds of measurement in the messages of a type.
 KINDS = {IMU_TYPE: ('imu',), **dict.fromkeys(INERTIAL_UNITS, ('imu',)), FIX_TYPE: ('fix',),
          **dict.fromkeys(VELOCITY_TYPES, ('velocity',)),

@@ -25,14 +25,14 @@ from ins_align.config import Config
 from ins_align.geometry.rotation import Transform
 from ins_align.gnss.drivers import (
     DRIVER_TYPES, imu_from_driver, INERTIAL_UNITS, LIVE_TYPES, NoTimeError, receiver_from_msg,
-    RECEIVERS, type_in_words)
+    RECEIVERS, type_in_words, VELOCITY_TYPES)
 from ins_align.gnss.messages import MessageError, velocities_from_msgs
 from ins_align.mounting import find_mounting, FixedFrames, Mounting
 from ins_align.recordings import BagError, listed, Topic
 from ins_align.recordings.bag import Bag, Block
 from ins_align.recordings.decode import (
     decode, decode_imu, deserialize, deserialize_or_none, FIX_TYPE, Gnss, IMU_TYPE, ImuSamples,
-    short_name, TF_TYPE, VECTOR_TYPE, VELOCITY_TYPES)
+    short_name, TF_TYPE, VECTOR_TYPE)
 from ins_align.results import Severity
 import numpy as np
 

@@ -25,27 +25,23 @@ from importlib import import_module
 import struct
 from typing import Any, NamedTuple
 
-from geometry_msgs.msg import TwistStamped, TwistWithCovarianceStamped, Vector3Stamped
 from ins_align.config import Config, ConfigError
 from ins_align.geometry.rotation import Transform
-from ins_align.gnss.drivers import LIVE_TYPES, receiver_from_msg, type_in_words
+from ins_align.gnss.drivers import (
+    LIVE_TYPES, receiver_from_msg, RECEIVERS, type_in_words, VELOCITY_TYPES)
 from ins_align.gnss.messages import (
     Fix, fixes_from_msgs, imu_from_msg, velocities_from_msgs, Velocity)
 from ins_align.mounting import Lookup, transform_from_msg
-from nav_msgs.msg import Odometry
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
 from rclpy.time import Time
-from sensor_msgs.msg import Imu, NavSatFix
+from sensor_msgs.msg import Imu
 
 FIX_TOPIC, VELOCITY_TOPIC = 'fix', 'fix_velocity'
 # Names under which messages that cannot be used are counted, by topic.
 REJECTED_AS = {FIX_TOPIC: 'fix_undecodable', VELOCITY_TOPIC: 'velocity_body_frame'}
-# Message types by the value of the parameter velocity_type.
-VELOCITY_TYPES = {kind.__name__: kind for kind in (
-    TwistWithCovarianceStamped, TwistStamped, Odometry, Vector3Stamped)}
 
 # sensor_msgs/Imu in plain CDR, little endian (OMG DDSI-RTPS 2.3, 10.2): a header of four bytes,
 # stamp, length of the frame_id, frame_id, and the body, all float64: orientation (4) with its
@@ -130,53 +126,51 @@ def queued(subscription: Subscription) -> list[tuple[Any, int]]:
     return messages
 
 
-def gnss_topics(config: Config) -> dict[str, type]:
-    """Return the types of the GNSS topics; ConfigError: their package is not installed."""
-    if config.fix_type == 'NavSatFix':
-        return {FIX_TOPIC: NavSatFix, VELOCITY_TOPIC: VELOCITY_TYPES[config.velocity_type]}
-    package = LIVE_TYPES[config.fix_type].partition('/')[0]
+def gnss_topics(config: Config) -> dict[str, str]:
+    """Return the message types of the GNSS topics: 'sensor_msgs/msg/NavSatFix'."""
+    fix_type = LIVE_TYPES[config.fix_type]
+    return ({FIX_TOPIC: fix_type} if fix_type in RECEIVERS else
+            {FIX_TOPIC: fix_type, VELOCITY_TOPIC: LIVE_TYPES[config.velocity_type]})
+
+
+def message_class(msgtype: str) -> type:
+    """Return the class of a message type; ConfigError: the package of a fix is not installed."""
+    package, _, name = msgtype.split('/')
     try:
-        return {FIX_TOPIC: getattr(import_module(f'{package}.msg'), config.fix_type)}
+        found: type = getattr(import_module(f'{package}.msg'), name)
     except ModuleNotFoundError:
         raise ConfigError(
-            f'fix_type is {config.fix_type}, but {package} is not installed: sudo apt install '
+            f'fix_type is {name}, but {package} is not installed: sudo apt install '
             f'ros-$ROS_DISTRO-{package.replace("_", "-")}, or set fix_type to NavSatFix') from None
+    return found
 
 
-def type_name(msg_type: type) -> str:
-    """Return the full name of a message type: sensor_msgs/msg/Imu."""
-    return f'{msg_type.__module__.split(".")[0]}/msg/{msg_type.__name__}'
-
-
-def inputs_in_words(node: Node, inputs: Mapping[str, type], config: Config) -> str:
+def inputs_in_words(node: Node, inputs: Mapping[str, str], config: Config) -> str:
     """Say what a node reads, and with which parameters."""
-    topics = ', '.join(f'{node.resolve_topic_name(topic)} ({type_in_words(type_name(msg_type))})'
-                       for topic, msg_type in inputs.items())
+    topics = ', '.join(f'{node.resolve_topic_name(topic)} ({type_in_words(msgtype)})'
+                       for topic, msgtype in inputs.items())
     settings = ', '.join(
         f'{field.name} {getattr(config, field.name)}' for field in dataclasses.fields(Config)
         if field.name == 'lever_arm' or getattr(config, field.name) != field.default)
     return f'reads {topics}; {settings}, other parameters at their defaults'
 
 
-def topic_faults(node: Node, inputs: Mapping[str, type], expected: Sequence[str],
-                 ) -> Iterator[str]:
+def topic_faults(node: Node, inputs: Mapping[str, str], expected: Sequence[str]) -> Iterator[str]:
     """
     Yield in words what is wrong with the publishers of topics, given with their types.
 
     A topic that nobody publishes is a fault only if it is `expected`.
     """
-    for topic, msg_type in inputs.items():
+    for topic, wanted in inputs.items():
         name = node.resolve_topic_name(topic)
         types = {info.topic_type for info in node.get_publishers_info_by_topic(topic)}
-        wanted = type_name(msg_type)
         if not types and topic in expected:
             yield f'nobody publishes {name}'
         if not types or wanted in types:
             continue
         other = min(types)
-        known = [parameter for parameter, velocity in VELOCITY_TYPES.items()
-                 if topic == VELOCITY_TOPIC and type_name(velocity) == other]
-        hint = f': set velocity_type to {known[0]}' if known else ''
+        settable = topic == VELOCITY_TOPIC and other in VELOCITY_TYPES
+        hint = f': set velocity_type to {other.split("/")[-1]}' if settable else ''
         yield f'{name} is published as {type_in_words(other)}, not {type_in_words(wanted)}{hint}'
 
 
@@ -184,9 +178,9 @@ def gnss_from_msg(topic: str, msg: Any, config: Config) -> Sequence[Fix | Veloci
     """Convert a message of a GNSS topic; a MessageError says why it cannot be used."""
     if topic == VELOCITY_TOPIC:
         return velocities_from_msgs([msg], config)
-    if config.fix_type == 'NavSatFix':
-        return fixes_from_msgs([msg])
-    return receiver_from_msg(msg, LIVE_TYPES[config.fix_type], config)
+    fix_type = LIVE_TYPES[config.fix_type]
+    return receiver_from_msg(msg, fix_type, config) if fix_type in RECEIVERS else (
+        fixes_from_msgs([msg]))
 
 
 def open_static_tf(node: Node, config: Config) -> Lookup | None:

@@ -38,8 +38,8 @@ from ins_align.imu.prediction import Follower, Prediction
 from ins_align.mounting import Mounting, MountingSearch
 from ins_align.results import FOR_PLOTS, level_of, Severity, status_values, WARN
 from ins_align.ros.inputs import (
-    FIX_TOPIC, Gate, gnss_from_msg, gnss_topics, ImuSample, inputs_in_words, open_static_tf,
-    queued, read_imu, REJECTED_AS, topic_faults, VELOCITY_TOPIC, with_orientation)
+    FIX_TOPIC, Gate, gnss_from_msg, gnss_topics, ImuSample, inputs_in_words, message_class,
+    open_static_tf, queued, read_imu, REJECTED_AS, topic_faults, VELOCITY_TOPIC, with_orientation)
 import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -422,12 +422,13 @@ class AlignmentNode(Node):
                                     for name in FOR_PLOTS}
         self._state_publisher = self._publish_on(UInt8, '~/state', 10)
         gnss = gnss_topics(self._config)
-        self._inputs = {IMU_TOPIC: Imu, **gnss}
+        self._inputs = {IMU_TOPIC: 'sensor_msgs/msg/Imu', **gnss}
         self._gate = Gate()
         self._imu_subscription = self._subscribe_to(
             Imu, IMU_TOPIC, self._on_imu, IMU_DEPTH, self._gate)
-        for topic, msg_type in gnss.items():
-            self._subscribe_to(msg_type, topic, partial(self._on_gnss, topic), GNSS_DEPTH)
+        for topic, msgtype in gnss.items():
+            self._subscribe_to(message_class(msgtype), topic, partial(self._on_gnss, topic),
+                               GNSS_DEPTH)
 
     def _publish_on(self, msg_type: type, topic: str, qos: QoSProfile | int) -> Publisher:
         # The executor would wait for every event handler at each IMU message, and none is needed:
