@@ -54,7 +54,7 @@ _RANK = {State.LEVELLED: 1, State.ALIGNED: 2}    # of what is declared; 0 in oth
 
 class Aligner:
     """
-    In-motion alignment from messages, taken in the order of their arrival.
+    In-motion alignment from messages in the order of their arrival; by default with `Config()`.
 
     `base` transforms from the vehicle's base frame to the IMU frame; it is used with ``vehicle``
     and by default is the identity. The attribute `declared` is the initial attitude as it was

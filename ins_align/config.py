@@ -86,7 +86,7 @@ def _parameter(default: Any, description: str, unit: str = '', minimum: float | 
 @dataclass(frozen=True)
 class Config:
     """
-    All parameters, checked, with their description in each field's metadata (see `_parameter`).
+    All parameters; each field's metadata has its description, unit, range and choices.
 
     A ConfigError is raised if a value is of the wrong type, out of range or in contradiction to
     another one.

@@ -72,7 +72,7 @@ class ImuBuffer:
         self._reach_ns = max(lateness_ns, MAX_GAP_NS)
         self._counts = counts
         self._stated = np.array(stated[:2])
-        # The sorted samples: stamps, (N,), ns; angular rate, rad/s, and specific force, m/s^2,
+        # Stamps, (N,), strictly increasing, ns; angular rate, rad/s, and specific force, m/s^2,
         # (N, 6), in Fortran order so that each axis is contiguous.
         self.stamps = np.zeros(0, np.int64)
         self.samples = np.zeros((0, 6), order='F')
@@ -136,8 +136,8 @@ class ImuBuffer:
             self.newest_ns = stamp_ns
 
     def _set_back(self, far: bool) -> bool:
-        """Return whether the clock of the held samples, `far` behind or not, was set back."""
-        if far:                                 # beyond the lateness
+        """Return whether the clock was set back to the held samples; `far`: beyond lateness."""
+        if far:
             return len(self.held) > 1           # a single one is late
         if len(self.held) < SET_BACK_SAMPLES:
             return False

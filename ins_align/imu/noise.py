@@ -22,9 +22,10 @@ import numpy as np
 # vehicle falls, flies loops (up to 6 g) or the unit is wrong.
 FORCE_RANGE = 4.0, 60.0
 FORCE_TIME = 5.0
-# A spike differs from the mean of its neighbours by at least this much (rad/s, m/s^2), and this
-# many times as much as the neighbours from each other and as earlier samples from the mean of
-# theirs: of so many before it the one of this rank, as another spike makes three large ones.
+# A spike differs from the mean of its neighbours by at least this much (rad/s, m/s^2), and by this
+# many times as much as the neighbours differ from each other and as earlier samples differ from
+# the mean of theirs. Of the latter the one of this rank counts, from below, among so many samples
+# before the spike: three are larger, as many as another spike makes.
 SPIKE_RATE, SPIKE_FORCE = 0.5, 5.0
 SPIKE_RATIO = 12.0
 SPIKE_BEFORE, SPIKE_RANK = 12, 7
@@ -39,7 +40,7 @@ END_TIMES, END_CHANGING, PILED_UP = 5, 3, 4
 BEYOND_END = 0.5
 # The attitude is lost when the gyros may have missed this angle (rad).
 BLIND_ANGLE = 0.35
-# A step this many times the usual one lost samples, which may have missed so much motion (angular
+# A step this many times the usual one lacks samples, which may have missed this motion (angular
 # acceleration, rad/s^2, and jerk, m/s^3).
 GAP_STEPS = 2.5
 GAP_ANGULAR_ACCELERATION, GAP_JERK = 2.0, 20.0

@@ -121,7 +121,7 @@ class Follower:
         self._prediction = None
         if prediction is None:
             return
-        # From the newest sample back: before the clock was set back, the stamp may have come, too.
+        # From the newest sample back: the stamp may have come before the clock was set back, too.
         since = []
         for sample in reversed(self._samples):
             if sample[0] == prediction.stamp_ns:

@@ -104,7 +104,8 @@ class Gate(ReentrantCallbackGroup):
     """
     A callback group whose subscription the executor passes over while the gate is closed.
 
-    A turn of the executor takes longer than the work on a message: messages wait for each other.
+    A turn of the executor takes longer than the work on a message. While no message is urgent,
+    messages wait in the subscription's queue, and one turn takes many.
     """
 
     is_open = False
@@ -127,10 +128,11 @@ def queued(subscription: Subscription) -> list[tuple[Any, int]]:
 
 
 def gnss_topics(config: Config) -> dict[str, str]:
-    """Return the message types of the GNSS topics: 'sensor_msgs/msg/NavSatFix'."""
+    """Return the message types of the GNSS topics, such as sensor_msgs/msg/NavSatFix."""
     fix_type = LIVE_TYPES[config.fix_type]
-    return ({FIX_TOPIC: fix_type} if fix_type in RECEIVERS else
-            {FIX_TOPIC: fix_type, VELOCITY_TOPIC: LIVE_TYPES[config.velocity_type]})
+    if fix_type in RECEIVERS:   # whose messages have the velocity, too
+        return {FIX_TOPIC: fix_type}
+    return {FIX_TOPIC: fix_type, VELOCITY_TOPIC: LIVE_TYPES[config.velocity_type]}
 
 
 def message_class(msgtype: str) -> type:
@@ -179,8 +181,9 @@ def gnss_from_msg(topic: str, msg: Any, config: Config) -> Sequence[Fix | Veloci
     if topic == VELOCITY_TOPIC:
         return velocities_from_msgs([msg], config)
     fix_type = LIVE_TYPES[config.fix_type]
-    return receiver_from_msg(msg, fix_type, config) if fix_type in RECEIVERS else (
-        fixes_from_msgs([msg]))
+    if fix_type in RECEIVERS:
+        return receiver_from_msg(msg, fix_type, config)
+    return fixes_from_msgs([msg])
 
 
 def open_static_tf(node: Node, config: Config) -> Lookup | None:
