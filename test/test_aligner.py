@@ -373,6 +373,23 @@ def test_why_messages_were_refused_is_forgotten_when_others_come(flight):
     assert aligner.status().reason == 'no GNSS velocity yet'
 
 
+def test_velocities_that_are_wanted_alone_are_waited_for(flight):
+    aligner, epochs = aligned(flight, velocity=False, use_position=False)
+    status = aligner.status()
+    assert not epochs and status.state is State.WAITING_FOR_GNSS
+    assert status.reason == 'no GNSS velocity yet, and use_position is false'
+
+
+def test_gnss_from_before_the_last_epoch_is_left_out(flight):
+    """After a flush messages may come again that the queue would have refused."""
+    aligner, _ = aligned(flight)
+    before = aligner.status().current
+    aligner.add_velocity(flight.velocity_measurement(-2))
+    assert not aligner.flush()
+    assert aligner.counts['gnss_out_of_order'] == 1
+    assert aligner.status().current == before
+
+
 def test_a_loop_inside_one_array_is_the_same_as_one_by_one(flight):
     """The stamps that come again were there before, in the same array."""
     stamps, gyro, accel = (np.concatenate([column[:300]] * 3) for column in (
