@@ -42,8 +42,8 @@ ENU_FROM_NED = enu_from_ned(np.eye(3))
 _BODY_FRAME = re.compile(r'(?:^|[_\-/.])(?:base|body|chassis|footprint|imu|ins|vehicle)\d*'
                          r'(?:$|[_\-/.])', re.IGNORECASE)
 
-# Variances (m^2 or m^2/s^2) below `SMALLEST_VARIANCE` are placeholders. Others are limited, so that
-# matrices can be inverted.
+# Variances (m^2 or m^2/s^2) below `SMALLEST_VARIANCE` are placeholders. Others are limited, so
+# that matrices can be inverted.
 SMALLEST_VARIANCE = 1e-12
 MIN_VARIANCE, MAX_VARIANCE = 1e-8, 1e6
 MIN_EIGENVALUE = 1e-9  # of a correlation matrix; less may be rounding of an impossible one

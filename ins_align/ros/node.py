@@ -79,8 +79,8 @@ class ReasonLog:
         """
         Return whether to log a text at time `now`, s; if so, it counts as logged.
 
-        A text is due if it differs in more than numbers from the one logged last, or if `again` says
-        to repeat it, but not within `LOG_AGAIN`. `logged` says that it has been logged already.
+        A text is due if it differs in more than numbers from the one logged last, or if `again`
+        says to repeat it, but not within `LOG_AGAIN`. With `logged` it has been logged already.
         """
         kind = _NUMBER.sub('#', text)
         self._logged = {other: when for other, when in self._logged.items()
