@@ -35,7 +35,7 @@ TOO_FAST_SHARE = 1e-3  # of the samples may exceed that, as spikes
 # The specific force is summed over so many cells of GRID s; so many sums are needed to judge.
 LENGTH_CELLS, MIN_LENGTHS = 20, 20
 # Ratio of a sum's length to the expected one: the lower quartile is below the first where rates
-# are wrong; the median is within the second of 1 where they are right.
+# are wrong; of such sums, the median with the right rates is within the second of 1.
 SHORTER, AS_LONG = 0.85, 0.15
 MIN_MISFIT = 0.1  # by how much log(speed ratio) must be closer to 0 with exchanged positions
 _MAXIMA = {field.name: field.metadata['maximum'] for field in fields(Config)}
@@ -62,7 +62,8 @@ def degrees_fault(too_fast: bool, times: Array, gyro: Array, accel: Array, veloc
         if not (lengths.size >= MIN_LENGTHS and np.quantile(lengths, 0.25) < SHORTER):
             return ''
         in_degrees = _lengths(times, np.radians(gyro), accel, velocities)
-        if not abs(np.median(in_degrees) - 1.0) < AS_LONG:
+        # Slow rates are too small in either unit to shorten a sum, which says nothing then.
+        if not abs(np.median(in_degrees[lengths < SHORTER]) - 1.0) < AS_LONG:
             return ''
     return 'the angular rates look like deg/s: they must be rad/s'
 

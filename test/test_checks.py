@@ -109,6 +109,15 @@ def test_rates_in_degrees_are_found_whatever_moves_and_nothing_else_is(scenario,
     assert DEGREES in fault
 
 
+def test_a_receiver_that_goes_wild_makes_no_rates_degrees():
+    """It spoils what the force should add up to, with rates in either unit."""
+    hover = simulate('hover', seed=2, duration=90.0)
+    wild = hover.velocity.copy()
+    time = hover.gnss_stamps_ns * 1e-9
+    wild[:, 2] += np.where(time > 45.0, 40.0 * np.sin(time / 4.0), 0.0)
+    assert checked(dataclasses.replace(hover, velocity=wild)).faults() == []
+
+
 def test_velocities_north_east_down_are_no_exchanged_positions(drive):
     velocity = drive.velocity[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
     checks = checked(dataclasses.replace(drive, velocity=velocity))
