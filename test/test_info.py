@@ -398,6 +398,14 @@ def test_an_imu_that_is_too_slow(changed, drive):
     assert info.command is None and 'its rate is 1 Hz' in info.faults[0]
 
 
+def test_an_imu_that_is_slow(tmp_path):
+    path = tmp_path / 'slow'
+    write_bag(simulate('car', duration=20.0, imu_rate=10.0), path)
+    info = inspect(path)
+    assert 'its rate is 10 Hz: what happens between two samples' in describe(info)
+    assert info.command is not None
+
+
 @pytest.mark.parametrize('ahead', [3, -3])
 def test_clocks_some_seconds_apart(changed, ahead):
     """The motion tells clocks that differ from messages that are late."""
@@ -479,6 +487,8 @@ def test_values_that_are_no_numbers(changed):
     info = inspect(changed(change))
     assert by_name(info, '/imu/data_raw').figures['imu_grade'] == 'tactical'
     assert by_name(info, '/fix').figures['usable_share'] == 0.0
+    assert ('without numbers, or with impossible ones: 33% of the messages'
+            in by_name(info, '/imu/data_raw').lines)
     json.dumps(info.to_json(), allow_nan=False)
 
 

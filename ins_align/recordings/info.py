@@ -43,7 +43,7 @@ from ins_align.report import format_table
 import numpy as np
 
 WEAK_CHANGE = 1.0  # m/s: smaller changes of velocity show no heading with a usual receiver
-MIN_RATE = 1e9 / MAX_GAP_NS  # Hz
+MIN_RATE, LOW_RATE = 1e9 / MAX_GAP_NS, 20.0  # Hz
 # Names of topics with the output of a filter, whose errors last and which is not at the antenna.
 FUSED = re.compile(r'(^|[/_])(ekf|ukf|filter|filtered|fused)([/_]|$)', re.IGNORECASE)
 MIN_AHEAD = 0.3  # s: a smaller difference of clocks may be jitter
@@ -51,7 +51,7 @@ MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s, sigmas: a delay beyond the sum of both
 FRAMES_THAT_FIT = ('enu', 'ned')
 FRAME_FAULTS = {
     'body': 'its speed fits the change of position and its direction does not: it is given in the '
-            'axes of the vehicle or of a start of its own',
+            'axes of the vehicle or of a start of its own, or the receiver is wrong',
     'turned': 'it is turned by {0.angle_deg:.0f} deg against the change of position: its axes are '
               'not east and north',
     'contradiction': 'it is {0.speed_ratio:.2g} times the change of position: check its unit'}
@@ -193,6 +193,9 @@ def _survey_imu(data: Recorded, motion: Series, gravity: float, alone: bool) -> 
     elif gap is not None and gap > MAX_GAP_NS * 1e-9:
         data.add(f'silent for {gap:.1f} s at {data.figures["longest_gap_start_s"]:.1f} s: an '
                  'alignment starts over after that')
+    if rate is not None and MIN_RATE <= rate < LOW_RATE:
+        data.add(f'its rate is {rate:.2g} Hz: what happens between two samples is lost; 50 Hz and '
+                 'more follow vehicles that turn or shake')
     survey_imu(data, data.series(), motion, gravity)
 
 

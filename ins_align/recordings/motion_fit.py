@@ -186,7 +186,8 @@ def _fit(imu: _Imu, times: Array, v_n: Array, good: Array, gravity: float,
     middle = times.mean(axis=1, keepdims=True)
     from_imu, by_gyro, by_accel, by_lever = imu.between(middle, times)
     from_gnss = v_n + (times - middle)[..., None] * [0.0, 0.0, gravity]
-    weight = (good / np.maximum(good.sum(axis=1, keepdims=True), 1.0))[..., None]
+    used_epochs = np.maximum(good.sum(axis=1), 1.0)
+    weight = (good / used_epochs[:, None])[..., None]
     centred = [vectors - np.sum(weight * vectors, axis=1, keepdims=True)
                for vectors in (from_gnss, from_imu)]
     C_n0 = nearest_rotation(np.swapaxes(weight * centred[0], 1, 2) @ centred[1])
@@ -205,7 +206,7 @@ def _fit(imu: _Imu, times: Array, v_n: Array, good: Array, gravity: float,
         cost = np.sum(good_rows * residuals ** 2, axis=1) + x[..., 0] ** 2 @ priors
         C_n0, used = C_n0 @ exp_so3(x[:, 3:6, 0]), C_n0
     variance = np.trace(
-        np.linalg.inv(normal)[:, 3:6, 3:6], axis1=1, axis2=2) * cost / good.sum(axis=1)
+        np.linalg.inv(normal)[:, 3:6, 3:6], axis1=1, axis2=2) * cost / used_epochs
     return (cost + 1e-12, residuals.reshape(count, epochs, 3) @ np.swapaxes(used, 1, 2),
             np.sqrt(variance / 3.0))
 

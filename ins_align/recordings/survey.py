@@ -35,6 +35,7 @@ from ins_align.recordings.reader import candidates, doubt
 import numpy as np
 
 MAX_ASTRAY = 60.0  # s that the age of a usable stamp may differ from the median age
+MAX_USELESS = 0.01  # share of messages without usable numbers that is not worth a line
 GAP_INTERVALS = 3.5  # usual intervals without a message that make a gap
 # Of the samples of an IMU:
 WINDOW = 2.0  # s, the length of a window in which noise is measured
@@ -158,7 +159,9 @@ class Recorded(Surveyed):
                 ('out_of_order', int(np.count_nonzero(np.diff(stamps_ns) <= 0)),
                  'stamps are not later than the one before')):
             self.add(f'{number} {text}' if number else '', **{name: number})
-        self.add('', usable_share=float(np.mean(self.usable)))
+        useless = float(np.mean(~(data.usable | data.no_fix)))
+        self.add(f'without numbers, or with impossible ones: {useless:.0%} of the messages'
+                 if useless > MAX_USELESS else '', usable_share=float(np.mean(self.usable)))
         if kind == 'fix':
             share = float(np.mean(data.no_fix))
             self.add(f'without a fix: {share:.1%}', no_fix_share=share)
