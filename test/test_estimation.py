@@ -646,6 +646,14 @@ def test_coarse_positions_at_10_hz_start():
     assert 5.0 < next(epoch.t_s for epoch in epochs if epoch.current) < 10.0
 
 
+def test_velocities_that_do_not_fit_each_other_say_so():
+    s = simulated('hover', duration=30.0, imu_rate=50.0)
+    wild = np.random.default_rng(1).normal(0.0, 100.0, s.velocity.shape) * [0.0, 0.0, 1.0]
+    aligner, epochs = aligned(replace(s, velocity=s.velocity + wild))
+    assert not any(epoch.current for epoch in epochs)
+    assert 'do not suffice for a start: they are noisy, or do not fit' in aligner.status().reason
+
+
 def test_positions_too_coarse_to_start_say_so():
     s = simulated('static', duration=10.0, gnss_rate=50.0, imu_rate=50.0, position_std=20.0)
     aligner, _ = aligned(s, velocity=False, use_velocity=False)

@@ -50,6 +50,10 @@ OUTLYING = 20.0
 # Among so many epochs an outlier is searched for even before they suffice, for with one they may
 # never suffice.
 FEW = 64
+# After so many epochs and seconds without a start something is wrong with them.
+STUCK_EPOCHS, STUCK_SECONDS = 20, 20.0
+UNFIT = ('{epochs} GNSS epochs in {seconds:.0f} s do not suffice for a start: they are noisy, or '
+         'do not fit each other or the motion of the IMU: check the velocity frame and the clocks')
 TOO_NOISY = ('{epochs} GNSS epochs in {seconds:.0f} s are too noisy to start with: fewer epochs a '
              'second, which are waited for longer, would do')
 # Number of headings, one every five degrees, and their sigma (rad): wide enough for the sum of
@@ -177,10 +181,12 @@ class Start:
                 or epoch.position_covariance[2, 2] < UNKNOWN_ALTITUDE_STD ** 2
                 for epoch in epochs):
             return NO_VERTICAL
-        if self.measured < MAX_WAITING:
+        measured = self.measured
+        if measured < STUCK_EPOCHS:
             return ''
         seconds = (epochs[-1].stamp_ns - epochs[0].stamp_ns) * 1e-9
-        return TOO_NOISY.format(seconds=seconds, epochs=self.measured)
+        words = UNFIT if seconds >= STUCK_SECONDS else TOO_NOISY if measured >= MAX_WAITING else ''
+        return words.format(seconds=seconds, epochs=measured)
 
     def _pairs(self, kind: int) -> tuple[Array, Array, Array]:
         """Return times, s and a of the formula with a free start, for all epochs."""
