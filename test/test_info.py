@@ -168,6 +168,13 @@ def test_frame_of_the_velocity(changed, function, settings):
     assert bool(by_name(info, '/fix_velocity').faults) == useless
 
 
+@pytest.mark.parametrize('ratio, said', [(1.0, False), (0.9, True)])
+def test_velocities_that_are_too_short_for_the_clock_are_said(changed, ratio, said):
+    info = inspect(changed(velocity_changed(lambda *v: [ratio * each for each in v])))
+    line = next(line for line in by_name(info, '/fix_velocity').lines if 'frame: enu' in line)
+    assert ('times as long' in line) == said and (not said or 'is 0.9' in line)
+
+
 def test_velocity_that_says_it_is_in_the_body_frame(changed):
     def change(name, time, message):
         if name == '/fix_velocity':

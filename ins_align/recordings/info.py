@@ -48,6 +48,7 @@ MIN_RATE, LOW_RATE = 1e9 / MAX_GAP_NS, 20.0  # Hz
 FUSED = re.compile(r'(^|[/_])(ekf|ukf|filter|filtered|fused)([/_]|$)', re.IGNORECASE)
 MIN_AHEAD = 0.3  # s: a smaller difference of clocks may be jitter
 MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s, sigmas: a delay beyond the sum of both is set
+MAX_STRETCH = 0.05  # of velocities against the change of position, which is worth a word
 FRAMES_THAT_FIT = ('enu', 'ned')
 FRAME_FAULTS = {
     'body': 'its speed fits the change of position and its direction does not: it is given in the '
@@ -167,8 +168,11 @@ def _survey_velocity(data: Recorded, positions: Series) -> None:
     name = frame.frame
     data.add('', frame=name, speed_ratio=frame.speed_ratio)
     if name in FRAMES_THAT_FIT:
-        data.add(f'frame: {name} (fits the change of position over {frame.windows} distances)',
-                 {'velocity_frame': name} if name == 'ned' or data.doubt else {})
+        ratio = frame.speed_ratio or 1.0
+        long = '' if abs(ratio - 1.0) < MAX_STRETCH else (
+            f', but is {ratio:.2f} times as long: check the unit and the rate of the clock')
+        data.add(f'frame: {name} (fits the change of position over {frame.windows} distances'
+                 f'{long})', {'velocity_frame': name} if name == 'ned' or data.doubt else {})
     elif data.doubt:
         data.add(data.doubt, fault=True)
     if name in FRAME_FAULTS:
