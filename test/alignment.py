@@ -87,3 +87,52 @@ def normalised_error(attitude, simulation):
     """Squared error of an attitude over its covariance; 3 on average where that is honest."""
     error = error_of(attitude, simulation)
     return float(error @ np.linalg.solve(attitude.covariance, error))
+
+
+def check_same(epochs, others):
+    """Compare epochs, states and attitudes, but for rounding: a thousandth of a sigma."""
+    assert [(e.stamp_ns, e.state) for e in epochs] == [(e.stamp_ns, e.state) for e in others]
+    for epoch, other in zip(epochs, others):
+        assert (epoch.current is None) == (other.current is None)
+        if epoch.current is not None:
+            check_same_attitude(epoch.current, other.current)
+            check_same_attitude(epoch.initial, other.initial)
+
+
+def check_same_attitude(one, other):
+    away = np.degrees(log_so3(one.C_nb @ other.C_nb.T))
+    assert np.all(np.abs(away) < 1e-3 * one.sigma_deg)
+    assert np.allclose(one.sigma_deg, other.sigma_deg, rtol=1e-3)
+
+
+def feed_part(aligner, s, start=0.0, end=1e9):
+    """Feed what arrives between two times, in seconds of the recording."""
+    origin = int(s.imu_stamps_ns[0])
+    epochs = []
+    for count, (kind, payload) in enumerate(s.messages()):
+        stamp = int(payload[0][-1]) if kind == 'imu' else payload.stamp_ns
+        if start <= (stamp - origin) * 1e-9 < end:
+            give(aligner, kind, payload)
+        if count % 40 == 0:
+            epochs += aligner.update()
+    return epochs + aligner.update()
+
+
+def give_all(aligner, s, used=slice(None), force_scale=1.0,
+             change=lambda k, kind, message: message):
+    """
+    Feed a whole recording at once, GNSS first so that nothing of it is late.
+
+    `change` makes another message of the k-th fix or velocity; None leaves it out.
+    """
+    for k in range(len(s.gnss_stamps_ns)):
+        for kind, message in (('fix', s.fix(k)), ('velocity', s.velocity_measurement(k))):
+            if (message := change(k, kind, message)) is not None:
+                give(aligner, kind, message)
+    aligner.add_imu(s.imu_stamps_ns[used], s.gyro[used], force_scale * s.accel[used])
+    return aligner.flush()
+
+
+def turning_car(seed, **options):
+    """Simulate a car that turns soon."""
+    return simulated('car', imu_grade='mems', duration=40.0, seed=seed, **options)

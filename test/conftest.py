@@ -18,6 +18,8 @@ import os
 import platform
 import random
 
+import pytest
+
 # Before numpy is there: OpenBLAS 0.3.23, which numpy 1.26 brings along, has kernels for the newest
 # processors whose sums depend, in the last bit, on where in memory a matrix lies. Those for older
 # processors have not.
@@ -38,3 +40,19 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 def pytest_report_header():
     return ', '.join(f'{name} {version(name)}' for name in ('numpy', 'scipy'))
+
+
+@pytest.fixture(scope='session')
+def flight():
+    """Simulate a MEMS flight of 30 s."""
+    from alignment import simulated
+
+    return simulated('flight', imu_grade='mems', duration=30.0, seed=2)
+
+
+@pytest.fixture(scope='session')
+def result(flight):
+    """Align it; return the aligner, which is not to be changed, and its epochs."""
+    from alignment import aligned
+
+    return aligned(flight)
