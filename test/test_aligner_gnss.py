@@ -406,6 +406,15 @@ def test_velocity_in_the_other_frame_is_a_fault_with_the_cure():
     assert 'velocity_frame' in aligner.status().reason
 
 
+@pytest.mark.parametrize('frame, state', [('ned', State.FAULT), ('enu', State.LEVELLED)])
+def test_sharp_positions_show_the_frame_of_a_slow_robot_within_seconds(frame, state):
+    s = simulated('robot', imu_grade='mems', duration=20.0, seed=1, position_std=0.02,
+                  velocity_frame=frame)
+    status = aligned(s)[0].status()
+    assert status.state is state
+    assert ('north and east exchanged' in status.reason) == (frame == 'ned')
+
+
 @pytest.mark.parametrize('bad', (0, 2))
 @pytest.mark.parametrize('positions', (False, True))
 def test_an_outlier_among_the_first_epochs_is_left_out_of_the_start(flight, positions, bad):

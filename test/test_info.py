@@ -168,6 +168,14 @@ def test_frame_of_the_velocity(changed, function, settings):
     assert bool(by_name(info, '/fix_velocity').faults) == useless
 
 
+@pytest.mark.parametrize('std, frame', [(0.02, 'ned'), (1.0, 'unknown')])
+def test_sharp_positions_show_the_frame_of_a_slow_robot(tmp_path, std, frame):
+    write_bag(simulate('robot', duration=30.0, position_std=std, velocity_frame='ned'),
+              tmp_path / 'robot')
+    info = inspect(tmp_path / 'robot')
+    assert by_name(info, '/fix_velocity').figures['frame'] == frame
+
+
 @pytest.mark.parametrize('ratio, said', [(1.0, False), (0.9, True)])
 def test_velocities_that_are_too_short_for_the_clock_are_said(changed, ratio, said):
     info = inspect(changed(velocity_changed(lambda *v: [ratio * each for each in v])))

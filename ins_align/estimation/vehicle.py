@@ -49,8 +49,8 @@ MOST = 4.0
 # Log likelihood by which the assumption must exceed none: some seconds of motion.
 CONFIRMED = 9.0
 NOT_USED = ('; the motion contradicts vehicle: {vehicle}, which is not used (a drift, a tow, a '
-            'ferry, GNSS errors that last: raise vehicle_velocity_std? or x of base_frame does '
-            'not point forward: raise mount_yaw_std?)')
+            'ferry, GNSS errors that last, a base_frame that is not at the rear axle: raise '
+            'vehicle_velocity_std? or its x does not point forward: raise mount_yaw_std?)')
 UNCONFIRMED = 'the motion does not confirm yet that the vehicle moves along x of its base: wait'
 AMBIGUOUS = '; forwards and backwards are both possible: change speed'
 

@@ -24,6 +24,7 @@ from ins_align.geometry.earth import (
 from ins_align.geometry.rotation import Array
 from ins_align.gnss.buffer import GnssEpoch
 from ins_align.gnss.messages import AntennaEpoch, Fix, UNKNOWN_ALTITUDE_STD
+from ins_align.gnss.motion import least_distance, SHARP_STD
 import numpy as np
 
 # A fix further from the predicted place than this (m), and as much again for every second since
@@ -38,8 +39,7 @@ _UNKNOWN_VERTICAL_STD = 1e3     # m/s
 # In the first epoch 1 mm (1 mm/s) and more is believed.
 BETTER_THAN_USUAL, USUAL_EPOCHS = 100.0, 11
 BEST_VARIANCE = 1e-6
-# Velocity and position are compared over this distance (m), and at least so many sigmas.
-MIN_DISTANCE = 10.0
+# Velocity and position are compared over `least_distance`, and at least so many sigmas.
 DISTANCE_SIGMAS = 8.0
 # A mismatch of more than this share of the distance is not noise, if this many fixes in a row
 # agree to within it. This many mismatches in a row are a fault, and fewer where all would fit with
@@ -207,9 +207,9 @@ class VelocityCheck:
         self._origin: Place | None = None
         # Horizontal vectors are complex numbers: east is the real part, north the imaginary one.
         self._path = 0j                     # integral of the velocity since the origin
-        # Position and path since the origin: at the latest epochs, and where the distance begins.
-        self._recent: deque[tuple[complex, complex]] = deque(maxlen=AGREEING)
-        self._anchor: tuple[complex, complex] | None = None
+        # Position, path since the origin, and time: at the latest epochs, and where the distance begins.
+        self._recent: deque[tuple[complex, complex, float]] = deque(maxlen=AGREEING)
+        self._anchor: tuple[complex, complex, float] | None = None
         self._last: tuple[float, complex] | None = None     # time and velocity
         self._bad_in_a_row = self._as_ned_in_a_row = 0
 
@@ -224,19 +224,20 @@ class VelocityCheck:
         if self._origin is None:
             self._origin, self._path, self._anchor = place, 0j, None
             self._recent.clear()
-        self._recent.append((complex(*enu_offset(self._origin, place)[:2]), self._path))
+        self._recent.append((complex(*enu_offset(self._origin, place)[:2]), self._path, time))
         if len(self._recent) < AGREEING:
             return
         here = self._recent[AGREEING // 2]
         if self._anchor is None:
             self._anchor = here
             return
-        moved, travelled = (now - then for now, then in zip(here, self._anchor))
+        moved, travelled = here[0] - self._anchor[0], here[1] - self._anchor[1]
         distance = max(abs(moved), abs(travelled))
+        least = least_distance(here[2] - self._anchor[2], position_std <= SHARP_STD)
         tolerance = MAX_MISMATCH * distance
         # A wild fix does not count as motion, and several of them do not agree.
-        if (distance < max(MIN_DISTANCE, DISTANCE_SIGMAS * position_std)
-                or any(abs(other - here[0]) > tolerance for other, _ in self._recent)):
+        if (distance < max(least, DISTANCE_SIGMAS * position_std)
+                or any(abs(other - here[0]) > tolerance for other, _, _ in self._recent)):
             return
         bad = abs(moved - travelled) > tolerance
         as_ned = abs(moved - 1j * travelled.conjugate()) < tolerance    # east and north exchanged

@@ -29,6 +29,9 @@ MANOEUVRE_SPEED, MANOEUVRE_TIME = 5.0, 20.0  # change of velocity, m/s, within s
 # Distance over which velocity and position are compared: m, and at least so many sigmas of a
 # position; times, s, in which a vehicle may cover it, and how many distances it takes.
 MIN_DISTANCE, DISTANCE_SIGMAS = 10.0, 10.0
+# Positions with a sigma of at most so much (m) do not wander: where a vehicle is faster (m/s), they
+# are compared over less (m).
+SHARP_STD, SHARP_SPEED, SHARP_DISTANCE = 0.1, 0.5, 2.0
 SPANS = 2.0, 4.0, 8.0, 16.0, 30.0
 MIN_WINDOWS = 4
 MAX_FRAME_ANGLE = math.radians(20.0)
@@ -95,7 +98,7 @@ def without_wild_positions(positions: Series) -> Series:
     if vectors.shape[0] < 5:
         return positions
     medians = np.median(np.lib.stride_tricks.sliding_window_view(vectors, 5, axis=0), axis=-1)
-    limit = 0.5 * _compared_distance(positions)
+    limit = 0.5 * max(MIN_DISTANCE, DISTANCE_SIGMAS * position_noise(positions))
     off = np.abs(vectors[2:-2] - medians)
     near = np.ones(vectors.shape[0], bool)
     # Receivers are about half as good vertically.
@@ -130,13 +133,14 @@ def on_grid(velocities: Series) -> Series:
     return _finite(times, _at(Series(velocities.times, v), times))
 
 
-def velocity_frame(velocities: Series, positions: Series) -> VelocityFrame:
+def velocity_frame(velocities: Series, positions: Series, sharp: bool = False) -> VelocityFrame:
     """
     Find the frame of velocities, m/s, taken as ENU, from the change of position, ENU, m.
 
-    The frame is 'unknown' if the vehicle covered fewer than MIN_WINDOWS distances.
+    The frame is 'unknown' if the vehicle covered fewer than MIN_WINDOWS distances, which may be
+    shorter if positions are `sharp`.
     """
-    moved, travelled = _distances(velocities, positions)
+    moved, travelled = _distances(velocities, positions, sharp)
     count = moved.shape[0]
     if count < MIN_WINDOWS:
         return VelocityFrame('unknown', count)
@@ -153,6 +157,13 @@ def velocity_frame(velocities: Series, positions: Series) -> VelocityFrame:
     if abs(as_enu) > MIN_CONCENTRATION:
         return VelocityFrame('turned', count, float(np.degrees(-np.angle(as_enu))), ratio)
     return VelocityFrame('body', count, speed_ratio=ratio)
+
+
+def least_distance(seconds: float, sharp: bool) -> float:
+    """Return the least distance, m, covered in some time, over which velocities are compared."""
+    if not sharp or seconds < SPANS[0]:
+        return MIN_DISTANCE
+    return min(MIN_DISTANCE, max(SHARP_DISTANCE, SHARP_SPEED * seconds))
 
 
 def find_manoeuvres(velocities: Series) -> tuple[float, float | None]:
@@ -176,7 +187,7 @@ def find_manoeuvres(velocities: Series) -> tuple[float, float | None]:
     return largest, float(times[until <= ends[0]][-1]) if ends.size else None
 
 
-def _distances(velocities: Series, positions: Series) -> tuple[Array, Array]:
+def _distances(velocities: Series, positions: Series, sharp: bool) -> tuple[Array, Array]:
     """Return the change of position and the integral of velocity, (K, 3), over K distances."""
     best = np.zeros((0, 3)), np.zeros((0, 3))
     if velocities.times.size < 2 or positions.times.size < 2:
@@ -191,15 +202,11 @@ def _distances(velocities: Series, positions: Series) -> tuple[Array, Array]:
         moved, travelled = (
             _at(series, starts + span) - _at(series, starts)
             for series in (positions, Series(velocities.times, integral)))
-        good = ((np.hypot(moved[:, 0], moved[:, 1]) >= _compared_distance(positions))
-                & (travelled[:, 3] == 0.0))
+        least = max(least_distance(span, sharp), DISTANCE_SIGMAS * position_noise(positions))
+        good = (np.hypot(moved[:, 0], moved[:, 1]) >= least) & (travelled[:, 3] == 0.0)
         if np.count_nonzero(good) > best[0].shape[0]:
             best = moved[good], travelled[good, :3]
     return best
-
-
-def _compared_distance(positions: Series) -> float:
-    return max(MIN_DISTANCE, DISTANCE_SIGMAS * position_noise(positions))
 
 
 def _mean_direction(numbers: np.ndarray) -> complex:

@@ -29,8 +29,8 @@ from ins_align.estimation.receiver import QUIET
 from ins_align.geometry.earth import normal_gravity
 from ins_align.gnss.messages import enu_from_ned, NO_VERTICAL
 from ins_align.gnss.motion import (
-    differences, EMPTY, find_manoeuvres, MANOEUVRE_SPEED, MANOEUVRE_TIME, on_grid, Series, track,
-    velocity_frame, velocity_from_positions, without_wild_positions)
+    differences, EMPTY, find_manoeuvres, MANOEUVRE_SPEED, MANOEUVRE_TIME, on_grid, Series, SHARP_STD,
+    track, velocity_frame, velocity_from_positions, without_wild_positions)
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings import BagError, printable
 from ins_align.recordings.bag import Bag
@@ -48,7 +48,7 @@ MIN_RATE, LOW_RATE = 1e9 / MAX_GAP_NS, 20.0  # Hz
 FUSED = re.compile(r'(^|[/_])(ekf|ukf|filter|filtered|fused)([/_]|$)', re.IGNORECASE)
 MIN_AHEAD = 0.3  # s: a smaller difference of clocks may be jitter
 MIN_DELAY, DELAY_SIGMAS = 0.05, 2.0  # s, sigmas: a delay beyond the sum of both is set
-MAX_STRETCH = 0.05  # of velocities against the change of position, which is worth a word
+MAX_STRETCH = 0.06  # of velocities against the change of position, which is worth a word
 FRAMES_THAT_FIT = ('enu', 'ned')
 FRAME_FAULTS = {
     'body': 'its speed fits the change of position and its direction does not: it is given in the '
@@ -91,10 +91,10 @@ def inspect(path: str | os.PathLike[str]) -> Info:
         imus, fixes, velocities = (
             [data for data in candidates if data.kind == kind]
             for kind in ('imu', 'fix', 'velocity'))
-        positions, gravity = _survey_fixes(fixes, velocities)
+        positions, gravity, sharp = _survey_fixes(fixes, velocities)
         for data in velocities:
             if data.stamps_ns.size:
-                _survey_velocity(data, positions)
+                _survey_velocity(data, positions, sharp)
         motion, grid = differences(positions), velocity_from_positions(positions)
         if (velocity := _best(velocities)) is not None:
             motion = velocity.series()
@@ -133,8 +133,13 @@ def inspect(path: str | os.PathLike[str]) -> Info:
     return info
 
 
-def _survey_fixes(fixes: list[Recorded], velocities: list[Recorded]) -> tuple[Series, float]:
-    """Check positions; return the best track, without outliers, and gravity there, m/s^2."""
+def _survey_fixes(fixes: list[Recorded], velocities: list[Recorded],
+                  ) -> tuple[Series, float, bool]:
+    """
+    Check positions; return the best track, without outliers, and gravity there, m/s^2.
+
+    The third value says whether the positions are sharp, see `velocity_frame`.
+    """
     for data in fixes:
         if data.stamps_ns.size and not data.usable.any():
             beyond = [beyond_the_poles(*place) for place in data.values[:, :2].tolist()]
@@ -146,7 +151,7 @@ def _survey_fixes(fixes: list[Recorded], velocities: list[Recorded]) -> tuple[Se
             data.add(fault, fault=True)
     fix = _best(fixes)
     if fix is None:
-        return EMPTY, 9.81
+        return EMPTY, 9.81, False
     for velocity in velocities:
         if not velocity.doubt and (
                 fault := exchange_fault(fix.series(), velocity.series())):
@@ -156,15 +161,16 @@ def _survey_fixes(fixes: list[Recorded], velocities: list[Recorded]) -> tuple[Se
     positions_deg = fix.series()
     latitude, _, altitude = np.median(positions_deg.vectors, axis=0).tolist()
     return (without_wild_positions(track(positions_deg)),
-            float(normal_gravity(math.radians(latitude), altitude)))
+            float(normal_gravity(math.radians(latitude), altitude)),
+            fix.figures.get('sigma', [math.inf])[0] <= SHARP_STD)
 
 
-def _survey_velocity(data: Recorded, positions: Series) -> None:
+def _survey_velocity(data: Recorded, positions: Series, sharp: bool) -> None:
     """Find the frame of a velocity, and why it cannot be used."""
     if not data.usable.any():
         data.add('no message has numbers that can be used', fault=True)
         return
-    frame = velocity_frame(data.series(), positions)
+    frame = velocity_frame(data.series(), positions, sharp)
     name = frame.frame
     data.add('', frame=name, speed_ratio=frame.speed_ratio)
     if name in FRAMES_THAT_FIT:
@@ -214,7 +220,8 @@ def _best(topics: list[Recorded]) -> Recorded | None:
 def _add_manoeuvres(info: Info, velocities: Series) -> None:
     """Add how the vehicle moves and whether its motion shows the heading."""
     if velocities.times.size < 2:
-        info.add('heading from the motion: unknown: there is no GNSS to tell the motion from')
+        info.add('heading from the motion: unknown: there is no GNSS, or too little, to '
+                 'tell the motion from')
         return
     largest, first = find_manoeuvres(velocities)
     shown = ('no: turn or change speed (standing, only navigation grade finds north, by the '
