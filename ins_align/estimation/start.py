@@ -30,8 +30,7 @@ from ins_align.estimation.states import FIRST, PHI, PHI0, RHO, triads, XI
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.rotation import (
     apply, Array, cross, cumulative_rotations, exp_so3, Index, log_so3, skew)
-from ins_align.gnss.messages import (
-    AntennaEpoch, NO_VERTICAL, UNKNOWN_ALTITUDE_STD, velocities_of)
+from ins_align.gnss.messages import AntennaEpoch, velocities_of
 from ins_align.imu.preintegration import Intervals
 import numpy as np
 
@@ -175,13 +174,7 @@ class Start:
     @property
     def lacks(self) -> str:
         """Return in words what the epochs lack for a start, or ''."""
-        epochs = self.epochs
-        if epochs and not any(
-                epoch.v_n is not None
-                or epoch.position_covariance[2, 2] < UNKNOWN_ALTITUDE_STD ** 2
-                for epoch in epochs):
-            return NO_VERTICAL
-        measured = self.measured
+        epochs, measured = self.epochs, self.measured
         if measured < STUCK_EPOCHS:
             return ''
         seconds = (epochs[-1].stamp_ns - epochs[0].stamp_ns) * 1e-9
@@ -206,12 +199,11 @@ class Start:
         """
         Return the variance that the receiver states at each epoch, mean of three axes.
 
-        A vertical velocity that is not measured is taken as steady, with the variance of the
-        horizontal ones. Positions without an altitude have a huge variance.
+        A vertical velocity that is not measured is taken as steady, an altitude as constant, with
+        the variance of the horizontal ones.
         """
-        if kind:
-            return np.array([np.trace(epoch.position_covariance) / 3 for epoch in self.epochs])
-        covariance = np.array([epoch.velocity_covariance for epoch in self.epochs])
+        covariance = np.array([epoch.position_covariance if kind else epoch.velocity_covariance
+                               for epoch in self.epochs])
         horizontal = np.trace(covariance[:, :2, :2], axis1=1, axis2=2)
         return np.minimum(np.trace(covariance, axis1=1, axis2=2) / 3, horizontal)
 

@@ -207,7 +207,7 @@ class VelocityCheck:
         self._origin: Place | None = None
         # Horizontal vectors are complex numbers: east is the real part, north the imaginary one.
         self._path = 0j                     # integral of the velocity since the origin
-        # Position, path since the origin, and time: at the latest epochs, and where the distance begins.
+        # Position and path since the origin, and time, at the latest epochs and at the first.
         self._recent: deque[tuple[complex, complex, float]] = deque(maxlen=AGREEING)
         self._anchor: tuple[complex, complex, float] | None = None
         self._last: tuple[float, complex] | None = None     # time and velocity

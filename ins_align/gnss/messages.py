@@ -50,9 +50,7 @@ MIN_EIGENVALUE = 1e-9  # of a correlation matrix; less may be rounding of an imp
 # No receiver measures more than this; such values would overflow the integrals (m/s, m).
 MAX_SPEED, MAX_ALTITUDE = 2000.0, 1e6
 NO_FIX = -1  # status
-# Sigma of an altitude that a fix does not have (m), and the reason when there is no velocity.
-UNKNOWN_ALTITUDE_STD = 1e4
-NO_VERTICAL = 'positions have no altitude, and there is no velocity: one of the two is needed'
+UNKNOWN_ALTITUDE_STD = 1e4  # m, of an altitude that a fix does not have
 
 
 class MessageError(ValueError):

@@ -29,8 +29,8 @@ MANOEUVRE_SPEED, MANOEUVRE_TIME = 5.0, 20.0  # change of velocity, m/s, within s
 # Distance over which velocity and position are compared: m, and at least so many sigmas of a
 # position; times, s, in which a vehicle may cover it, and how many distances it takes.
 MIN_DISTANCE, DISTANCE_SIGMAS = 10.0, 10.0
-# Positions with a sigma of at most so much (m) do not wander: where a vehicle is faster (m/s), they
-# are compared over less (m).
+# Positions with a sigma of at most so much (m) do not wander: where a vehicle is faster (m/s),
+# they are compared over less (m).
 SHARP_STD, SHARP_SPEED, SHARP_DISTANCE = 0.1, 0.5, 2.0
 SPANS = 2.0, 4.0, 8.0, 16.0, 30.0
 MIN_WINDOWS = 4

@@ -27,10 +27,10 @@ from ins_align.checks import (
 from ins_align.config import Config, config_from_mapping, ConfigError
 from ins_align.estimation.receiver import QUIET
 from ins_align.geometry.earth import normal_gravity
-from ins_align.gnss.messages import enu_from_ned, NO_VERTICAL
+from ins_align.gnss.messages import enu_from_ned
 from ins_align.gnss.motion import (
-    differences, EMPTY, find_manoeuvres, MANOEUVRE_SPEED, MANOEUVRE_TIME, on_grid, Series, SHARP_STD,
-    track, velocity_frame, velocity_from_positions, without_wild_positions)
+    differences, EMPTY, find_manoeuvres, MANOEUVRE_SPEED, MANOEUVRE_TIME, on_grid, Series,
+    SHARP_STD, track, velocity_frame, velocity_from_positions, without_wild_positions)
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings import BagError, printable
 from ins_align.recordings.bag import Bag
@@ -120,10 +120,9 @@ def inspect(path: str | os.PathLike[str]) -> Info:
             if data.faults:
                 info.add(f'{data.name} cannot be used: {data.faults[0]}', fault=True)
         if velocity is None and fix is not None and not fix.faults:
-            alone = fix.figures['vertical_share'] > 0.0
             info.add('there is no velocity that can be used: it is aligned from positions alone, '
-                     'which takes longer unless they are RTK' if alone else NO_VERTICAL,
-                     {'use_velocity': False} if velocities else {}, fault=not alone)
+                     'which takes longer unless they are RTK',
+                     {'use_velocity': False} if velocities else {})
         gnss = [data for data in (fix, velocity) if data is not None]
         if imu is not None and gnss:
             _add_clocks(info, imu, gnss)
