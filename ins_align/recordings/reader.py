@@ -289,7 +289,8 @@ def _can_be_used(bag: Bag, topic: Topic, config: Config) -> bool:
 
 
 def _listing(bag: Bag) -> str:
-    return 'it has ' + (listed(topic.name for topic in bag.topics) or 'no topics')
+    return 'it has ' + (listed(f'{topic.name} ({type_in_words(topic.msgtype)})'
+                               for topic in bag.topics) or 'no topics')
 
 
 def _in_words(types: Sequence[str]) -> str:
