@@ -121,9 +121,11 @@ class Start:
     def solve(self, use_position: bool) -> RoughAttitude | None:
         """Return an attitude; None if the epochs do not suffice or contradict each other."""
         epochs = self.epochs
+        if len(epochs) < FIRST_EPOCHS:
+            return None
         kind = 0 if sum(epoch.v_n is not None for epoch in epochs) >= FIRST_EPOCHS else 1
         use = np.array([epoch.position_measured if kind else epoch.v_n is not None
-                        for epoch in epochs], bool)
+                        for epoch in epochs])
         variance = self._variance(kind)
         use &= variance <= UNCERTAIN ** 2 * np.min(variance[use], initial=np.inf)
         if np.count_nonzero(use) < FIRST_EPOCHS + kind or (kind and not use_position):
