@@ -184,8 +184,8 @@ class Aligner:
         """
         Process the queued messages that no late one can precede; return the new epochs.
 
-        With `dry` also those without measurement that divide an outage. `last`: no more messages
-        come, so that all are processed.
+        With `dry`, epochs without measurement that divide an outage are returned as well. `last`
+        says that no more messages come, so that all that are queued are processed.
         """
         self._process(last)
         done, self._done = self._done, []
@@ -417,16 +417,16 @@ class Aligner:
         return int(self._imu.stamps[-1]) if self._imu.stamps.size else None
 
     def attitude_now(self) -> Attitude | None:
-        """Return the attitude of `prediction`."""
+        """
+        Return the current attitude, propagated with the gyros to the newest IMU sample.
+
+        None before there is an attitude, and after a time in which the IMU measured too little.
+        """
         prediction = self.prediction()
         return None if prediction is None else prediction.attitude()
 
     def prediction(self) -> Prediction | None:
-        """
-        Return the current attitude, carried on with the gyros to the newest IMU sample.
-
-        None before there is an attitude, and after a time in which the IMU measured too little.
-        """
+        """Return a prediction that stands at the newest IMU sample; None as `attitude_now`."""
         current, method = self._current, self._method
         if current is None or method is None:
             return None

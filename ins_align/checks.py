@@ -50,9 +50,9 @@ def degrees_fault(too_fast: bool, times: Array, gyro: Array, accel: Array, veloc
     """
     Return in words that the angular rates are in deg/s, or ''.
 
-    They are if they are `too_fast`, or if the specific force, rotated by the rates and integrated
-    over some seconds, is shorter than the change of velocity less gravity: right rates make it as
-    long, whatever the attitude and the axes are.
+    They are if they are `too_fast`, or if the specific force shows it: rotated by the rates and
+    integrated over some seconds, it is as long as the change of velocity less gravity, whatever
+    the attitude and the axes are. Rates that are 57 times too large make it shorter.
 
     `times` are increasing, s, shape (N,); `gyro`, rad/s, and `accel`, m/s^2, are means over GRID s
     around them, shape (N, 3); `velocities` are as from `on_grid`.
@@ -62,7 +62,7 @@ def degrees_fault(too_fast: bool, times: Array, gyro: Array, accel: Array, veloc
         if not (lengths.size >= MIN_LENGTHS and np.quantile(lengths, 0.25) < SHORTER):
             return ''
         in_degrees = _lengths(times, np.radians(gyro), accel, velocities)
-        # Slow rates are too small in either unit to shorten a sum, which says nothing then.
+        # Only the sums that do not fit tell: where nothing turns, both units fit.
         if not abs(np.median(in_degrees[lengths < SHORTER]) - 1.0) < AS_LONG:
             return ''
     return 'the angular rates look like deg/s: they must be rad/s'
@@ -116,7 +116,11 @@ def beyond_the_poles(latitude_deg: float, longitude_deg: float) -> bool:
 
 
 def lateness_advice(lateness: float, delay: float = 0.0) -> tuple[str, str]:
-    """Return advice for messages that are late beyond gnss_delay, s, and the gnss_lateness."""
+    """
+    Return advice for GNSS messages that are `lateness` s late, and the gnss_lateness to set.
+
+    `delay`, s, is negative where gnss_delay corrects a clock that is behind.
+    """
     other_delay = max(delay - lateness, -MAX_DELAY)
     value = f'{min(math.ceil(2.0 * lateness) / 2.0 + 0.5, MAX_LATENESS):g}'
     return (f'GNSS messages come up to {lateness:.1f} s later than newer IMU samples: set '

@@ -86,10 +86,11 @@ def _parameter(default: Any, description: str, unit: str = '', minimum: float | 
 @dataclass(frozen=True)
 class Config:
     """
-    All parameters; each field's metadata has its description, unit, range and choices.
+    All parameters, checked.
 
-    A ConfigError is raised if a value is of the wrong type, out of range or in contradiction to
-    another one.
+    Each field's metadata holds ``description``, ``unit``, ``minimum`` and ``maximum`` (inclusive;
+    None if it is not a number), ``choices`` and ``read_only``. A ConfigError is raised if a value
+    is of the wrong type, out of range or in contradiction to another one.
     """
 
     lever_arm: tuple[float, float, float] = _parameter(

@@ -37,7 +37,8 @@ def apply(matrix: Array, vectors: Array) -> Array:
     """
     Return ``matrix @ vector``, shapes (..., m, n) and (..., n), with leading axes that broadcast.
 
-    One by one: in a product of a matrix with many vectors, the last bit depends on their number.
+    Each product is computed separately: in one of a matrix with many vectors, the last bit depends
+    on their number.
     """
     return (matrix @ vectors[..., None])[..., 0]
 
@@ -148,7 +149,8 @@ def log_so3(matrix: ArrayLike) -> Array:
     """
     Return rotation vectors, shape (..., 3), of rotation matrices, angle in [0, pi].
 
-    Unless all angles are below a right angle, by quaternions, which are precise near pi.
+    If all angles are below a right angle they are computed from sine and cosine, otherwise from
+    quaternions, which keep full precision near pi.
     """
     m = np.asarray(matrix, dtype=float)
     cosine = 0.5 * (np.einsum('...ii', m) - 1.0)
@@ -237,7 +239,11 @@ def orthonormalized(matrix: Array) -> Array:
 
 
 def cumulative_rotations(steps: Array) -> Array:
-    """Return ``steps[0] @ ... @ steps[k]`` for every k, shape (..., n, 3, 3), one by one."""
+    """
+    Return ``steps[0] @ ... @ steps[k]`` for every k, shape (..., n, 3, 3).
+
+    No bit of the products depends on the other leading axes.
+    """
     steps = np.ascontiguousarray(np.moveaxis(steps, -3, 0))
     total = steps.copy()
     for before, step, after in zip(total[:-1], steps[1:], total[1:]):

@@ -162,8 +162,9 @@ class StatedNoise:
     """
     Covariances of a receiver: those stated, as far as they are believed, or those configured.
 
-    `std` and `std_vertical` are the configured sigmas, `unknown_std` that of a vertical that is
-    not measured; `counter` counts covariances which are not believed.
+    `std` and `std_vertical` are the configured sigmas, for messages without a covariance;
+    `unknown_std` is that of a vertical that is not measured. `counter` is the name that counts
+    covariances which are not believed.
     """
 
     def __init__(self, std: float, std_vertical: float, unknown_std: float, counts: Counter[str],
@@ -207,7 +208,8 @@ class VelocityCheck:
         self._origin: Place | None = None
         # Horizontal vectors are complex numbers: east is the real part, north the imaginary one.
         self._path = 0j                     # integral of the velocity since the origin
-        # Position and path since the origin, and time, at the latest epochs and at the first.
+        # Position, path and time since the origin: at the latest epochs, and where the distance
+        # begins.
         self._recent: deque[tuple[complex, complex, float]] = deque(maxlen=AGREEING)
         self._anchor: tuple[complex, complex, float] | None = None
         self._last: tuple[float, complex] | None = None     # time and velocity

@@ -182,9 +182,10 @@ def fixes_from_msgs(msgs: Sequence[Any]) -> list[Fix]:
 def fixes(stamps_ns: ArrayLike, places: ArrayLike, covariances: np.ndarray,
           covariance_types: ArrayLike, status: ArrayLike) -> list[Fix]:
     """
-    Return fixes from the columns of N messages, as in sensor_msgs/NavSatFix.
+    Return fixes from the columns of N messages, with types and status as in sensor_msgs/NavSatFix.
 
-    Places, (N, 3), are latitude, longitude, degrees, and altitude, m; covariances are (N, 3, 3).
+    Places, (N, 3), are latitude and longitude, degrees, and altitude, m; covariances, (N, 3, 3),
+    m^2, are as sent.
     """
     columns = (stamps_ns, *np.asarray(places, float).T, covariance_types, status)
     return [Fix(stamp, latitude, longitude, altitude,
@@ -218,8 +219,9 @@ def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
     """
     Return velocities from the columns of N messages with the same frame_id, `frame`.
 
-    `linear`, (N, 3), m/s, is ENU unless ``config.velocity_frame`` is ned. Covariances may be those
-    of twists, (N, 6, 6). Raises MessageError if `frame` is a body frame and
+    `linear`, (N, 3), m/s, is ENU unless ``config.velocity_frame`` is ned. Of covariances, which
+    may be those of twists, (N, 6, 6), the first three rows and columns are used, as in
+    `sound_covariance`. Raises MessageError if `frame` is a body frame and
     ``config.velocity_frame`` is auto.
     """
     if config.velocity_frame == 'auto' and _BODY_FRAME.search(frame):

@@ -91,7 +91,7 @@ def without_wild_positions(positions: Series) -> Series:
     """
     Leave out positions that are far from the median of the five around them.
 
-    Far is half of the distance over which velocity and position are compared. The first two and
+    Far is half of the distance over which they are compared with velocities. The first two and
     the last two positions cannot be judged and stay.
     """
     vectors = positions.vectors
@@ -197,12 +197,13 @@ def _distances(velocities: Series, positions: Series, sharp: bool) -> tuple[Arra
     integral = np.zeros((v.shape[0], 4))
     integral[1:] = np.cumsum(np.column_stack(
         [0.5 * (v[1:] + v[:-1]) * steps[:, None], steps > MAX_GAP]), axis=0)
+    noise = DISTANCE_SIGMAS * position_noise(positions)
     for span in SPANS:
         starts = np.unique(np.floor(positions.times / span)) * span
         moved, travelled = (
             _at(series, starts + span) - _at(series, starts)
             for series in (positions, Series(velocities.times, integral)))
-        least = max(least_distance(span, sharp), DISTANCE_SIGMAS * position_noise(positions))
+        least = max(least_distance(span, sharp), noise)
         good = (np.hypot(moved[:, 0], moved[:, 1]) >= least) & (travelled[:, 3] == 0.0)
         if np.count_nonzero(good) > best[0].shape[0]:
             best = moved[good], travelled[good, :3]

@@ -136,7 +136,11 @@ class ImuBuffer:
             self.newest_ns = stamp_ns
 
     def _set_back(self, far: bool) -> bool:
-        """Return whether the clock was set back to the held samples; `far`: beyond lateness."""
+        """
+        Return whether the samples held behind the newest one are of a clock that was set back.
+
+        `far`: they are further behind than samples may arrive out of order.
+        """
         if far:
             return len(self.held) > 1           # a single one is late
         if len(self.held) < SET_BACK_SAMPLES:
@@ -284,8 +288,8 @@ class ImuBuffer:
         """
         Return what `preintegrate` takes for the intervals that end at K increasing epochs.
 
-        The first begins at the last epoch that was cut. `gravity_drift` is noise in each,
-        m/s/sqrt(s).
+        The first begins at the last epoch that was cut. `gravity_drift` is the noise in each that
+        comes from gravity at an unknown place, m/s/sqrt(s).
         """
         stamps = self.stamps
         ends_ns = np.array([self.used_ns, *epochs_ns])

@@ -32,16 +32,16 @@ SPIKE_BEFORE, SPIKE_RANK = 12, 7
 # An IMU is stuck that has repeated the same six values this often and for this long (ns).
 STUCK_SAMPLES, STUCK_NS = 8, 250_000_000
 # The largest value of an axis is the end of its range if it is at least this large (rad/s, m/s^2),
-# and has come this often while so many other axes changed, and this many times as often as the
-# next smaller value (with a coarse resolution smaller values repeat, too). The true motion may
-# exceed the end by this share.
+# more than at rest, and has come this often while so many other axes changed, and this many times
+# as often as the next smaller value: with a coarse resolution smaller values repeat, too. The true
+# motion may exceed the end by this share.
 END_RATE, END_FORCE = 0.5, 15.0
 END_TIMES, END_CHANGING, PILED_UP = 5, 3, 4
 BEYOND_END = 0.5
 # The attitude is lost when the gyros may have missed this angle (rad).
 BLIND_ANGLE = 0.35
-# A step this many times the usual one lacks samples, which may have missed this motion (angular
-# acceleration, rad/s^2, and jerk, m/s^3).
+# A step this many times the usual one holds lost samples; the motion that they may have missed
+# (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
 GAP_STEPS = 2.5
 GAP_ANGULAR_ACCELERATION, GAP_JERK = 2.0, 20.0
 # Samples come in bunches, stamped on arrival, where the median step is less than this share of
@@ -111,7 +111,8 @@ class RangeCheck:
         # Stamps of M samples at the end of the range, ns, and noise densities, (M, 2), of the
         # motion that gyros and accelerometers may miss until the next, rad/sqrt(s), m/s/sqrt(s).
         self.stamps, self.densities = np.zeros(0, np.int64), np.zeros((0, 2))
-        # Stamps at which the gyros may have missed another `BLIND_ANGLE`, ns.
+        # Stamps at which the gyros may have missed another `BLIND_ANGLE` since they were last
+        # within the range, ns.
         self.blind: list[int] = []
 
     def add(self, stamps: Index, samples: Array) -> None:

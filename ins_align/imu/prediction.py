@@ -14,7 +14,8 @@
 """
 The attitude between epochs, carried on with the gyroscopes sample by sample.
 
-In plain numbers, as the node needs it at each IMU message: numpy takes several times as long.
+It computes with plain numbers, because the node does this for each IMU message and numpy takes
+several times as long for vectors of three.
 """
 
 from collections import deque
@@ -60,8 +61,9 @@ class Prediction:
         """
         Carry on to a sample (rad/s), with the mean of its rate and that of the last one.
 
-        Return whether the attitude is now that at the sample: not if this is old or invalid, and
-        never again after a gap of `MAX_GAP_NS`. A shorter one adds to the covariance.
+        Return whether the attitude is now that at the sample. It is not if the sample is old or
+        invalid, and never again after a gap longer than `MAX_GAP_NS`, in which the rotation is
+        unknown. A shorter gap adds to the covariance, as in the filters.
         """
         x, y, z = gyro
         if not (0 < stamp_ns - self.stamp_ns <= MAX_GAP_NS

@@ -144,8 +144,9 @@ def split_at_epochs(stamps_ns: Index, samples: Array, epochs_ns: Index) -> Steps
     """
     Cut samples, (N, 6), rad/s and m/s^2, into the K intervals between K + 1 epochs.
 
-    Values at an epoch are those of the cubic by the neighbouring samples and their central
-    differences. All epochs lie between the first and the last stamp and may be equal.
+    Values at an epoch are interpolated with the cubic of the neighbouring samples and their
+    central differences. Stamps increase strictly, and all epochs lie between the first and the
+    last one; two equal epochs make an interval of zero length.
     """
     samples = samples.T
     slopes = _slopes(samples, np.diff(stamps_ns) * 1e-9)
@@ -275,7 +276,8 @@ def _derivatives(dt: Array, turns: Array, u: Array, rate: Array,
 
     A gyro bias turns the rest of the interval by minus the integral of the attitude, `turns` of
     each step, (K, n, 3, 3); an entry of a matrix acts as a bias times the mean rate or force of
-    the step, (K, n, 3). `u`, (K, n, 3), is the velocity gained in each step.
+    the step, (K, n, 3). `u`, (K, n, 3), is the velocity gained in each step. A few steps are taken
+    as one, with an error of second order in their motion.
     """
     def together(values: Array) -> Array:
         sums = values[:, ::DERIVATIVE_STEPS].copy(order='K')

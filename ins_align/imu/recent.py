@@ -100,7 +100,7 @@ def _seen_from_epoch(dt: Array, rate: Array, force: Array) -> Array:
     return np.concatenate([force, rate], axis=-1)
 
 
-def interpolated(integrals: Array, age: float) -> tuple[Array, ...]:
+def interpolated(integrals: Array, age: float) -> tuple[Array, Array, Array]:
     """
     Return a force or rate at an age, and its integral and double integral from age 0, each (K, 3).
 
@@ -113,7 +113,9 @@ def interpolated(integrals: Array, age: float) -> tuple[Array, ...]:
     trapezoids[1:step] += AGE_STEP
     trapezoids[step] += 0.5 * (AGE_STEP + rest)
     # The weights begin with the step at age 0, where the integrals are 0.
-    return tuple(weights[1:] @ integrals for weights in (value, there, trapezoids))
+    value, integral, double_integral = (weights[1:] @ integrals
+                                        for weights in (value, there, trapezoids))
+    return value, integral, double_integral
 
 
 def smoothed(integrals: Array, age: float) -> tuple[Array, Array]:

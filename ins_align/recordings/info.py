@@ -174,10 +174,10 @@ def _survey_velocity(data: Recorded, positions: Series, sharp: bool) -> None:
     data.add('', frame=name, speed_ratio=frame.speed_ratio)
     if name in FRAMES_THAT_FIT:
         ratio = frame.speed_ratio or 1.0
-        long = '' if abs(ratio - 1.0) < MAX_STRETCH else (
+        stretched = '' if abs(ratio - 1.0) < MAX_STRETCH else (
             f', but is {ratio:.2f} times as long: check the unit and the rate of the clock')
         data.add(f'frame: {name} (fits the change of position over {frame.windows} distances'
-                 f'{long})', {'velocity_frame': name} if name == 'ned' or data.doubt else {})
+                 f'{stretched})', {'velocity_frame': name} if name == 'ned' or data.doubt else {})
     elif data.doubt:
         data.add(data.doubt, fault=True)
     if name in FRAME_FAULTS:
