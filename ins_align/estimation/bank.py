@@ -366,15 +366,16 @@ class Bank:
                        delay=self._config.gnss_delay, doubt=self._start.lacks)
         velocity, position, either = self._rejected
         x, P = self._body()
-        best = filters.best
+        likeliest = self._rivals.table[filters.ids[filters.best]]
         remarks = receiver.in_words() + self._not_used + level_in_words(
-            self._rivals.table[filters.ids[best]], self._config.imu_noise, x, P)
+            likeliest, self._config, x, P)
         if self._vehicle is not None:
             remarks += self._vehicle.in_words(filters)
         return Fit(self._offered, rows=3 * (self._offered - either), misfit=receiver.misfit,
                    innovation=self._innovation, rejected_velocity=velocity,
                    rejected_position=position, rejected=either,
                    delay=self._config.gnss_delay + float(x[DELAY]),
+                   delay_std=max(self._config.gnss_delay_std, likeliest.gnss_delay_std),
                    objection=self._doubt if self._contradicted else '', doubt=self._doubt,
                    remarks=remarks)
 

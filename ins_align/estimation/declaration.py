@@ -56,6 +56,7 @@ class Fit:
     rejected_position: int = 0
     rejected: int = 0  #: epochs with any of them
     delay: float = 0.0  #: of the GNSS, s; the configured one where none is estimated
+    delay_std: float = 0.0  #: how far it is expected to be from the configured one, 1 sigma
     objection: str = ''  #: what the data say against the configuration, in words
     doubt: str = ''  #: what speaks against declaring a heading, in words
     remarks: str = ''  #: how the sensors differ from the configuration, as the end of a sentence
@@ -192,7 +193,7 @@ class Declaration:
             return ''
         config = self.config
         unexplained = abs(fit.delay - config.gnss_delay)
-        if unexplained > DELAY_SIGMAS * config.gnss_delay_std > 0:
+        if unexplained > DELAY_SIGMAS * fit.delay_std > 0:
             digits = 2 if unexplained >= 0.02 else 3
             return (f'the GNSS stamps seem to be {fit.delay:.{digits}f} s late, gnss_delay is '
                     f'{config.gnss_delay:g} and gnss_delay_std {config.gnss_delay_std:g}: check '

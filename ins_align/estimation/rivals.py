@@ -48,8 +48,8 @@ ALIKE = 2.0
 # shows the signs of two gyros.
 HARMLESS = 1.0
 # A setting is named for a bias that is so many times its configured sigma, less so many of its
-# own sigmas, and not beyond the last, 4 sigmas of the worst level: then something else is wrong.
-LARGE_BIAS, SURELY, NO_BIAS = 2.0, 2.0, 40.0
+# own sigmas, and not beyond so many sigmas of its level: then something else is wrong.
+LARGE_BIAS, SURELY, NO_BIAS = 2.0, 2.0, 4.0
 # Sigma of the velocity of a vehicle sideways and upwards that lasts (m/s: slip of tyres, leeway
 # and current, wind); it changes by its sigma in this time (s), as the wind does for an aeroplane
 # that turns.
@@ -64,29 +64,38 @@ SHARE = 1 / 27
 class Rival:
     """Another hypothesis about the sensors."""
 
-    #: What it assumes, in words with places for parameters; empty for a level.
-    better: str = ''
-    advice: str = 'check the IMU axes'  #: what to do then
+    wrong: str = ''  #: what it assumes that must not be aligned with; empty for a level
+    remark: str = ''  #: what a level says that is the likeliest, with places for parameters
     #: Of the gyros x, y, z and of the accelerometers.
     signs: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     gyro: float = 1.0  #: factor on the gyros' errors, and on their rate random walk
     accel: float = 1.0  #: factor on the accelerometers' errors
-    lever_arm_std: float = 0.0  #: at least so much (SI), as the next three
+    grade: str = ''  #: the preset of the IMU whose errors it has at least
+    lever_arm_std: float = 0.0  #: at least so much (SI), as the next
     gnss_delay_std: float = 0.0
-    gyro_bias_std: float = 0.0
-    accel_bias_std: float = 0.0
     #: Of a vehicle: 1 forwards, -1 backwards along its x axis; 0: it moves as it likes.
     along: int = 0
     prior: float = 0.0  #: log of how likely it is before the data, over the configuration
 
-    @property
-    def wrong(self) -> bool:
-        """Whether it contradicts the configuration, so that nothing is aligned with it."""
-        return bool(self.better)
+    def sigmas(self, noise: ImuNoise) -> tuple[float, ...]:
+        """
+        Return the sigmas of the errors of an IMU that is configured as `noise`, in SI units.
+
+        Those of the gyros' biases, the accelerometers' biases, the gyros' rate random walk, the
+        gyros' scale factors and the accelerometers' scale factors.
+        """
+        least = PRESETS[self.grade] if self.grade else noise
+        gyro, accel = min(self.gyro, WORSE_SCALE), min(self.accel, WORSE_SCALE)
+        return (max(self.gyro * noise.gyro_bias_std, least.gyro_bias_std),
+                max(self.accel * noise.accel_bias_std, least.accel_bias_std),
+                max(self.gyro * noise.rate_random_walk, least.rate_random_walk),
+                max(gyro * noise.gyro_scale_std, least.gyro_scale_std),
+                ACCEL_ERRORS * max(accel * noise.gyro_scale_std, least.gyro_scale_std))
 
 
 # Levels: factors on the biases of gyros and accelerometers, and log prior; the first level is the
-# configuration. Scale factors and misalignment are at most so many times larger.
+# configuration. Scale factors and misalignment are at most so many times larger. The last level is
+# also at least as bad as the next worse preset: `mems`, or `chip` for MEMS.
 WORSE = ((1, 1, 0), (1, 3, -3), (1, 10, -5), (3, 1, -5.5), (10, 1, -11), (10, 10, -16))
 WORSE_SCALE = 3.0
 LEVELS = tuple(Rival(gyro=gyro, accel=accel, prior=prior) for gyro, accel, prior in WORSE)
@@ -98,32 +107,27 @@ SIGNS = (
     Rival('the angular rate about x reversed', signs=(-1.0, 1.0, 1.0, 1.0)),
     Rival('the angular rate about y reversed', signs=(1.0, -1.0, 1.0, 1.0)),
     Rival('the angular rate about z reversed', signs=(1.0, 1.0, -1.0, 1.0)))
-# A parameter that is configured with a smaller sigma (SI) has a rival.
+# Levels for a parameter that is configured with a smaller sigma (SI) than this.
 CERTAIN = (
-    ('lever_arm_std', 0.3, Rival(
-        'a lever arm of [{lever}] m',
-        'check lever_arm (its signs, the axes of the IMU), or raise lever_arm_std',
-        lever_arm_std=2.0, prior=-6.0)),
-    ('gnss_delay_std', 0.03, Rival(
-        'GNSS stamps that are {delay:.2f} s late',
-        'check the clocks, set gnss_delay, or raise gnss_delay_std', gnss_delay_std=0.1,
-        prior=-6.0)),
-    ('gyro_bias_std', 0.3 * PRESETS['mems'].gyro_bias_std, Rival(
-        'biases of [{gyro}] deg/s and [{accel}] m/s^2, more than the grade of the IMU expects',
-        'set imu_grade, or raise gyro_bias_std and accel_bias_std',
-        gyro_bias_std=PRESETS['mems'].gyro_bias_std,
-        accel_bias_std=PRESETS['mems'].accel_bias_std, prior=-6.0)))
+    ('lever_arm_std', 0.3, Rival(lever_arm_std=2.0, prior=-6.0, remark=(
+        'a lever arm of [{lever}] m fits better than the configured one: check its signs and the '
+        'axes of the IMU, or raise lever_arm_std'))),
+    ('gnss_delay_std', 0.03, Rival(gnss_delay_std=0.1, prior=-6.0, remark=(
+        'GNSS stamps that are {delay:.2f} s late fit better than gnss_delay: check the clocks, '
+        'set it, or raise gnss_delay_std'))))
 
 
 def rivals_of(config: Config) -> tuple[Rival, ...]:
     """Return the rivals of a configuration, which itself comes first."""
-    stated = vars(config) | config.imu_noise._asdict()
-    told = tuple(rival for name, std, rival in CERTAIN if stated[name] < std)
-    rivals = (*LEVELS, *(() if config.trust_imu_axes else SIGNS), *told)
+    worse = next((grade for grade in ('mems', 'chip')
+                  if PRESETS[grade].gyro_bias_std > config.imu_noise.gyro_bias_std), '')
+    levels = (*LEVELS[:-1], replace(LEVELS[-1], grade=worse),
+              *(level for name, std, level in CERTAIN if getattr(config, name) < std))
+    rivals = (*levels, *(() if config.trust_imu_axes else SIGNS))
     if config.vehicle == 'none':
         return rivals
     return (*(replace(rival, along=1) for rival in rivals),
-            *(replace(level, along=-1) for level in LEVELS), *LEVELS)
+            *(replace(level, along=-1) for level in levels), *levels)
 
 
 class Rivals:
@@ -144,12 +148,11 @@ class Rivals:
 
     def __init__(self, config: Config) -> None:
         """Make the table."""
-        self._gnss_delay = config.gnss_delay
         self.table = rivals_of(config)
         self.signs = np.array([rival.signs for rival in self.table])
         self.prior = np.array([rival.prior for rival in self.table])
         self.along = np.array([rival.along for rival in self.table])
-        self._wrong = np.array([rival.wrong for rival in self.table])
+        self._wrong = np.array([bool(rival.wrong) for rival in self.table])
         self.counts = ~self._wrong & ((self.along != 0) | (config.vehicle == 'none'))
 
     def select(self, filters: Filters) -> None:
@@ -200,14 +203,10 @@ class Rivals:
         # wrong, the rival has to fit better than each level does without its prior.
         fits = np.max((level - self.prior[filters.ids])[filters.counts])
         if level[worst] - fits > MARGIN:
-            return in_words(self.table[filters.ids[worst]], filters.x[filters.lead[worst]],
-                            self._gnss_delay), True
-        rival = self.table[filters.ids[worst]]
-        if min(rival.signs) < 0:
-            what, otherwise = 'the signs of the IMU axes are', ''
-        else:
-            what, otherwise = 'what is configured for certain is', f', or {rival.advice}'
-        return f'{what} not confirmed by the motion yet: turn and change speed{otherwise}', False
+            rival = self.table[filters.ids[worst]]
+            return f'the data fit better with {rival.wrong}: check the IMU axes', True
+        return ('the signs of the IMU axes are not confirmed by the motion yet: turn and change '
+                'speed'), False
 
 
 @dataclass
@@ -246,65 +245,55 @@ class Parameters:
         x[LEVER_ARM] = config.lever_arm
         std[LEVER_ARM] = max(config.lever_arm_std, rival.lever_arm_std)
         std[DELAY] = max(config.gnss_delay_std, rival.gnss_delay_std)
-        std[GYRO:GYRO + 3] = max(rival.gyro * noise.gyro_bias_std, rival.gyro_bias_std)
-        accel_std = max(rival.accel * noise.accel_bias_std, rival.accel_bias_std)
-        std[accel:accel + 3] = accel_std
+        gyro_std, accel_std, walk_std, gyro_scale, accel_scale = rival.sigmas(noise)
+        std[GYRO:GYRO + 3], std[accel:accel + 3] = gyro_std, accel_std
         walk[DELAY] = (DELAY_WANDER * config.gnss_delay_std) ** 2 / WANDER_TIME
-        walk[GYRO:GYRO + 3] = (rival.gyro * noise.rate_random_walk) ** 2
+        walk[GYRO:GYRO + 3] = walk_std ** 2
         walk[accel:accel + 3] = (ACCEL_WANDER * accel_std) ** 2 / WANDER_TIME
         P = np.diag(std ** 2)
         if matrices:
-            P[GYRO + 3:accel, GYRO + 3:accel] = np.diag(
-                gyro_matrix_std(min(rival.gyro, WORSE_SCALE) * noise.gyro_scale_std).ravel() ** 2)
+            P[GYRO + 3:accel, GYRO + 3:accel] = np.diag(gyro_matrix_std(gyro_scale).ravel() ** 2)
             # At the force f the error b + M f of bias b and matrix M has the sigma of the bias.
-            scale = ACCEL_ERRORS * min(rival.accel, WORSE_SCALE) * noise.gyro_scale_std
             told = np.eye(12)
             told[:3, 3:] = -np.kron(np.eye(3), force)
-            sigmas = np.repeat([accel_std, scale], [3, 9])
+            sigmas = np.repeat([accel_std, accel_scale], [3, 9])
             P[accel:accel + 12, accel:accel + 12] = told @ np.diag(sigmas ** 2) @ told.T
         return Parameters(x, P, np.concatenate([np.zeros(FIRST), walk]))
 
 
-def in_words(rival: Rival, x: Array, gnss_delay: float) -> str:
-    """Return the sentence of a rival that the data fit better, with its parameters x, (m,)."""
-    gyro, accel = biases(x.size)
-
-    def listed(vector: Array, digits: str) -> str:
-        return ', '.join(format(number, digits) for number in vector.tolist())
-
-    better = rival.better.format(
-        lever=listed(x[LEVER_ARM], '.2f'), delay=gnss_delay + float(x[DELAY]),
-        gyro=listed(np.degrees(x[gyro]), '.2g'),
-        accel=listed(x[accel], '.2g'))
-    return f'the data fit better with {better}: {rival.advice}'
-
-
-def level_in_words(level: Rival, noise: ImuNoise, x: Array, P: Array) -> str:
+def level_in_words(level: Rival, config: Config, x: Array, P: Array) -> str:
     """
-    Return how the IMU is worse than configured, as the end of a sentence, or ''.
+    Return how the sensors differ from the configuration, as the end of a sentence, or ''.
 
     `x`, (m,), and `P`, (m, m), are the parameters of the level and their covariance. A setting is
     named where a bias is surely far larger than configured: an IMU that looks worse for other
     reasons gets no better with a setting, and takes longer.
     """
+    if level.remark:
+        lever = ', '.join(f'{number:.2f}' for number in x[LEVER_ARM].tolist())
+        return '; ' + level.remark.format(lever=lever, delay=config.gnss_delay + float(x[DELAY]))
     if level.gyro == level.accel == 1:
         return ''
-    std = np.sqrt(np.diag(P))
+    noise, std = config.imu_noise, np.sqrt(np.diag(P))
     settings = []
-    for name, places, configured, unit in zip(
+    for name, places, configured, sigma, unit in zip(
             ('gyro_bias_std', 'accel_bias_std'), biases(x.size),
-            (noise.gyro_bias_std, noise.accel_bias_std), (math.degrees(1.0), 1.0)):
+            (noise.gyro_bias_std, noise.accel_bias_std), level.sigmas(noise),
+            (math.degrees(1.0), 1.0)):
         found = np.abs(x[places])
         if (np.any(found - SURELY * std[places] > LARGE_BIAS * configured)
-                and found.max() < NO_BIAS * configured):
+                and found.max() < NO_BIAS * sigma):
             settings.append(f'{name}={unit * found.max():.2g}')
+    if level.grade and settings:
+        settings = [f'imu_grade={level.grade}']
     if settings:
         return ('; the biases of the IMU are larger than configured, which sigmas allow for: set '
                 + ' and '.join(settings))
     worse = [sensors for sensors, factor in (
         ('gyros', level.gyro), ('accelerometers', level.accel)) if factor > 1]
-    return (f'; the {" and ".join(worse)} look worse than configured, as with '
-            f'{max(level.gyro, level.accel):g} times the bias, '
+    bias = (f'imu_grade={level.grade}' if level.grade
+            else f'{max(level.gyro, level.accel):g} times the bias')
+    return (f'; the {" and ".join(worse)} look worse than configured, as with {bias}, '
             'which sigmas allow for: coarse readings, scale factors, vibration or GNSS errors '
             'that last')
 
