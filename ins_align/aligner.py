@@ -22,7 +22,7 @@ from collections import Counter
 import dataclasses
 
 from ins_align.config import Config, ConfigError
-from ins_align.estimation.bank import Bank, Learnt
+from ins_align.estimation.bank import Bank, Learnt, REJECTED
 from ins_align.estimation.declaration import Declaration, Fit
 from ins_align.estimation.formula import NoteMethod
 from ins_align.geometry.rotation import Array, Transform
@@ -64,7 +64,8 @@ class Aligner:
     def __init__(self, config: Config | None = None, base: Transform | None = None) -> None:
         self.config = Config() if config is None else config
         self._base = base
-        self._counts: Counter[str] = Counter()      # messages and epochs, by outcome
+        # Messages and epochs, by outcome; the epochs of the present alignment are in its method.
+        self._counts = Counter(dict.fromkeys((*REJECTED, 'epochs_used', 'rebases'), 0))
         self._events: list[Event] = []
         self._warned: set[str] = set()
         self._done: list[Epoch] = []                # not yet returned by `update`
@@ -85,7 +86,7 @@ class Aligner:
     def _forget(self, learnt: Learnt | None) -> None:
         """Drop the alignment and wait for a new t0; keep the queues and `learnt` for its start."""
         if self._method is not None:
-            self._counts.update(_epoch_counts(self._method))
+            self._counts.update(self._method.counts)
         self._learnt = learnt
         self._method = None
         self._antenna = Antenna(self.config, self._counts)
@@ -270,7 +271,7 @@ class Aligner:
             self._counts['restarts'] += 1
             self._announce_restart(method.restarted)
             self.declared = self._time_to_align_s = None
-            method.restarted = ''
+            self._start_ns, method.restarted = epoch.stamp_ns, ''
         # 7. The declaration decides on the state and words the reason.
         verdict = self._decide(epoch, method, fit)
         if epoch.v_n is not None:
@@ -446,7 +447,8 @@ class Aligner:
     def counts(self) -> Counter[str]:
         """Return how many messages and epochs had which outcome, by name."""
         counts = Counter(self._counts)
-        counts.update(_epoch_counts(self._method))
+        if self._method is not None:
+            counts.update(self._method.counts)
         return counts
 
     def status(self) -> Status:
@@ -457,12 +459,3 @@ class Aligner:
                       t0_ns=None if method is None else method.t0_ns, initial=self._initial,
                       current=self._current, time_to_align_s=self._time_to_align_s,
                       counts=dict(self.counts))
-
-
-def _epoch_counts(method: Bank | NoteMethod | None) -> Counter[str]:
-    """Return the counts that an alignment keeps itself."""
-    fit = Fit(0) if method is None else method.fit()
-    return Counter(epochs_used=fit.offered - fit.rejected,
-                   epochs_rejected_velocity=fit.rejected_velocity,
-                   epochs_rejected_position=fit.rejected_position,
-                   rebases=0 if method is None else method.moved)

@@ -226,14 +226,24 @@ def test_counts_hold_every_epoch_over_a_restart(flight):
 
 
 def test_a_bank_that_starts_again_by_itself_says_so(flight):
-    """Ten velocities in a row that are 50 m/s off."""
+    """Eleven velocities in a row are 50 m/s off; what follows is judged by itself."""
     aligner = Aligner(config_for(flight))
-    give_all(aligner, flight, change=lambda k, kind, message: message if kind == 'fix' or not (
-        100 <= k < 111) else message._replace(velocity=message.velocity + [30.0, -40.0, 10.0]))
+
+    def spoil(k, kind, message):
+        if kind == 'fix' or not 40 <= k < 51:
+            return message
+        return message._replace(velocity=message.velocity + [30.0, -40.0, 10.0])
+
+    epochs = give_all(aligner, flight, change=spoil)
     counts = aligner.status().counts
     assert counts['restarts'] == 1 and counts.get('withdrawals', 0) == 0
     assert (Severity.WARNING, 'alignment starts over: the last GNSS epochs do not fit the rest'
             ) in aligner.take_events()
+    again = next(epoch for epoch in epochs if epoch.started_over)
+    after = [epoch for epoch in epochs if epoch.t_s > again.t_s]
+    declared = next(epoch for epoch in after if epoch.state is State.ALIGNED)
+    assert aligner.status().time_to_align_s == pytest.approx(declared.t_s - again.t_s, abs=1e-6)
+    assert counts['epochs_used'] + counts['epochs_rejected_velocity'] == len(epochs)
 
 
 def test_nothing_is_learnt_of_lever_arm_and_delay_at_rest():

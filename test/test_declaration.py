@@ -296,7 +296,7 @@ def test_a_new_start_remembers_what_contradicted_the_one_before():
     assert declaration.update_without_gnss(4.0, GOOD, GOOD, few).reason == (
         f'{words}; no GNSS for 4 s')
     judge(declaration, 3.4, 0.0, GOOD, fit(offered=660))
-    few = fit(rows=5, offered=663)
+    few = fit(rows=5, offered=3)
     assert declaration.update_without_attitude(0.0, few).reason == (
         '3 GNSS epochs so far: more are needed')
     assert declaration.update_without_attitude(4.0, few).reason.endswith('needed; no GNSS for 4 s')

@@ -18,6 +18,7 @@ It starts from the note's pair of vectors, weighs means and rivals by their like
 the attitude as a Gaussian mixture (docs, "Theory").
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import math
@@ -54,6 +55,8 @@ ASTRAY = 10
 # A heading with a smaller sigma (rad) is resolved.
 RESOLVED_STD = 0.35
 NO_INNOVATION = np.full(3, math.nan)
+# Counts of epochs with an outlier, in the order of kinds of measurement.
+REJECTED = 'epochs_rejected_velocity', 'epochs_rejected_position'
 
 
 class Learnt(NamedTuple):
@@ -95,10 +98,8 @@ class Bank:
         self._use_position = use_position
         self._velocity_ns = epoch.stamp_ns          # stamp of the last velocity
         self._velocities_since_ns: int | None = None
-        self.moved = 0
+        self.counts: Counter[str] = Counter()       # epochs by outcome, and moves of t0
         self.restarted = ''         # why the bank has started again by itself, until it is read
-        self._offered = 0
-        self._rejected = [0, 0, 0]
         self._begin(epoch, imu, prior)
         self._wait(epoch, imu)
 
@@ -126,6 +127,7 @@ class Bank:
         self._doubt, self._contradicted = '', False
         self._start = Start(self._config)
         self._last = epoch                          # the last epoch that was processed
+        self._offered = self._rejected = 0          # epochs with a measurement; with an outlier
         self._C_nn0 = np.eye(3)
         self._innovation = NO_INNOVATION
         self._receiver = ReceiverNoise()
@@ -267,10 +269,12 @@ class Bank:
             stated = measured.stated[k][kind]
             new = filters.update(model, k, kind, measured, receiver.factors(kind, stated))
             receiver.follow(kind, stated, moving, new.square, new.normalised, self._seconds)
-            self._rejected[kind] += not new.taken
+            self.counts[REJECTED[kind]] += not new.taken
             news.append(new)
         self._offered += 1
-        self._rejected[2] += not all(new.taken for new in news)
+        good = all(new.taken for new in news)
+        self._rejected += not good
+        self.counts['epochs_used'] += good
         self._in_a_row = self._in_a_row + 1 if any(new.fits_none for new in news) else 0
         self._innovation = news[0].normalised
         if not vertical:
@@ -308,9 +312,9 @@ class Bank:
         start = self._start
         start.add(epoch, imu)
         rough = start.solve(self._use_position)
-        for kind, count in enumerate(start.rejected):
-            self._rejected[kind] += count
-            self._rejected[2] += count
+        for name, count in zip(REJECTED, start.rejected):
+            self.counts[name] += count
+            self._rejected += count
             self._offered += count
         start.rejected = [0, 0]
         if start.epochs:
@@ -364,18 +368,16 @@ class Bank:
         if filters is None:
             return Fit(self._offered, waiting=self._start.measured,
                        delay=self._config.gnss_delay, doubt=self._start.lacks)
-        velocity, position, either = self._rejected
         x, P = self._body()
         likeliest = self._rivals.table[filters.ids[filters.best]]
         remarks = receiver.in_words() + self._not_used + level_in_words(
             likeliest, self._config, x, P)
         if self._vehicle is not None:
             remarks += self._vehicle.in_words(filters)
-        return Fit(self._offered, rows=3 * (self._offered - either), misfit=receiver.misfit,
-                   innovation=self._innovation, rejected_velocity=velocity,
-                   rejected_position=position, rejected=either,
+        return Fit(self._offered, rows=3 * (self._offered - self._rejected),
+                   misfit=receiver.misfit, innovation=self._innovation, rejected=self._rejected,
                    delay=self._config.gnss_delay + float(x[DELAY]),
-                   delay_std=max(self._config.gnss_delay_std, likeliest.gnss_delay_std),
+                   delay_std=likeliest.gnss_delay_std,
                    objection=self._doubt if self._contradicted else '', doubt=self._doubt,
                    remarks=remarks)
 
@@ -384,7 +386,7 @@ class Bank:
         assert self._filters is not None
         self._filters.clone(self._C_nn0.T)
         self._mixture = self._filters.mixture()
-        self.moved += 1
+        self.counts['rebases'] += 1
         self.t0_ns = self._last.stamp_ns
 
     def _body(self) -> tuple[Array, Array]:

@@ -46,17 +46,15 @@ PATIENCE, ACCEPTABLE = 60.0, 4.0
 class Fit:
     """How well the data fit the model of a method."""
 
-    offered: int  #: epochs with a measurement, rejected ones included
+    offered: int  #: epochs with a measurement since the start, rejected ones included
     waiting: int = 0  #: epochs that wait for a start, not offered yet
     rows: int = 0  #: redundant rows; 0 before there is a solution
     misfit: float = math.nan  #: mean square of normalised residuals
     #: (3,), of the velocity (of the position where only that is used) over its sigma.
     innovation: Array = field(default_factory=lambda: np.full(3, math.nan))
-    rejected_velocity: int = 0  #: measurements that were rejected as outliers
-    rejected_position: int = 0
-    rejected: int = 0  #: epochs with any of them
+    rejected: int = 0  #: epochs with a measurement that was rejected as an outlier
     delay: float = 0.0  #: of the GNSS, s; the configured one where none is estimated
-    delay_std: float = 0.0  #: how far it is expected to be from the configured one, 1 sigma
+    delay_std: float = 0.0  #: sigma, s, that the likeliest hypothesis gives it at least
     objection: str = ''  #: what the data say against the configuration, in words
     doubt: str = ''  #: what speaks against declaring a heading, in words
     remarks: str = ''  #: how the sensors differ from the configuration, as the end of a sentence
@@ -75,13 +73,12 @@ class Declaration:
         self.move_t0 = False                # whether t0 should move to now
         self._against = ''                  # what spoke against a declaration at the last epoch
         self._contradiction = ''            # at the last epoch with redundancy
-        self._offered = 0                   # number of epochs then
         self._rejected = 0
         self._time_s = 0.0
 
     def update(self, time_s: float, initial: Array, current: Array, fit: Fit) -> Verdict:
         """
-        Judge an epoch, `time_s` seconds after the first t0.
+        Judge an epoch, `time_s` seconds after the first one of the alignment.
 
         `initial` and `current`, (3, 3), are covariances of the attitude at t0 and of that now, in
         ENU. Both must be good enough; where only that now is, `move_t0` is set.
@@ -89,7 +86,7 @@ class Declaration:
         self._time_s = time_s
         contradiction = self._contradicted_by(fit)
         if fit.rows >= MIN_ROWS:
-            self._contradiction, self._offered = contradiction, fit.offered
+            self._contradiction = contradiction
         tilt, heading = _sigmas_deg(initial)
         tilt_now, heading_now = _sigmas_deg(current)
         tilt, heading = max(tilt, tilt_now), max(heading, heading_now)
@@ -181,8 +178,7 @@ class Declaration:
         """Return how many epochs there are where there is no redundancy yet."""
         if self._contradiction:
             return f'{self._contradiction}; it has started over'
-        return (f'{fit.offered + fit.waiting - self._offered} GNSS epochs so far: more are '
-                'needed')
+        return f'{fit.offered + fit.waiting} GNSS epochs so far: more are needed'
 
     def _held(self, since_s: float | None, time_s: float) -> bool:
         return since_s is not None and time_s - since_s >= self.config.hold_time - 1e-6
@@ -193,7 +189,7 @@ class Declaration:
             return ''
         config = self.config
         unexplained = abs(fit.delay - config.gnss_delay)
-        if unexplained > DELAY_SIGMAS * fit.delay_std > 0:
+        if unexplained > DELAY_SIGMAS * max(config.gnss_delay_std, fit.delay_std) > 0:
             digits = 2 if unexplained >= 0.02 else 3
             return (f'the GNSS stamps seem to be {fit.delay:.{digits}f} s late, gnss_delay is '
                     f'{config.gnss_delay:g} and gnss_delay_std {config.gnss_delay_std:g}: check '

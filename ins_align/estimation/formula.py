@@ -19,6 +19,7 @@ coarse alignment'", and the free start and the position form (Remark 2.3) that t
 adds (docs, "Theory").
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 import math
 
@@ -169,7 +170,8 @@ class NoteMethod:
                  use_position: bool) -> None:
         """Start at t0."""
         self.t0_ns = epoch.stamp_ns
-        self.moved, self.restarted = 0, ''
+        self.counts: Counter[str] = Counter()
+        self.restarted = ''
         self._config = config
         self._lever_b = np.array(config.lever_arm)
         self._free = config.free_start
@@ -230,6 +232,7 @@ class NoteMethod:
         else:
             return
         self._offered += 1
+        self.counts['epochs_used'] += 1
         if self._rows <= 0:
             return
         C, residual, A = self._moments.solve()
