@@ -16,8 +16,8 @@ The rivals: hypotheses about the sensors beside the configuration.
 
 Each is a change to the filter, a prior probability and a sentence, and is a bank of its own on the
 same data. While a rival that is `wrong` is as likely as the configuration and gives another
-attitude, no heading is declared. The others are levels of the IMU's errors, which count in results
-by their likelihood.
+attitude, no heading is declared. The others are levels, worse IMUs or another lever arm or delay
+than configured, which count in results by their likelihood.
 """
 
 from dataclasses import dataclass, replace
@@ -65,7 +65,7 @@ class Rival:
     """Another hypothesis about the sensors."""
 
     wrong: str = ''  #: what it assumes that must not be aligned with; empty for a level
-    remark: str = ''  #: what a level says that is the likeliest, with places for parameters
+    remark: str = ''  #: what is said while this level is the likeliest, with places for parameters
     #: Of the gyros x, y, z and of the accelerometers.
     signs: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     gyro: float = 1.0  #: factor on the gyros' errors, and on their rate random walk
