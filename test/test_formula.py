@@ -284,6 +284,22 @@ def test_free_start_is_minimised_over(nuisance):
     assert np.allclose(A, centred.T @ centred)
 
 
+def test_many_sums_at_once_each_without_one_pair():
+    """Against scipy on the pairs that are left, with the free start projected out."""
+    random = np.random.default_rng(4)
+    basis = np.vander(np.arange(12.0), 2, increasing=True)
+    a = random.standard_normal((12, 3)) * [3.0, 2.0, 1.0]
+    s = Rotation.from_rotvec([0.3, -0.2, 2.0]).apply(a) + 0.3 * random.standard_normal((12, 3))
+    rows = np.hstack([s, a, basis])
+    C, residual, _ = q_method.solve_moments(rows.T @ rows - rows[:, :, None] * rows[:, None])
+    for k in range(12):
+        left = np.linalg.qr(np.delete(basis, k, 0), 'complete').Q[:, 2:].T
+        expected, rssd = Rotation.align_vectors(left @ np.delete(s, k, 0),
+                                                left @ np.delete(a, k, 0))
+        assert angle_deg(C[k], expected.as_matrix()) < 1e-6
+        assert residual[k] == pytest.approx(rssd ** 2, rel=1e-9)
+
+
 def test_moments_of_hundreds_of_kilometres_keep_a_centimetre():
     """Position form after long: sums of squares of large numbers must not lose the small ones."""
     random = np.random.default_rng(3)

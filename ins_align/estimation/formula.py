@@ -238,7 +238,7 @@ class NoteMethod:
         C, residual, A = self._moments.solve()
         A_n = C @ A @ C.T
         information = np.trace(A_n) * np.eye(3) - A_n
-        self._residual = residual
+        self._residual = float(residual)
         self._solved_s = time
         white, common = self._noise()
         # Noise that all pairs have in common does not average out.

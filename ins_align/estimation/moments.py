@@ -31,7 +31,6 @@ class AttitudeMoments:
 
     def __init__(self, nuisance: int) -> None:
         """Start with empty sums."""
-        self._nuisance = nuisance
         self.count = 0
         self._moments = np.zeros((6 + nuisance, 6 + nuisance))
 
@@ -41,50 +40,60 @@ class AttitudeMoments:
         self._moments += np.outer(row, row)
         self.count += 1
 
-    def solve(self) -> tuple[Array, float, Array]:
-        """
-        Davenport's q-method on the moments left when the nuisance parameters are regressed out.
-
-        Returns
-        -------
-        C : ndarray, shape (3, 3)
-            The attitude.
-        residual : float
-            Weighted residual sum of squares.
-        A : ndarray, shape (3, 3)
-            Moments of a about the regression.
-
-        """
-        m = self._moments[:6, :6]
-        if self._nuisance:
-            z = self._moments[6:, 6:]
-            zm = self._moments[6:, :6]
-            m = m - zm.T @ np.linalg.pinv(z, hermitian=True) @ zm
-        C, residual = attitude_from_moments(m[:3, 3:], float(np.trace(m)))
-        return C, residual, m[3:, 3:]
+    def solve(self) -> tuple[Array, Array, Array]:
+        """Return attitude, residual and moments of a, see `solve_moments`."""
+        return solve_moments(self._moments)
 
 
-def attitude_from_moments(B: Array, total: float) -> tuple[Array, float]:
+def solve_moments(moments: Array) -> tuple[Array, Array, Array]:
+    """
+    Davenport's q-method on the moments left when the nuisance parameters are regressed out.
+
+    Parameters
+    ----------
+    moments : ndarray, shape (..., 6 + nuisance, 6 + nuisance)
+        Sums of the products of each pair: s, a and the regressors.
+
+    Returns
+    -------
+    C : ndarray, shape (..., 3, 3)
+        The attitude.
+    residual : ndarray, shape (...)
+        Weighted residual sum of squares.
+    A : ndarray, shape (..., 3, 3)
+        Moments of a about the regression.
+
+    """
+    zm = moments[..., 6:, :6]
+    m = moments[..., :6, :6] - zm.swapaxes(-1, -2) @ np.linalg.pinv(
+        moments[..., 6:, 6:], hermitian=True) @ zm
+    C, residual = attitude_from_moments(m[..., :3, 3:], np.trace(m, axis1=-2, axis2=-1))
+    return C, residual, m[..., 3:, 3:]
+
+
+def attitude_from_moments(B: Array, total: Array) -> tuple[Array, Array]:
     """
     Davenport's q-method for ``sum |s - C a|^2`` with vectors that are not normalised.
 
     Parameters
     ----------
-    B : ndarray, shape (3, 3)
+    B : ndarray, shape (..., 3, 3)
         ``sum s a^T``.
-    total : float
+    total : ndarray, shape (...)
         ``sum |s|^2 + |a|^2``.
 
     Returns
     -------
-    C : ndarray, shape (3, 3)
-    residual : float
+    C : ndarray, shape (..., 3, 3)
+    residual : ndarray, shape (...)
         Smallest eigenvalue of ``K = total I - 2 D``, the residual sum (not negative).
 
     """
-    D = np.empty((4, 4))
-    D[:3, :3] = B + B.T - np.trace(B) * np.eye(3)
-    D[:3, 3] = D[3, :3] = B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]
-    D[3, 3] = np.trace(B)
-    values, vectors = np.linalg.eigh(total * np.eye(4) - 2 * D)
-    return matrix_from_quaternion(vectors[:, 0]), max(float(values[0]), 0.0)
+    trace = np.trace(B, axis1=-2, axis2=-1)
+    twist = B.swapaxes(-1, -2) - B
+    D = np.empty((*trace.shape, 4, 4))
+    D[..., :3, :3] = B + B.swapaxes(-1, -2) - trace[..., None, None] * np.eye(3)
+    D[..., :3, 3] = D[..., 3, :3] = twist[..., [1, 2, 0], [2, 0, 1]]
+    D[..., 3, 3] = trace
+    values, vectors = np.linalg.eigh(np.multiply.outer(total, np.eye(4)) - 2 * D)
+    return matrix_from_quaternion(vectors[..., 0]), np.maximum(values[..., 0], 0.0)

@@ -24,12 +24,12 @@ from typing import NamedTuple
 
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.estimation.filter import Filters, of_heading
-from ins_align.estimation.moments import AttitudeMoments
+from ins_align.estimation.moments import solve_moments
 from ins_align.estimation.receiver import LEAST_NOISE, LOUD, MOVING, QUIET
 from ins_align.estimation.states import FIRST, PHI, PHI0, RHO, triads, XI
 from ins_align.estimation.track import InertialTrack
 from ins_align.geometry.rotation import (
-    apply, Array, cross, cumulative_rotations, exp_so3, Index, log_so3, skew)
+    apply, Array, cross, cumulative_rotations, exp_so3, log_so3, skew)
 from ins_align.gnss.messages import AntennaEpoch, velocities_of
 from ins_align.imu.preintegration import Intervals
 import numpy as np
@@ -130,13 +130,15 @@ class Start:
         use &= variance <= UNCERTAIN ** 2 * np.min(variance[use], initial=np.inf)
         if np.count_nonzero(use) < FIRST_EPOCHS + kind or (kind and not use_position):
             return None
-        time, s, a = self._pairs(kind)
+        time, pairs = self._pairs(kind)
         places = np.flatnonzero(use)
         while True:
-            C, residual, moments = _solved(s, a, time, places, kind)
+            used = pairs[places]
+            total = used.T @ used
+            C, residual, moments = solve_moments(total)
             usual = float(np.mean(variance[places]))
             rows = 3 * (len(places) - 2 - kind)
-            noise = residual / (rows * usual)
+            noise = float(residual) / (rows * usual)
             values, vectors = np.linalg.eigh(moments)
             states = [epochs[k].stated[kind] for k in places]
             stated = any(states)
@@ -155,11 +157,10 @@ class Start:
                 if noise > OUTLYING:                # they do not show which is the outlier
                     return None
                 break
-            left = [_solved(s, a, time, np.delete(places, i), kind)[1]
-                    for i in range(len(places))]
-            if (residual - min(left)) * (rows - 3) <= 3 * OUTLYING * min(left):
+            left = solve_moments(total - used[:, :, None] * used[:, None])[1]   # without each
+            if (residual - left.min()) * (rows - 3) <= 3 * OUTLYING * left.min():
                 break
-            places = np.delete(places, int(np.argmin(left)))
+            places = np.delete(places, np.argmin(left))
         if not enough:
             return None
         for k in np.setdiff1d(np.flatnonzero(use), places).tolist():
@@ -183,8 +184,8 @@ class Start:
         words = UNFIT if seconds >= STUCK_SECONDS else TOO_NOISY if measured >= MAX_WAITING else ''
         return words.format(seconds=seconds, epochs=measured)
 
-    def _pairs(self, kind: int) -> tuple[Array, Array, Array]:
-        """Return times, s and a of the formula with a free start, for all epochs."""
+    def _pairs(self, kind: int) -> tuple[Array, Array]:
+        """Return times, and rows of s, a, 1 and for positions time, for all epochs."""
         epochs, imu, first = self.epochs, self.imu, self.epochs[0]
         track = InertialTrack.start(first.latitude, first.longitude, first.altitude).along(
             epochs, first.stamp_ns)
@@ -193,9 +194,12 @@ class Start:
         v = np.cumsum(steps, axis=0)
         if kind:
             p = np.cumsum(imu.duration[:, None] * (v - steps) + apply(C[:-1], imu.p), axis=0)
-            return track.time, track.s_p, p + C[1:] @ self._lever
-        swing = cross(imu.omega, np.broadcast_to(self._lever, imu.omega.shape))
-        return track.time, track.s_v(velocities_of(epochs)), v + apply(C[1:], swing)
+            s, a = track.s_p, p + C[1:] @ self._lever
+        else:
+            swing = cross(imu.omega, np.broadcast_to(self._lever, imu.omega.shape))
+            s, a = track.s_v(velocities_of(epochs)), v + apply(C[1:], swing)
+        start = np.vander(track.time, 1 + kind, increasing=True)
+        return track.time, np.hstack([s, a, start])
 
     def _variance(self, kind: int) -> Array:
         """
@@ -296,12 +300,3 @@ def redraw_headings(filters: Filters) -> None:
 
 def _measured(epoch: AntennaEpoch) -> bool:
     return epoch.v_n is not None or epoch.position_measured
-
-
-def _solved(s: Array, a: Array, time: Array, places: Index,
-            kind: int) -> tuple[Array, float, Array]:
-    """Solve ``s = (free start) + C a`` for some epochs; see `AttitudeMoments.solve`."""
-    moments = AttitudeMoments(1 + kind)
-    for k in places.tolist():
-        moments.add(s[k], a[k], (1.0, time[k])[:1 + kind])
-    return moments.solve()
