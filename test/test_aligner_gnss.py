@@ -400,6 +400,21 @@ def test_velocity_in_the_other_frame_is_a_fault_with_the_cure():
     assert 'velocity_frame' in aligner.status().reason
 
 
+def test_a_velocity_in_the_other_frame_is_no_fault_once_velocities_have_ended():
+    """Positions go on; the fault is there again as soon as velocities are."""
+    s = simulated('car', imu_grade='mems', duration=180.0, seed=1, velocity_frame='ned',
+                  position_std=0.05)
+    seconds = (s.gnss_stamps_ns - s.gnss_stamps_ns[0]) * 1e-9
+    silent = (seconds > 50.0) & (seconds < 160.0)
+    epochs = give_all(Aligner(config_for(s)), s, change=lambda k, kind, message: (
+        None if kind == 'velocity' and silent[k] else message))
+    before, epoch, after = (next(epoch for epoch in epochs if epoch.t_s > time)
+                            for time in (49.0, 155.0, 160.0))
+    assert before.state is after.state is State.FAULT
+    assert epoch.state is State.ALIGNED
+    assert normalised_error(epoch.current, s) < chi2.ppf(0.9999, 3)
+
+
 @pytest.mark.parametrize('frame, state', [('ned', State.FAULT), ('enu', State.LEVELLED)])
 def test_sharp_positions_show_the_frame_of_a_slow_robot_within_seconds(frame, state):
     s = simulated('robot', imu_grade='mems', duration=20.0, seed=1, position_std=0.02,

@@ -114,7 +114,8 @@ class Antenna:
             self._vertical and (velocity is None or velocity.vertical))
         return AntennaEpoch(message.stamp_ns, *self._place, v_n, velocity_covariance, believed,
                             position_covariance, self.gravity_drift(message.stamp_ns),
-                            fault=self._check.fault, dry=fix is None and velocity is None,
+                            fault='' if self._v_n is None else self._check.fault,
+                            dry=fix is None and velocity is None,
                             stated=(velocity is None or velocity.covariance is not None,
                                     fix is None or fix.covariance is not None))
 
