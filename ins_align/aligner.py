@@ -18,7 +18,7 @@ In step 1 the caller has turned messages into numbers. An epoch is processed whe
 `gnss_lateness` ahead of it, so that results do not depend on when `update` is called.
 """
 
-from collections import Counter
+from collections import Counter, deque
 import dataclasses
 
 from ins_align.config import Config, ConfigError
@@ -43,6 +43,7 @@ DRY_INTERVAL_NS = 2_000_000_000
 # An alignment starts with positions alone if no velocity came for this long after the first (ns).
 NO_VELOCITY_NS = 2_000_000_000
 MAX_WARNINGS = 100      # different texts about messages that could not be used
+MAX_EVENTS = 1000       # the latest, kept for `Aligner.take_events`
 # Why messages were left out, by the ending of the name of their count.
 _LEFT_OUT = {'no_fix': 'without a fix', 'undecodable': 'that cannot be decoded',
              'nan': 'without numbers or with impossible ones',
@@ -66,7 +67,7 @@ class Aligner:
         self._base = base
         # Messages and epochs, by outcome; the epochs of the present alignment are in its method.
         self._counts = Counter(dict.fromkeys((*REJECTED, 'epochs_used', 'rebases'), 0))
-        self._events: list[Event] = []
+        self._events: deque[Event] = deque(maxlen=MAX_EVENTS)
         self._warned: set[str] = set()
         self._done: list[Epoch] = []                # not yet returned by `update`
         self._delay_ns = round(self.config.gnss_delay * 1e9)
@@ -408,8 +409,9 @@ class Aligner:
     # Output
 
     def take_events(self) -> list[Event]:
-        """Return and forget the events since the last call."""
-        events, self._events = self._events, []
+        """Return and forget the events since the last call, at most `MAX_EVENTS`."""
+        events = list(self._events)
+        self._events.clear()
         return events
 
     @property

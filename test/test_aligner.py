@@ -91,6 +91,15 @@ def test_faults_of_velocities_that_are_not_wanted_are_only_counted():
     assert aligner.status().counts['velocity_body_frame'] == 1 and not aligner.take_events()
 
 
+def test_events_that_nobody_takes_are_bounded():
+    aligner = Aligner()
+    for k in range(3000):
+        aligner.reset(f'number {k}')
+    events = aligner.take_events()
+    assert len(events) <= 1000 and events[-1].text == 'alignment starts over: number 2999'
+    assert aligner.take_events() == []
+
+
 @pytest.mark.parametrize('changes', (
     {'use_velocity': True}, {'method': 'vif'}, {'use_position': False}))
 def test_fixes_and_velocities_of_different_epochs_start_together(flight, changes):
