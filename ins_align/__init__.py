@@ -21,7 +21,7 @@ Frames
 ``n``
     Local level at the antenna, east-north-up (ENU).
 ``n0``
-    ``n`` frozen at the start t0; does not rotate.
+    ``n`` frozen at t0, in a bank at a later epoch; does not rotate.
 ``b``
     IMU body frame, forward-left-up (FLU).
 ``b0``
@@ -30,13 +30,13 @@ Frames
 Names
 -----
 ``C_xy`` takes components in y to components in x: ``C_nb`` is the attitude, ``C_n0n`` and
-``C_b0b`` are how far the two frames have turned since t0. A vector carries its frame as a suffix:
-``v_n``, ``f_b``, ``omega_ib_b``, ``lever_b``. Quaternions are (x, y, z, w) with w >= 0. Stamps
-are integer nanoseconds. Attitude errors are small rotations about the axes of ENU (left errors):
-``C_nb = exp_so3(phi) C_nb_estimated``.
+``C_b0b`` are how far the two frames have turned since they were frozen. A vector carries its frame
+as a suffix: ``v_n``, ``f_b``, ``omega_ib_b``, ``lever_b``. Quaternions are (x, y, z, w) with
+w >= 0. Stamps are integer nanoseconds. Attitude errors are small rotations about the axes of ENU
+(left errors): ``C_nb = exp_so3(phi) C_nb_estimated``.
 
-Chain rule: ``C_nb(t) = C_n0n(t)^T C_nb(0) C_b0b(t)``; the unknown is the initial attitude
-``C_nb(0)``.
+Chain rule, with n0 frozen at t0: ``C_nb(t) = C_n0n(t)^T C_nb(0) C_b0b(t)``; the
+unknown is the initial attitude ``C_nb(0)``.
 """
 
 from importlib import import_module

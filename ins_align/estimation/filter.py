@@ -27,6 +27,9 @@ with J the left Jacobian of SO(3) at phi: (phi, xi, rho) is the logarithm of an 
 Biases of the accelerometers turn with the attitude (`states.turned_parameters`). Neither the
 propagation of errors, exact but for noise, nor a measurement's derivative holds an attitude, so
 all means that differ in their heading share one covariance (docs, "Theory").
+
+Arrays are per mean (B), sorted by rival, or per rival (M): X[q], with q = `place`, spreads rivals
+to means, X[lead] takes each rival's likeliest mean; q is a slice when B = M.
 """
 
 from typing import NamedTuple

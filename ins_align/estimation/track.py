@@ -32,14 +32,16 @@ class InertialTrack:
     """
     The navigation side of the formulas in the non-rotating frame n0.
 
+    It starts at the epoch where n0 is frozen: t0, or in a bank the one at which it last anchored.
+
     ``s_p = C_n0e Rz(W t) r_e(t) - int int gravitation`` and its derivative ``s_v`` are the
     integrals of the note: ``s_v - v_n(0)`` is its left side (9), ``s_p - t v_n(0)`` that of the
     position form. Only gravitation is interpolated between epochs, so gaps do no harm. Both are
-    relative to the position at t0, against rounding.
+    relative to the position at the start, against rounding.
     """
 
-    origin: tuple[float, float]  #: latitude and longitude at t0, radians
-    time: Array  #: (...), s since t0
+    origin: tuple[float, float]  #: latitude and longitude at the start, radians
+    time: Array  #: (...), s since the start
     C_n0n: Array  #: (..., 3, 3)
     still_v: Array  #: (..., 3), s_v of an antenna that rests on the Earth here, m/s
     s_p: Array  #: (..., 3), m
@@ -47,12 +49,12 @@ class InertialTrack:
     gravitation: Array
     int_gravitation: Array  #: (..., 3), m/s; and twice, m
     int_int_gravitation: Array
-    origin_r: Array  #: (3,), position and ground velocity at t0
+    origin_r: Array  #: (3,), position and ground velocity at the start
     origin_v: Array
 
     @staticmethod
     def start(latitude: float, longitude: float, altitude: float) -> 'InertialTrack':
-        """Start at t0, with the antenna there: radians and metres."""
+        """Freeze n0, with the antenna there: radians and metres."""
         zero = np.zeros(3)
         return InertialTrack(
             (latitude, longitude), np.zeros(()), np.eye(3), zero, zero,
@@ -67,7 +69,7 @@ class InertialTrack:
         Parameters
         ----------
         time : ndarray, shape (K,)
-            Seconds since t0, increasing.
+            Seconds since the start, increasing.
         latitude, longitude, altitude : ndarray, shape (K,)
             Of the antenna, radians and metres.
 
@@ -99,10 +101,10 @@ class InertialTrack:
             seen(gravity_here), gravitation, int_gravitation, int_int_gravitation,
             self.origin_r, self.origin_v)
 
-    def along(self, epochs: Sequence[AntennaEpoch], t0_ns: int) -> 'InertialTrack':
-        """Follow the antenna through GNSS epochs; `t0_ns` is the stamp of t0."""
+    def along(self, epochs: Sequence[AntennaEpoch], n0_ns: int) -> 'InertialTrack':
+        """Follow the antenna through GNSS epochs; `n0_ns` is the stamp at which n0 was frozen."""
         return self.extended(
-            np.array([epoch.stamp_ns - t0_ns for epoch in epochs]) * 1e-9,
+            np.array([epoch.stamp_ns - n0_ns for epoch in epochs]) * 1e-9,
             *(np.array([getattr(epoch, name) for epoch in epochs])
               for name in ('latitude', 'longitude', 'altitude')))
 

@@ -165,7 +165,7 @@ def epoch_rows() -> list[JsonDict]:
             pages = int(Path('/proc/self/statm').read_text().split()[1])
             resident.append(pages * resource.getpagesize() / 2 ** 20)
             start = time.process_time()
-    return [row(f'GNSS epoch of the estimator, {len(times)}: longest; median', max(times),
+    return [row(f'epoch with velocity at 5 Hz, {len(times)}: longest; median', max(times),
                 statistics.median(times), 'ms', 'longest 20 ms'),
             row(f'memory after {EPOCH_SECONDS / 60:g} min; after a tenth of them',
                 resident[-1], resident[len(resident) // 10], 'MB')]

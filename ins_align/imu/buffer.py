@@ -79,8 +79,8 @@ class ImuBuffer:
         # Stamps and samples, one or many at a time, that are not sorted into these yet.
         self._new: list[tuple[ArrayLike, ArrayLike]] = []
         self.newest_ns: int | None = None           # stamp of the newest sample accepted
-        # They wait until later ones show whether the clock has changed: a sample far ahead of the
-        # newest, or some in a row behind it.
+        # Either one sample far ahead of the newest or several in a row behind it, which wait until
+        # later ones show whether the clock has changed.
         self.held: list[tuple[int, tuple[float, ...]]] = []
         # Samples up to here have been cut; those that arrive after that are late.
         self.used_ns = -(1 << 62)
@@ -96,7 +96,7 @@ class ImuBuffer:
             self._append(sample)
             return True
         if self.held and self.held[0][0] > self.newest_ns:
-            ahead = self.held.pop()
+            ahead = self.held.pop()             # the only one
             if stamp_ns >= ahead[0] - self._lateness_ns:
                 self._append(ahead)             # samples go on from there
             else:
