@@ -168,7 +168,7 @@ def test_api_page_has_every_module():
 def test_constants_are_those_of_their_page():
     """All numbers of the estimation; places in arrays, sentences and tables are none."""
     others = set('LEVER_ARM DELAY GYRO MOUNT DRIFT OF_VEHICLE NO_INNOVATION NOT_USED TOO_NOISY '
-                 'UNFIT UNCONFIRMED AMBIGUOUS LEVELS SIGNS CERTAIN REJECTED'.split())
+                 'UNFIT UNCONFIRMED AMBIGUOUS LEVELS SIGNS GRADE CERTAIN REJECTED'.split())
     written, found = {}, {}
     for row in re.findall(r'^\| (`.*?`) \| (`.*?`) \|', read('docs/constants.md'), re.MULTILINE):
         names, values = (re.findall('`(.*?)`', cell) for cell in row)

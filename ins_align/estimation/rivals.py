@@ -95,7 +95,9 @@ class Rival:
 
 # Levels: factors on the biases of gyros and accelerometers, and log prior; the first level is the
 # configuration. Scale factors and misalignment are at most so many times larger. The last level is
-# also at least as bad as the next worse preset: `mems`, or `chip` for MEMS.
+# also at least as bad as the next worse preset: `mems`, or `chip` for MEMS. Where an IMU of
+# navigation grade is configured a MEMS IMU is a contradiction: its biases would explain a velocity
+# in another frame as well.
 WORSE = ((1, 1, 0), (1, 3, -3), (1, 10, -5), (3, 1, -5.5), (10, 1, -11), (10, 10, -16))
 WORSE_SCALE = 3.0
 LEVELS = tuple(Rival(gyro=gyro, accel=accel, prior=prior) for gyro, accel, prior in WORSE)
@@ -107,6 +109,7 @@ SIGNS = (
     Rival('the angular rate about x reversed', signs=(-1.0, 1.0, 1.0, 1.0)),
     Rival('the angular rate about y reversed', signs=(1.0, -1.0, 1.0, 1.0)),
     Rival('the angular rate about z reversed', signs=(1.0, 1.0, -1.0, 1.0)))
+GRADE = Rival('errors as large as those of a MEMS IMU', grade='mems', prior=-6.0)
 # Levels for a parameter that is configured with a smaller sigma (SI) than this.
 CERTAIN = (
     ('lever_arm_std', 0.3, Rival(lever_arm_std=2.0, prior=-6.0, remark=(
@@ -119,11 +122,13 @@ CERTAIN = (
 
 def rivals_of(config: Config) -> tuple[Rival, ...]:
     """Return the rivals of a configuration, which itself comes first."""
-    worse = next((grade for grade in ('mems', 'chip')
-                  if PRESETS[grade].gyro_bias_std > config.imu_noise.gyro_bias_std), '')
+    bias = config.imu_noise.gyro_bias_std
+    precise = bias < 0.5 * PRESETS['tactical'].gyro_bias_std
+    worse = '' if precise else next(
+        (grade for grade in ('mems', 'chip') if PRESETS[grade].gyro_bias_std > bias), '')
     levels = (*LEVELS[:-1], replace(LEVELS[-1], grade=worse),
               *(level for name, std, level in CERTAIN if getattr(config, name) < std))
-    rivals = (*levels, *(() if config.trust_imu_axes else SIGNS))
+    rivals = (*levels, *(() if config.trust_imu_axes else SIGNS), *((GRADE,) if precise else ()))
     if config.vehicle == 'none':
         return rivals
     return (*(replace(rival, along=1) for rival in rivals),
@@ -199,14 +204,15 @@ class Rivals:
         worst = int(np.argmax(ahead))
         if ahead[worst] <= -MARGIN:
             return '', False
+        rival = self.table[filters.ids[worst]]
+        what, known = (('imu_grade', 'imu_grade is') if rival.grade
+                       else ('the IMU axes', 'the signs of the IMU axes are'))
         # The prior of a bad IMU must not make a wrong configuration likely: before it is called
         # wrong, the rival has to fit better than each level does without its prior.
         fits = np.max((level - self.prior[filters.ids])[filters.counts])
         if level[worst] - fits > MARGIN:
-            rival = self.table[filters.ids[worst]]
-            return f'the data fit better with {rival.wrong}: check the IMU axes', True
-        return ('the signs of the IMU axes are not confirmed by the motion yet: turn and change '
-                'speed'), False
+            return f'the data fit better with {rival.wrong}: check {what}', True
+        return f'{known} not confirmed by the motion yet: turn and change speed', False
 
 
 @dataclass
