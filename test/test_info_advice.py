@@ -19,7 +19,7 @@ import re
 import shlex
 
 from ins_align.cli import main
-from ins_align.config import PRESETS
+from ins_align.config import Config
 from ins_align.estimation.rivals import level_in_words, Rival
 from ins_align.estimation.states import biases, GYRO
 from ins_align.recordings.info import describe, inspect
@@ -238,14 +238,14 @@ def test_a_level_names_the_setting_that_a_bias_asks_for(gyro_bias, accel_bias):
     gyro, accel = biases(x.size)
     x[gyro], x[accel] = [0.0, -np.radians(gyro_bias), 0.0], [accel_bias, 0.0, 0.0]
     P = np.radians(0.01) ** 2 * np.eye(x.size)
-    said = level_in_words(Rival(gyro=3.0), PRESETS['mems'], x, P)
+    said = level_in_words(Rival(gyro=3.0), Config(), x, P)
     assert ('gyro_bias_std=0.8' in said) == (gyro_bias == 0.8)
     assert ('accel_bias_std=0.3' in said) == (accel_bias == 0.3)
     assert ('gyros look worse' in said) != ('_std=' in said)
-    assert level_in_words(Rival(), PRESETS['mems'], x, P) == ''
-    assert '_std=' not in level_in_words(Rival(gyro=3.0), PRESETS['mems'], 100.0 * x, P)
+    assert level_in_words(Rival(), Config(), x, P) == ''
+    assert '_std=' not in level_in_words(Rival(gyro=3.0), Config(), 100.0 * x, P)
     hardly_known = np.diag(0.25 * x ** 2)
-    assert '_std=' not in level_in_words(Rival(gyro=3.0), PRESETS['mems'], x, hardly_known)
+    assert '_std=' not in level_in_words(Rival(gyro=3.0), Config(), x, hardly_known)
 
 
 def test_both_biases_beyond_the_default_are_another_grade(tmp_path):

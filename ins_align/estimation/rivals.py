@@ -48,8 +48,8 @@ ALIKE = 2.0
 # shows the signs of two gyros.
 HARMLESS = 1.0
 # A setting is named for a bias that is so many times its configured sigma, less so many of its
-# own sigmas, and not beyond so many sigmas of its level: then something else is wrong.
-LARGE_BIAS, SURELY, NO_BIAS = 2.0, 2.0, 4.0
+# own sigmas, and not beyond the last, 4 sigmas of ten times the bias: otherwise it is no bias.
+LARGE_BIAS, SURELY, NO_BIAS = 2.0, 2.0, 40.0
 # Sigma of the velocity of a vehicle sideways and upwards that lasts (m/s: slip of tyres, leeway
 # and current, wind); it changes by its sigma in this time (s), as the wind does for an aeroplane
 # that turns.
@@ -282,13 +282,12 @@ def level_in_words(level: Rival, config: Config, x: Array, P: Array) -> str:
         return ''
     noise, std = config.imu_noise, np.sqrt(np.diag(P))
     settings = []
-    for name, places, configured, sigma, unit in zip(
+    for name, places, configured, unit in zip(
             ('gyro_bias_std', 'accel_bias_std'), biases(x.size),
-            (noise.gyro_bias_std, noise.accel_bias_std), level.sigmas(noise),
-            (math.degrees(1.0), 1.0)):
+            (noise.gyro_bias_std, noise.accel_bias_std), (math.degrees(1.0), 1.0)):
         found = np.abs(x[places])
         if (np.any(found - SURELY * std[places] > LARGE_BIAS * configured)
-                and found.max() < NO_BIAS * sigma):
+                and found.max() < NO_BIAS * configured):
             settings.append(f'{name}={unit * found.max():.2g}')
     if level.grade and settings:
         settings = [f'imu_grade={level.grade}']
