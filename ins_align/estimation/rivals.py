@@ -123,7 +123,7 @@ CERTAIN = (
 def rivals_of(config: Config) -> tuple[Rival, ...]:
     """Return the rivals of a configuration, which itself comes first."""
     bias = config.imu_noise.gyro_bias_std
-    precise = bias < 0.5 * PRESETS['tactical'].gyro_bias_std
+    precise = bias < 0.5 * PRESETS['tactical'].gyro_bias_std    # clearly better than tactical
     worse = '' if precise else next(
         (grade for grade in ('mems', 'chip') if PRESETS[grade].gyro_bias_std > bias), '')
     levels = (*LEVELS[:-1], replace(LEVELS[-1], grade=worse),
