@@ -26,7 +26,9 @@ import numpy as np
 ROUNDING = 1e-6  # m: smaller differences between lever arms are rounding
 # Fixed transforms are published once and kept for late subscribers, so they arrive about when the
 # first sensor messages do.
-WAIT = 2.0  # s, for an optional transform, after both sensors have sent messages
+# s, for an optional transform, after both sensors have sent messages, and until it is looked up
+# again: it may come much later, as from a driver that starts last.
+WAIT = 2.0
 MAX_HELD = 4000  # messages
 
 # Returns the transform from a source frame to a target frame (target, source), None if unknown.
@@ -147,6 +149,7 @@ class MountingSearch:
         self.mounting: Mounting | None = None
         self.waits_for = 'a message of the IMU and a position' if self._required else ''
         self._since: float | None = None
+        self._again = 0.0  # when to look for what is missing, s
         self._imu_frame: str | None = None
         self.forget()
 
@@ -162,10 +165,11 @@ class MountingSearch:
 
         Items are messages and requests (which are callable) with the time when they came, ns; IMU
         samples have a `frame_id`; `other_frames` are those of IMUs that are not aligned. Messages
-        are kept during the search. At its end all of them are returned, if they had to wait or the
-        lever arm has changed. `now` is in seconds.
+        are kept for `WAIT`, or until a transform that is required is there. Then all of them are
+        returned, if they had to wait or the lever arm has changed. `now` is in seconds.
         """
-        if self.mounting is not None:
+        before = self.mounting
+        if before is not None and (before.complete or now < self._again):
             return items, None
         self._imu_frame = next((item.frame_id for _, item in reversed(items)
                                 if getattr(item, 'frame_id', None) not in (None, *other_frames)),
@@ -174,6 +178,9 @@ class MountingSearch:
         if self.mounting is None:
             self._held.extend(item for item in items if not callable(item[1]))
             return [item for item in items if not self._required or callable(item[1])], None
+        self._again = now + WAIT
+        if before is not None and not self.mounting.complete:
+            return items, None
         self.waits_for = ''
         anew = self._required or self.mounting.config.lever_arm != self._lever_arm
         self._lever_arm = self.mounting.config.lever_arm
@@ -192,5 +199,9 @@ class MountingSearch:
         if found.missing:
             self.waits_for = f'the transform {" and that ".join(found.missing)}'
         elif found.complete or now - self._since >= WAIT:
+            if not found.complete and self._config.lever_arm == Config.lever_arm:
+                found = found._replace(words=[*found.words, Event(Severity.INFO, (
+                    f'TF has no transform from the antenna ({self.antenna_frame!r}) to the IMU '
+                    f'({self._imu_frame!r}) yet: lever_arm [0, 0, 0] m is used until it has'))])
             return found
         return None

@@ -92,6 +92,23 @@ def test_messages_from_before_the_transform_are_aligned_with_it():
     assert items == [SAMPLE, FIX] and mounting.config.lever_arm == (0.0, 0.0, 0.0)
 
 
+def test_a_transform_that_comes_late_is_used():
+    translations = {}
+    auto = search(translations)
+    assert auto.take([SAMPLE, FIX], 0.0) == ([SAMPLE, FIX], None)
+    items, mounting = auto.take([SAMPLE], 2.5)
+    said, = mounting.words
+    assert "no transform from the antenna ('gnss') to the IMU ('imu') yet" in said.text
+    for now in (3.0, 5.0, 60.0):
+        assert auto.take([SAMPLE], now) == ([SAMPLE], None)
+    translations['gnss'] = LEVER_ARM
+    items, mounting = auto.take([FIX], 63.0)
+    assert items == [FIX] and mounting.config.lever_arm == (1.0, 2.0, 3.0)
+    said, = mounting.words
+    assert 'lever arm from TF: [1, 2, 3] m' in said.text
+    assert auto.take([SAMPLE], 90.0) == ([SAMPLE], None)
+
+
 def test_what_is_wanted_is_waited_for_and_named():
     translations = {'gnss': LEVER_ARM}
     wanted = search(translations, lever_arm_from_tf=True, base_frame='base_link')
