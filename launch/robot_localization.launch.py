@@ -21,7 +21,8 @@ where the vehicle was aligned, on /odometry/filtered and as the transform odom -
     ros2 launch ins_align robot_localization.launch.py params_file:=my_robot.yaml
 
 All nodes may start at once: before the alignment there is no message on ~/imu, and both nodes of
-robot_localization wait for the first one. navsat_transform_node keeps the heading of that message.
+robot_localization wait for the first one. navsat_transform_node keeps the heading of the last
+message before it computes its transform.
 """
 
 from launch import LaunchDescription
@@ -43,7 +44,7 @@ NAVSAT_TRANSFORM = {
     # The yaw of ~/imu is 0 facing east and grows to the left (REP-103), as this node wants it.
     # pi/2, the value in many examples, is for compasses that read 0 facing north.
     'yaw_offset': 0.0,
-    # Take the heading from the IMU: the odometry needs the output of this node first.
+    # Take the heading from the IMU, which has it before the odometry has.
     'use_odometry_yaw': False,
     'wait_for_datum': False,
     'zero_altitude': False,
