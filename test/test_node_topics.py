@@ -136,6 +136,16 @@ def test_what_is_missing_is_said_in_the_log_with_the_names_of_its_namespace():
             'lever_arm (1.0, 2.0, 3.0), imu_grade tactical' in node.output)
 
 
+def test_a_topic_with_two_publishers_is_named():
+    with Listener() as listener, running_node([]):
+        one, other = (listener.node.create_publisher(Imu, '/imu/data_raw', 10) for _ in range(2))
+        listener.wait_for(lambda: '/imu/data_raw has 2 publishers: it must have one'
+                          in listener.status.get('reason', ''))
+        listener.node.destroy_publisher(other)
+        listener.wait_for(lambda: 'publishers' not in listener.status['reason'])
+        listener.node.destroy_publisher(one)
+
+
 def test_wrong_units_and_late_messages_are_said_as_replay_says_them(tmp_path):
     simulation = simulate('car', seed=1, duration=40.0, stand_still=5.0, imu_grade='tactical')
     simulation = replace(simulation, gyro=np.degrees(simulation.gyro),

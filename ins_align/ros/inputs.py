@@ -165,9 +165,12 @@ def topic_faults(node: Node, inputs: Mapping[str, str], expected: Sequence[str])
     """
     for topic, wanted in inputs.items():
         name = node.resolve_topic_name(topic)
-        types = {info.topic_type for info in node.get_publishers_info_by_topic(topic)}
+        publishers = node.get_publishers_info_by_topic(topic)
+        types = {info.topic_type for info in publishers}
         if not types and topic in expected:
             yield f'nobody publishes {name}'
+        if len(publishers) > 1:
+            yield f'{name} has {len(publishers)} publishers: it must have one'
         if not types or wanted in types:
             continue
         other = min(types)
