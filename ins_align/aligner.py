@@ -21,6 +21,7 @@ In step 1 the caller has turned messages into numbers. An epoch is processed whe
 from collections import Counter, deque
 import dataclasses
 
+from ins_align.checks import InputChecks
 from ins_align.config import Config, ConfigError
 from ins_align.estimation.bank import Bank, Learnt, REJECTED
 from ins_align.estimation.declaration import Declaration, Fit
@@ -78,7 +79,9 @@ class Aligner:
     def _forget_all(self) -> None:
         """Drop the queues and all that was learnt; counts, events and finished epochs stay."""
         lateness_ns = round(self.config.gnss_lateness * 1e9) + max(self._delay_ns, 0)
-        self._imu = ImuBuffer(lateness_ns, self._counts, self.config.imu_noise)
+        self._checks = InputChecks(self.config)
+        self._imu = ImuBuffer(lateness_ns, self._counts, self.config.imu_noise,
+                              self._checks.add_imu)
         self._gnss = GnssBuffer(lateness_ns, self._counts, max(-self._delay_ns, 0))
         self._refusal = ''                          # why the last velocity could not be used
         self._first_t0_ns: int | None = None
@@ -137,7 +140,7 @@ class Aligner:
 
     def add_fix(self, fix: Fix) -> None:
         """Take a GNSS position."""
-        self._gnss.add(fix._replace(stamp_ns=fix.stamp_ns - self._delay_ns), self._imu.newest_ns)
+        self._add_gnss(fix)
 
     def add_velocity(self, velocity: Velocity) -> None:
         """Take a GNSS velocity."""
@@ -145,8 +148,12 @@ class Aligner:
         if self.config.use_velocity is False:
             self._counts['velocity'] += 1
             return
-        self._gnss.add(velocity._replace(stamp_ns=velocity.stamp_ns - self._delay_ns),
-                       self._imu.newest_ns)
+        self._add_gnss(velocity)
+
+    def _add_gnss(self, message: Fix | Velocity) -> None:
+        message = message._replace(stamp_ns=message.stamp_ns - self._delay_ns)
+        self._checks.add_gnss(message, self._imu.newest_ns)
+        self._gnss.add(message, self._imu.newest_ns)
 
     def reject(self, reason: str, why: str = '') -> None:
         """Count a message that the caller could not use; `why`, in words, is an event once."""
@@ -454,10 +461,17 @@ class Aligner:
         return counts
 
     def status(self) -> Status:
-        """Return the state, the reason for it, the estimates and the counts."""
+        """
+        Return the state, the reason for it, the estimates and the counts.
+
+        While nothing is ALIGNED, it is a FAULT if units or coordinates are found to be wrong.
+        """
         method = self._method
         nuisance = Nuisance.configured(self.config) if method is None else method.nuisance()
-        return Status(**vars(nuisance), **vars(self._verdict), stamp_ns=self._last_ns,
+        verdict = self._verdict
+        if verdict.state is not State.ALIGNED:
+            verdict = self._checks.judge(verdict)
+        return Status(**vars(nuisance), **vars(verdict), stamp_ns=self._last_ns,
                       t0_ns=None if method is None else method.t0_ns, initial=self._initial,
                       current=self._current, time_to_align_s=self._time_to_align_s,
                       counts=dict(self.counts))

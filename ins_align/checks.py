@@ -16,18 +16,18 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Sequence
 from dataclasses import fields, replace
 import math
 
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, Index
+from ins_align.gnss.buffer import MAX_AHEAD_NS
 from ins_align.gnss.messages import Fix, numbers_of, usable, Velocity
 from ins_align.gnss.motion import (
-    differences, EMPTY, GRID, on_grid, Series, series_of, track, velocity_frame,
-    velocity_from_positions, VelocityFrame, without_wild_positions)
+    GRID, on_grid, Series, series_of_rows, track, velocity_frame, velocity_from_positions,
+    VelocityFrame, without_wild_positions)
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE
-from ins_align.results import State, Status
+from ins_align.results import State, Verdict
 import numpy as np
 
 ANY_GYRO_RATE = 70.0  # rad/s: usual gyroscopes measure at most 4000 deg/s, which is less
@@ -129,68 +129,55 @@ def lateness_advice(lateness: float, delay: float = 0.0) -> tuple[str, str]:
 
 
 class InputChecks:
-    """Checks messages as they arrive, in bounded memory."""
+    """Checks messages of one clock as they arrive, in bounded memory."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._delay = min(config.gnss_delay, 0.0)  # a delay above 0 adds to gnss_lateness
         self._cells: dict[int, Array] = {}  # count, sums of rate and specific force, (7,)
         self._samples = self._too_fast = self._beyond_the_poles = 0
-        self._newest_ns: Index = np.zeros(0, np.int64)  # IMU stamp, shape (1,) once there is one
         self._late: deque[float] = deque(maxlen=10 * MIN_LATE)
         self._fixes: deque[tuple[float, ...]] = deque(maxlen=GNSS_MESSAGES)
         self._velocities: deque[tuple[float, ...]] = deque(maxlen=GNSS_MESSAGES)
 
-    def add(self, stamps_ns: Index, gyro: Array, accel: Array,
-            gnss: Sequence[tuple[int, Fix | Velocity]]) -> None:
-        """
-        Take consecutive messages.
+    def add_gnss(self, message: Fix | Velocity, imu_newest_ns: int | None) -> None:
+        """Take a message, its stamp less gnss_delay, and the stamp of the newest IMU sample."""
+        behind_ns = 0 if imu_newest_ns is None else imu_newest_ns - message.stamp_ns
+        late = behind_ns * 1e-9 - max(self._config.gnss_delay, 0.0)
+        self._late.append(late)
+        message, fault = usable(message)
+        numbers = numbers_of(message)
+        if -behind_ns > MAX_AHEAD_NS:
+            return  # of another clock
+        if not fault:
+            rows = self._velocities if isinstance(message, Velocity) else self._fixes
+            rows.append((message.stamp_ns * 1e-9, *numbers))
+        elif isinstance(message, Fix) and beyond_the_poles(*numbers[:2]):
+            self._beyond_the_poles += 1
 
-        IMU samples as sent are stamps, ns, shape (N,), rates, rad/s, and specific forces, m/s^2,
-        shape (N, 3). Each GNSS message comes with the number of these samples before it.
-        """
-        newest = np.maximum.accumulate(np.concatenate([self._newest_ns, stamps_ns]))
-        for count, message in gnss:
-            if place := count + self._newest_ns.size:
-                self._late.append(
-                    (int(newest[place - 1]) - message.stamp_ns) * 1e-9 + self._delay)
-            message, fault = usable(message)
-            numbers = numbers_of(message)
-            if not fault:
-                rows = self._velocities if isinstance(message, Velocity) else self._fixes
-                rows.append((message.stamp_ns * 1e-9, *numbers))
-            elif isinstance(message, Fix) and beyond_the_poles(*numbers[:2]):
-                self._beyond_the_poles += 1
-        if stamps_ns.size:
-            # Not the newest of all: the IMU's clock may have been set back.
-            self._newest_ns = stamps_ns.max(keepdims=True)
-            self._add_imu(stamps_ns, gyro, accel)
-
-    def _add_imu(self, stamps_ns: Index, gyro: Array, accel: Array) -> None:
-        rates = np.abs(gyro).max(axis=1)
+    def add_imu(self, stamps_ns: Index, samples: Array) -> None:
+        """Take samples as sent: stamps, ns, (N,); rates and forces, rad/s, m/s^2, (N, 6)."""
+        rates, forces = np.abs(samples).reshape(-1, 2, 3).max(axis=2).T
         self._samples += stamps_ns.size
         self._too_fast += np.count_nonzero(rates > ANY_GYRO_RATE)
-        good = (rates < 60.0 * MAX_RATE) & (np.abs(accel).max(axis=1) < MAX_ACCELERATION)
+        good = (rates < 60.0 * MAX_RATE) & (forces < MAX_ACCELERATION)
         index, place = np.unique((stamps_ns[good] * 1e-9 / GRID).astype(np.int64),
                                  return_inverse=True)
         sums = np.zeros((index.size, 7))
-        np.add.at(sums, place, np.column_stack([np.ones(place.size), gyro[good], accel[good]]))
+        np.add.at(sums, place, np.column_stack([np.ones(place.size), samples[good]]))
         for cell, row in zip(index.tolist(), sums):
             self._cells[cell] = self._cells.get(cell, 0.0) + row
         while len(self._cells) > CELLS:
             del self._cells[next(iter(self._cells))]
 
-    def judge(self, status: Status) -> Status:
-        """Return a status with what is wrong, faults first; an ALIGNED one is not changed."""
-        if status.state is State.ALIGNED:
-            return status
+    def judge(self, verdict: Verdict) -> Verdict:
+        """Return a verdict with what is wrong, faults first."""
         if faults := self.faults():
-            status = replace(status, state=State.FAULT, reason='; '.join(faults))
-        return replace(status, reason='; '.join([status.reason, *self.late_messages()]))
+            verdict = Verdict(State.FAULT, '; '.join(faults))
+        return replace(verdict, reason='; '.join([verdict.reason, *self.late_messages()]))
 
     def faults(self) -> list[str]:
         """Return a sentence for each fault of units or coordinates."""
-        fixes, velocities = map(_series, (self._fixes, self._velocities))
+        fixes, velocities = map(series_of_rows, (self._fixes, self._velocities))
         motion = on_grid(velocities) if velocities.times.size > 1 else velocity_from_positions(
             track(fixes))
         cells = sorted(self._cells)
@@ -198,24 +185,15 @@ class InputChecks:
         degrees = degrees_fault(
             self._too_fast > TOO_FAST_SHARE * self._samples, (np.array(cells) + 0.5) * GRID,
             *np.split(sums[:, 1:] / sums[:, :1], 2, axis=1), motion)
-        exchanged = exchange_fault(fixes, velocities) or (
+        # Of late messages, positions and velocities may have different clocks.
+        exchanged = not self.late_messages() and exchange_fault(fixes, velocities) or (
             BEYOND_THE_POLES if self._beyond_the_poles > MIN_LATE else '')
         return [fault for fault in (degrees, exchanged) if fault]
-
-    def velocities(self) -> Series:
-        """Return the latest velocities, ENU, m/s, or those that positions show if none came."""
-        if self._velocities:
-            return _series(self._velocities)
-        return differences(track(_series(self._fixes)))
 
     def late_messages(self) -> list[str]:
         """Return a sentence if GNSS messages come too late, else nothing."""
         late = [lateness for lateness in self._late if lateness > self._config.gnss_lateness]
         if len(late) >= max(MIN_LATE, LATE_SHARE * len(self._late)) and max(late) < MAX_LATENESS:
-            return [lateness_advice(float(np.quantile(late, 0.99)), self._delay)[0]]
+            return [lateness_advice(float(np.quantile(late, 0.99)),
+                                    min(self._config.gnss_delay, 0.0))[0]]
         return []
-
-
-def _series(rows: Collection[tuple[float, ...]]) -> Series:
-    """Return a series of rows that begin with the time."""
-    return series_of(*np.split(np.array(rows), [1], axis=1)) if rows else EMPTY

@@ -19,12 +19,11 @@ import os
 from typing import Any
 
 from ins_align.aligner import Aligner
-from ins_align.checks import InputChecks
 from ins_align.config import Config, config_from_mapping, ConfigError, STANDARD_GRAVITY
 from ins_align.geometry.rotation import Array, Index, Transform
 from ins_align.gnss import messages
-from ins_align.gnss.messages import Fix, usable, Velocity
-from ins_align.gnss.motion import Series, series_of
+from ins_align.gnss.messages import Fix, numbers_of, usable, Velocity
+from ins_align.gnss.motion import differences, series_of, series_of_rows, track
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings.motion_fit import fit_motion, MAX_DELAY_STD
 from ins_align.results import Epoch, in_order_of_time, Reference, Result, State
@@ -45,7 +44,6 @@ class _Run:
     def __init__(self, config: Config, base: Transform | None = None) -> None:
         self._config = config
         self._aligner = Aligner(config, base)
-        self._checks = InputChecks(config)
         self._epochs: list[Epoch] = []
         self._waiting = 0
 
@@ -77,28 +75,11 @@ class _Run:
                 aligner.add_velocity(message)
             elif message is not None:
                 aligner.reject(*message)
-        self._checks.add(stamps_ns, gyro, accel, [
-            (before, message) for before, message in gnss
-            if isinstance(message, (Fix, Velocity))])
-
-    def other_delay(self, stamps_ns: Index, samples: Array) -> str:
-        """Return in words that the motion shows another GNSS delay, or ''; samples are (N, 6)."""
-        good = np.isfinite(samples).all(axis=1)
-        motion, start = self._checks.velocities(), stamps_ns.min()
-        found = fit_motion(series_of((stamps_ns[good] - start) * 1e-9, samples[good]),
-                           Series(motion.times - start * 1e-9, motion.vectors), STANDARD_GRAVITY)
-        if found.get('gnss_delay_std', MAX_DELAY_STD) >= MAX_DELAY_STD:
-            return ''
-        delay, config = found['gnss_delay'], self._config
-        if abs(delay - config.gnss_delay) < 3.0 * max(config.gnss_delay_std, MAX_DELAY_STD):
-            return ''
-        return (f'the motion fits GNSS stamps that are {delay:.2f} s late: check the clocks, or '
-                f'set gnss_delay={delay:.2f}')
 
     def result(self, **of_recording: Any) -> Result:
         """Process the rest and return the result."""
         self._epochs += self._aligner.flush(dry=True)
-        return Result(config=self._config, status=self._checks.judge(self._aligner.status()),
+        return Result(config=self._config, status=self._aligner.status(),
                       epochs=in_order_of_time(self._epochs), **of_recording)
 
 
@@ -222,10 +203,30 @@ def align(stamps: ArrayLike, gyro: ArrayLike, accel: ArrayLike,
     run.add(stamps_ns, rates, forces, list(zip(before.tolist(), gnss)))
     result = run.result()
     if result.status.state in (State.ALIGNING, State.LEVELLED) and (
-            delay := run.other_delay(stamps_ns, np.hstack([rates, forces]))):
+            delay := _other_delay(stamps_ns, np.hstack([rates, forces]), gnss, settings)):
         result = replace(result, status=replace(
             result.status, reason=f'{delay}; {result.status.reason}'))
     return result
+
+
+def _other_delay(stamps_ns: Index, samples: Array, gnss: Sequence[Fix | Velocity],
+                 config: Config) -> str:
+    """Return in words that the motion shows another GNSS delay, or ''; samples are (N, 6)."""
+    good, start_ns = np.isfinite(samples).all(axis=1), stamps_ns.min()
+    velocities, positions = (series_of_rows(
+        [((message.stamp_ns - start_ns) * 1e-9, *numbers_of(message))
+         for message, fault in map(usable, gnss) if isinstance(message, kind) and not fault])
+        for kind in (Velocity, Fix))
+    motion = velocities if velocities.times.size else differences(track(positions))
+    found = fit_motion(series_of((stamps_ns[good] - start_ns) * 1e-9, samples[good]), motion,
+                       STANDARD_GRAVITY)
+    if found.get('gnss_delay_std', MAX_DELAY_STD) >= MAX_DELAY_STD:
+        return ''
+    delay = found['gnss_delay']
+    if abs(delay - config.gnss_delay) < 3.0 * max(config.gnss_delay_std, MAX_DELAY_STD):
+        return ''
+    return (f'the motion fits GNSS stamps that are {delay:.2f} s late: check the clocks, or '
+            f'set gnss_delay={delay:.2f}')
 
 
 def _numbers(name: str, given: Any) -> Array:

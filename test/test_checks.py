@@ -94,6 +94,15 @@ def test_late_messages_are_those_that_gnss_delay_does_not_explain(drive, behind,
         [list(advice)] if advice else [])
 
 
+@pytest.mark.parametrize('behind', [-18.0, 18.0])
+def test_positions_of_another_clock_are_no_exchanged_ones(behind):
+    flight = simulate('flight', seed=1, duration=60.0, imu_rate=50.0)
+    offset_ns = round(behind * 1e9)
+    positions = dataclasses.replace(flight, gnss_stamps_ns=flight.gnss_stamps_ns - offset_ns)
+    checks = checked(flight, kinds=(Velocity,))
+    assert checked(positions, checks=checks, kinds=(Fix,)).faults() == []
+
+
 def test_nothing_is_said_of_what_is_right(drive):
     checks = checked(drive)
     assert checks.faults() == checks.late_messages() == []
@@ -143,33 +152,33 @@ def test_it_is_found_in_pieces_of_any_size(drive, change, sentence):
 
 
 def test_what_is_no_number_says_nothing():
-    nan, huge = np.full((3, 3), np.nan), np.full((3, 3), 1e300)
+    nan, huge = np.full((3, 6), np.nan), np.full((3, 6), 1e300)
     checks = InputChecks(Config())
     assert checks.faults() == []
     for values in (nan, huge):
-        checks.add(np.arange(3), values, values, [
-            (1, Fix(0, np.nan, np.nan, np.nan, None, 0)), (1, Velocity(0, values[0], None))])
+        checks.add_imu(np.arange(3), values)
+        checks.add_gnss(Fix(0, np.nan, np.nan, np.nan, None, 0), 1)
+        checks.add_gnss(Velocity(0, values[0, :3], None), 1)
     fault, = checks.faults()  # of the huge ones
     assert DEGREES in fault
     nothing = Series(np.zeros(0), np.zeros((0, 3)))
     assert exchange_fault(nothing, nothing) == ''
 
 
-def checked(simulation, samples=500, config=Config()):
+def checked(simulation, samples=500, config=Config(), checks=None, kinds=(Fix, Velocity)):
     """Give the checks a simulation as it arrives, so many samples at a time."""
-    checks = InputChecks(config)
+    checks = checks or InputChecks(config)
     stamps = simulation.imu_stamps_ns
+    values = np.hstack([simulation.gyro, simulation.accel])
+    after = np.searchsorted(stamps, simulation.gnss_arrival_ns)
     for start in range(0, len(stamps), samples):
         part = slice(start, start + samples)
-        begin = stamps[start] if start else -np.inf
-        end = stamps[part.stop] if part.stop < len(stamps) else np.inf
-        arrived = np.flatnonzero((simulation.gnss_arrival_ns >= begin)
-                                 & (simulation.gnss_arrival_ns < end))
-        gnss = []
-        for k in arrived.tolist():
-            before = int(np.searchsorted(stamps[part], simulation.gnss_arrival_ns[k]))
-            stamp = int(simulation.gnss_stamps_ns[k])
-            gnss += [(before, Fix(stamp, *simulation.lla_deg[k].tolist(), None, 0)),
-                     (before, Velocity(stamp, simulation.velocity[k], None))]
-        checks.add(stamps[part], simulation.gyro[part], simulation.accel[part], gnss)
+        for k in np.flatnonzero((after >= start) & (after < part.stop)).tolist():
+            newest = int(stamps[after[k] - 1]) if after[k] else None
+            stamp = int(simulation.gnss_stamps_ns[k] - round(config.gnss_delay * 1e9))
+            for message in (Fix(stamp, *simulation.lla_deg[k].tolist(), None, 0),
+                            Velocity(stamp, simulation.velocity[k], None)):
+                if isinstance(message, kinds):
+                    checks.add_gnss(message, newest)
+        checks.add_imu(stamps[part], values[part])
     return checks

@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 import math
 from typing import NamedTuple
@@ -62,6 +63,11 @@ def series_of(times: Array, vectors: Array) -> Series:
     """Sort vectors, (N, M), by their times, (N,), s; of equal times the first counts."""
     times, first = np.unique(times, return_index=True)
     return Series(times, vectors[first])
+
+
+def series_of_rows(rows: Collection[tuple[float, ...]]) -> Series:
+    """Return a series of rows that begin with the time; it is empty if there are none."""
+    return series_of(*np.split(np.array(rows), [1], axis=1)) if rows else EMPTY
 
 
 def track(positions_deg: Series) -> Series:

@@ -14,7 +14,7 @@
 """The queue of IMU samples: sorted by stamp and cut into steps between GNSS epochs, with noise."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from ins_align.config import ImuNoise
@@ -63,15 +63,17 @@ class ImuBuffer:
     IMU samples that are not integrated yet, sorted by their stamps and counted in `counts`.
 
     Samples may arrive out of order by up to `lateness_ns`. `stated` is the noise that the sensors
-    have at least.
+    have at least. `check` is called with samples as they came, stamps, (N,), and values, (N, 6).
     """
 
     def __init__(self, lateness_ns: int, counts: Counter[str],
-                 stated: ImuNoise = ImuNoise(0.0, 0.0, 0.0, 0.0)) -> None:
+                 stated: ImuNoise = ImuNoise(0.0, 0.0, 0.0, 0.0),
+                 check: Callable[[Index, Array], None] | None = None) -> None:
         self._lateness_ns = lateness_ns
         self._reach_ns = max(lateness_ns, MAX_GAP_NS)
         self._counts = counts
         self._stated = np.array(stated[:2])
+        self._check_sent = check
         # Stamps, (N,), strictly increasing, ns; angular rate, rad/s, and specific force, m/s^2,
         # (N, 6), in Fortran order so that each axis is contiguous.
         self.stamps = np.zeros(0, np.int64)
@@ -146,11 +148,12 @@ class ImuBuffer:
         if len(self.held) < SET_BACK_SAMPLES:
             return False
         # Samples that are only late fill a gap. After a clock was set back there are others of
-        # the same time, with other stamps: equal ones may be of samples that were sent twice.
+        # the same time: equal ones were sent twice.
         self.consolidate()
-        behind = [stamp for stamp, _ in self.held]
-        inside = slice(*np.searchsorted(self.stamps, [behind[0], behind[-1]]))
-        if np.union1d(self.stamps[inside], behind).size > 1.5 * len(behind):
+        behind = np.array([(stamp, *values) for stamp, values in self.held])
+        inside = slice(*np.searchsorted(self.stamps, behind[[0, -1], 0]))
+        present = np.column_stack([self.stamps[inside], self.samples[inside]])
+        if len(np.unique(np.vstack([present, behind]), axis=0)) > 1.5 * len(behind):
             return True
         self._release_held()
         return False
@@ -181,6 +184,8 @@ class ImuBuffer:
         new, self._new = self._new, []
         stamps = np.concatenate([stamps for stamps, _ in new])
         samples = np.asfortranarray(np.concatenate([samples for _, samples in new])).T
+        if self._check_sent is not None:
+            self._check_sent(stamps, samples.T)
         self._counts['imu'] += stamps.size
         with np.errstate(invalid='ignore'):
             good = np.all(np.abs(samples) < _LIMITS, axis=0)

@@ -29,7 +29,6 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Quaternion, QuaternionStamped, Vector3, Vector3Stamped
 from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
-from ins_align.checks import InputChecks
 from ins_align.config import (
     Config, config_from_mapping, ConfigError, listed_choices, NODE_NAME, RCLPY_PARAMETERS,
     without_unknown)
@@ -40,7 +39,6 @@ from ins_align.results import FOR_PLOTS, level_of, Severity, status_values, WARN
 from ins_align.ros.inputs import (
     FIX_TOPIC, Gate, gnss_from_msg, gnss_topics, ImuSample, inputs_in_words, message_class,
     open_static_tf, queued, read_imu, REJECTED_AS, topic_faults, VELOCITY_TOPIC, with_orientation)
-import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
@@ -113,12 +111,14 @@ class AlignmentNode(Node):
     each IMU message at once and publishes it with the worker's latest attitude, carried on with
     the gyros; otherwise it takes them several times a second, which costs half. The worker, a
     thread that no callback waits for, aligns. A parameter that is wrong is a ConfigError.
+    `options` are those of `rclpy.node.Node`, as ``namespace`` or ``parameter_overrides``.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, **options: Any) -> None:
         # Overrides are declared untyped first, so that [1, 1, 1] is as good as [1.0, 1.0, 1.0].
         try:
-            super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True)
+            super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True,
+                             **options)
         except ValueError as error:
             if 'PARAMETER_NOT_SET' not in str(error):  # rcl loses the type of an empty list
                 raise
@@ -137,10 +137,6 @@ class AlignmentNode(Node):
         self._followed = self._prediction
         # The worker's:
         self._aligner = Aligner(self._config)
-        self._checks = InputChecks(self._config)
-        # Messages that the checks do not have yet: samples, and GNSS with their number before it.
-        self._unchecked: list[ImuSample] = []
-        self._unchecked_gnss: list[tuple[int, Fix | Velocity]] = []
         self._declared: Attitude | None = None
         self._imu_frame: str | None = None
         self._imu_received_ns = 0  # when the last sample of that IMU was received
@@ -185,8 +181,8 @@ class AlignmentNode(Node):
             if self._followed[1] not in (None, sample.frame_id):
                 continue
             now = self._follower.follow(sample.stamp_ns, sample.gyro)
-            # Without an attitude nothing is published: navsat_transform takes the quaternion of
-            # the first message that it gets for the heading, for good, whatever its covariance.
+            # Without an attitude nothing is published: navsat_transform keeps the heading of a
+            # message for good, whatever its covariance.
             if now is not None:
                 self._imu_publisher.publish(
                     with_orientation(data, now.quaternion_xyzw, now.covariance))
@@ -256,7 +252,6 @@ class AlignmentNode(Node):
                 or (mounting.base is not None and self._config.vehicle != 'none')):
             self._config = dataclasses.replace(self._config, lever_arm=mounting.config.lever_arm)
             self._aligner = Aligner(self._config, mounting.base)
-            self._checks = InputChecks(self._config)
 
     def _log(self, severity: Severity, text: str) -> None:
         # rclpy allows one severity for each line of code.
@@ -268,24 +263,17 @@ class AlignmentNode(Node):
             self.get_logger().info(text)
 
     def _feed(self, items: list[tuple[int, Any]]) -> None:
-        """Give messages to the aligner and the checks, and do the requests in between."""
+        """Give messages to the aligner, and do the requests in between."""
         for received_ns, item in items:
             if isinstance(item, ImuSample):
                 if self._accepts_frame(item.frame_id, received_ns):
                     self._aligner.add_imu(item.stamp_ns, item.gyro, item.accel)
-                    self._unchecked.append(item)
-            elif isinstance(item, (Fix, Velocity)):
-                if isinstance(item, Fix):
-                    self._aligner.add_fix(item)
-                else:
-                    self._aligner.add_velocity(item)
-                self._unchecked_gnss.append((len(self._unchecked), item))
+            elif isinstance(item, Fix):
+                self._aligner.add_fix(item)
+            elif isinstance(item, Velocity):
+                self._aligner.add_velocity(item)
             else:
                 item()
-        stamps, gyro, accel, _ = zip(*self._unchecked) if self._unchecked else ((), (), (), ())
-        self._checks.add(np.array(stamps, np.int64), np.array(gyro).reshape(-1, 3),
-                         np.array(accel).reshape(-1, 3), self._unchecked_gnss)
-        self._unchecked, self._unchecked_gnss = [], []
 
     def _align(self) -> None:
         """Process the epochs that are ready, and publish their results."""
@@ -298,8 +286,6 @@ class AlignmentNode(Node):
     def _start_over(self, why: str) -> None:
         self._align()  # messages before the request count, whenever the worker took them
         self._aligner.reset(why)
-        self._checks = InputChecks(self._config)
-        self._unchecked, self._unchecked_gnss = [], []
         self._search.forget()
 
     def _accepts_frame(self, frame_id: str, received_ns: int) -> bool:
@@ -370,7 +356,7 @@ class AlignmentNode(Node):
         now = time.monotonic()
         first = self._next_status == 0.0  # no publisher has been discovered yet
         self._next_status = now + STATUS_PERIOD
-        status = self._checks.judge(self._aligner.status())
+        status = self._aligner.status()
         level = level_of(status.state)
         # While a transform is waited for, samples are kept from the aligner.
         silent = (0.0 if self._imu_heard is None or self._search.waits_for
