@@ -17,34 +17,6 @@ from ins_align.geometry.rotation import Array, matrix_from_quaternion
 import numpy as np
 
 
-class AttitudeMoments:
-    """
-    Sums from which ``min_C sum |s - (unknown start) - C a|^2`` is solved: constant memory.
-
-    Parameters
-    ----------
-    nuisance : int
-        0: the note to the letter, nothing but C is unknown. 1: a free constant (velocity form).
-        2: a free constant and a free slope (position form).
-
-    """
-
-    def __init__(self, nuisance: int) -> None:
-        """Start with empty sums."""
-        self.count = 0
-        self._moments = np.zeros((6 + nuisance, 6 + nuisance))
-
-    def add(self, s: Array, a: Array, regressors: tuple[float, ...] = ()) -> None:
-        """Add one pair; `regressors` are the values that multiply the unknown start."""
-        row = np.concatenate([s, a, regressors])
-        self._moments += np.outer(row, row)
-        self.count += 1
-
-    def solve(self) -> tuple[Array, Array, Array]:
-        """Return attitude, residual and moments of a, see `solve_moments`."""
-        return solve_moments(self._moments)
-
-
 def solve_moments(moments: Array) -> tuple[Array, Array, Array]:
     """
     Davenport's q-method on the moments left when the nuisance parameters are regressed out.

@@ -11,17 +11,21 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The track of the antenna in a frame that does not rotate."""
+"""Both sides of the formulas, in frames that do not rotate: of the antenna and of the IMU."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple, TYPE_CHECKING
 
 from ins_align.estimation.states import Measured
 from ins_align.geometry.earth import (
     earth_rate_n, gravitation_n, gravity_n, ground_velocity_n, matrix_n0n, position_n)
-from ins_align.geometry.rotation import Array, cross, running_sum
+from ins_align.geometry.rotation import apply, Array, cross, cumulative_rotations, running_sum
 from ins_align.gnss.messages import AntennaEpoch, velocities_of
 import numpy as np
+
+if TYPE_CHECKING:
+    from ins_align.imu.preintegration import Intervals
 
 # Sigma (m/s, m) from which on a vertical velocity or position is not measured.
 UNMEASURED = 100.0
@@ -132,3 +136,42 @@ class InertialTrack:
             np.stack([self.s_v(velocities_of(epochs)), self.s_p], axis=1),
             C_n0n @ covariance @ C_n0n.swapaxes(-1, -2), present.tolist(), vertical.tolist(),
             [epoch.stated for epoch in epochs], self.still_v)
+
+
+class BodyTrack(NamedTuple):
+    """
+    The body side of the formulas in the non-rotating frame b0, the body at t0.
+
+    ``a_v - a_v(0)`` is the right side of the note's (9), short form, ``a_p - a_p(0) - t a_v(0)``
+    that of the position form (Remark 2.3).
+    """
+
+    C_b0b: Array = np.eye(3)  #: (..., 3, 3)
+    omega: Array = np.zeros(3)  #: (..., 3), angular rate in the body, rad/s
+    int_f: Array = np.zeros(3)  #: (..., 3), integral of C_b0b f, m/s; and twice, m
+    int_int_f: Array = np.zeros(3)
+
+    def along(self, imu: 'Intervals') -> 'BodyTrack':
+        """
+        Follow the body through K intervals; the result has a leading axis of K.
+
+        An interval of zero length at t0 gives the rate there.
+        """
+        C = cumulative_rotations(np.concatenate([self.C_b0b[None], imu.R]))
+        steps = apply(C[:-1], imu.v)
+        int_f = running_sum(self.int_f, steps)
+        int_int_f = running_sum(self.int_int_f, imu.duration[:, None] * (int_f - steps)
+                                + apply(C[:-1], imu.p))
+        return BodyTrack(C[1:], imu.omega, int_f, int_int_f)
+
+    def at(self, k: int) -> 'BodyTrack':
+        """Return one epoch of a track over many."""
+        return BodyTrack(*(values[k] for values in self))
+
+    def a_v(self, lever_b: Array) -> Array:
+        """Velocity, ``int C_b0b f + C_b0b (omega x lever_b)``, lever arm in m, shape (..., 3)."""
+        return self.int_f + apply(self.C_b0b, cross(self.omega, lever_b))
+
+    def a_p(self, lever_b: Array) -> Array:
+        """Position, ``int int C_b0b f + C_b0b lever_b``, lever arm in m, shape (..., 3)."""
+        return self.int_int_f + apply(self.C_b0b, lever_b)
