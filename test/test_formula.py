@@ -14,10 +14,12 @@
 """The note's formulas against noise-free motion, quadrature and brute force."""
 
 from functools import lru_cache
+from typing import NamedTuple
 
 from alignment import cut_at, integrate
-from ins_align.estimation import formula, moments as q_method
-from ins_align.estimation.track import InertialTrack
+from ins_align.estimation import formula
+from ins_align.estimation.moments import solve_moments
+from ins_align.estimation.track import BodyTrack, InertialTrack
 from ins_align.experiments.dense import bound, cumulative
 from ins_align.geometry.earth import EARTH_RATE, earth_rate_n
 from ins_align.geometry.rotation import skew
@@ -46,6 +48,22 @@ def flight(place, duration=10.5):
     return simulate('flight', ideal=True, duration=duration, gnss_rate=5.0, **PLACES[place])
 
 
+class Sides(NamedTuple):
+    """Both sides of the formulas at an epoch: of a free start, and to the letter."""
+
+    t: float
+    track: InertialTrack
+    body: BodyTrack
+    s_v: np.ndarray
+    s_p: np.ndarray
+    a_v: np.ndarray
+    a_p: np.ndarray
+    beta_v: np.ndarray
+    beta_p: np.ndarray
+    alpha_v: np.ndarray
+    alpha_p: np.ndarray
+
+
 def run(simulation, lever=LEVER):
     """Both sides of the formulas at every epoch."""
     stamps = (simulation.imu_stamps_ns - simulation.gnss_stamps_ns[0]) * 1e-9
@@ -54,31 +72,32 @@ def run(simulation, lever=LEVER):
     intervals, first = (
         integrate(cut_at(stamps, simulation.gyro, simulation.accel, ends))
         for ends in (epochs, epochs[[0, 0]]))
-    body = formula.BodyIntegrals(lever, first.omega[0])
-    navigation = formula.NavigationSide(simulation.velocity[0])
+    velocity = simulation.velocity
+    body, integral = BodyTrack().along(first).at(0), formula.VelocityIntegral(velocity[0])
     track = InertialTrack.start(*lla[0])
+    swing = body.a_v(lever)
     for k in range(1, len(epochs)):
-        body.advance(intervals, k - 1)
+        body = body.along(intervals.take(slice(k - 1, k))).at(0)
         track = track.extended(*np.array([epochs[k], *lla[k]])[:, None]).at(0)
-        navigation.advance(epochs[k], track.s_v(simulation.velocity[k]))
-        yield body, navigation, track
+        t, s_v = epochs[k], track.s_v(velocity[k])
+        integral.advance(t, s_v)
+        a_v, a_p = body.a_v(lever), body.a_p(lever)
+        yield Sides(t, track, body, s_v, integral.s_p, a_v, a_p, s_v - velocity[0],
+                    integral.s_p - t * velocity[0], a_v - swing, a_p - lever - t * swing)
 
 
 FORMS = {
-    'vif to the letter': (0, lambda b, n, t: (n.beta_v, b.alpha_v)),
-    'vif': (1, lambda b, n, t: (n.s_v, b.a_v, (1.0,))),
-    'pif to the letter': (0, lambda b, n, t: (n.beta_p, b.alpha_p)),
-    'pif': (2, lambda b, n, t: (n.s_p, b.a_p, (1.0, b.time))),
-    'pif of positions': (2, lambda b, n, t: (t.s_p, b.a_p, (1.0, b.time))),
+    'vif to the letter': lambda at: (at.beta_v, at.alpha_v),
+    'vif': lambda at: (at.s_v, at.a_v, 1.0),
+    'pif to the letter': lambda at: (at.beta_p, at.alpha_p),
+    'pif': lambda at: (at.s_p, at.a_p, 1.0, at.t),
+    'pif of positions': lambda at: (at.track.s_p, at.a_p, 1.0, at.t),
 }
 
 
 def aligned(simulation, form, lever=LEVER):
-    nuisance, pair = FORMS[form]
-    moments = q_method.AttitudeMoments(nuisance)
-    for sides in run(simulation, lever):
-        moments.add(*pair(*sides))
-    return moments.solve()
+    rows = np.array([np.hstack(FORMS[form](sides)) for sides in run(simulation, lever)])
+    return solve_moments(rows.T @ rows)
 
 
 @pytest.mark.parametrize('form', FORMS)
@@ -107,18 +126,17 @@ def test_body_and_navigation_side_agree_through_the_true_attitude():
     """Beta = C alpha at every epoch: what the note claims, on python-ins' sensors."""
     simulation = flight('north')
     C = simulation.attitude_at(int(simulation.gnss_stamps_ns[0]))
-    for body, navigation, _ in run(simulation):
-        assert np.allclose(navigation.beta_v, C @ body.alpha_v, atol=2e-4)
-        assert np.allclose(navigation.beta_p, C @ body.alpha_p, atol=2e-3)
+    for at in run(simulation):
+        assert np.allclose(at.beta_v, C @ at.alpha_v, atol=2e-4)
+        assert np.allclose(at.beta_p, C @ at.alpha_p, atol=2e-3)
 
 
 def test_chain_rule_gives_the_current_attitude():
     simulation = flight('south')
     C = simulation.attitude_at(int(simulation.gnss_stamps_ns[0]))
-    for body, _, track in run(simulation):
-        pass
+    *_, last = run(simulation)
     truth = simulation.attitude_at(int(simulation.gnss_stamps_ns[-1]))
-    assert angle_deg(track.C_n0n.T @ C @ body.C_b0b, truth) < 1e-4
+    assert angle_deg(last.track.C_n0n.T @ C @ last.body.C_b0b, truth) < 1e-4
 
 
 # Short form of (9) against the exact one
@@ -226,11 +244,11 @@ def test_positions_alone_are_the_integrated_velocity_form():
     # Of velocities, five a second, the integral is known to a parabola.
     time, track = np.arange(0.2, end + 0.1, 0.2), InertialTrack.start(*start)
     track = track.extended(time, *np.array([course.lla(t) for t in time]).T)
-    navigation = formula.NavigationSide(course.v_n(0.0))
+    integral = formula.VelocityIntegral(course.v_n(0.0))
     for t, s_v in zip(time, track.s_v(np.array([course.v_n(t) for t in time]))):
-        navigation.advance(t, s_v)
-    assert np.allclose(navigation.beta_v, beta_v, atol=1e-6)
-    assert np.allclose(navigation.beta_p, beta_p, atol=1e-3)
+        integral.advance(t, s_v)
+    assert np.allclose(s_v - course.v_n(0.0), beta_v, atol=1e-6)
+    assert np.allclose(integral.s_p - end * course.v_n(0.0), beta_p, atol=1e-3)
 
 
 # q-method
@@ -241,7 +259,8 @@ def test_q_method_is_the_least_squares_attitude(seed):
     truth = Rotation.random(random_state=seed)
     a = random.standard_normal((30, 3)) * [10.0, 5.0, 1.0]
     s = truth.apply(a) + 0.3 * random.standard_normal((30, 3))
-    C, residual = q_method.attitude_from_moments(s.T @ a, float(np.sum(s * s) + np.sum(a * a)))
+    rows = np.hstack([s, a])
+    C, residual, _ = solve_moments(rows.T @ rows)
     expected, rssd = Rotation.align_vectors(s, a)
     assert angle_deg(C, expected.as_matrix()) < 1e-6
     assert residual == pytest.approx(rssd ** 2, rel=1e-9)
@@ -250,8 +269,8 @@ def test_q_method_is_the_least_squares_attitude(seed):
 
 def test_q_method_on_vectors_of_half_a_turn():
     truth = np.diag([1.0, -1.0, -1.0])
-    a = np.eye(3)
-    C, residual = q_method.attitude_from_moments((a @ truth.T).T @ a, 6.0)
+    rows = np.hstack([truth, np.eye(3)])
+    C, residual, _ = solve_moments(rows.T @ rows)
     assert np.allclose(C, truth, atol=1e-12) and residual < 1e-12
 
 
@@ -265,9 +284,7 @@ def test_free_start_is_minimised_over(nuisance):
     basis = np.vander(time, nuisance, increasing=True)
     s = (truth.apply(a) + basis @ random.standard_normal((nuisance, 3)) * 20.0
          + 0.1 * random.standard_normal((20, 3)))
-    moments = q_method.AttitudeMoments(nuisance)
-    for k in range(20):
-        moments.add(s[k], a[k], tuple(basis[k]))
+    rows = np.hstack([s, a, basis])
 
     def cost(vector):
         left = s - Rotation.from_rotvec(vector).apply(a)
@@ -277,7 +294,7 @@ def test_free_start_is_minimised_over(nuisance):
 
     best = minimize(cost, truth.as_rotvec(), method='Nelder-Mead',
                     options={'xatol': 1e-9, 'fatol': 1e-12, 'maxiter': 4000})
-    C, residual, A = moments.solve()
+    C, residual, A = solve_moments(rows.T @ rows)
     assert angle_deg(C, Rotation.from_rotvec(best.x).as_matrix()) < 1e-4
     assert residual == pytest.approx(best.fun, rel=1e-6)
     centred = a - basis @ np.linalg.lstsq(basis, a, rcond=None)[0] if nuisance else a
@@ -291,7 +308,7 @@ def test_many_sums_at_once_each_without_one_pair():
     a = random.standard_normal((12, 3)) * [3.0, 2.0, 1.0]
     s = Rotation.from_rotvec([0.3, -0.2, 2.0]).apply(a) + 0.3 * random.standard_normal((12, 3))
     rows = np.hstack([s, a, basis])
-    C, residual, _ = q_method.solve_moments(rows.T @ rows - rows[:, :, None] * rows[:, None])
+    C, residual, _ = solve_moments(rows.T @ rows - rows[:, :, None] * rows[:, None])
     for k in range(12):
         left = np.linalg.qr(np.delete(basis, k, 0), 'complete').Q[:, 2:].T
         expected, rssd = Rotation.align_vectors(left @ np.delete(s, k, 0),
@@ -307,10 +324,10 @@ def test_moments_of_hundreds_of_kilometres_keep_a_centimetre():
     truth = Rotation.from_rotvec([0.1, 0.2, -1.0])
     a = np.column_stack([50.0 * np.sin(0.1 * time), 50.0 * np.cos(0.07 * time), 4.9 * time ** 2])
     s = truth.apply(a) + 30.0 * time[:, None] + 0.02 * random.standard_normal(a.shape)
-    moments = q_method.AttitudeMoments(2)
-    for k in range(time.size):
-        moments.add(s[k], a[k], (1.0, time[k]))
-    C, _, _ = moments.solve()
+    moments = np.zeros((8, 8))
+    for row in np.column_stack([s, a, np.ones(time.size), time]):
+        moments += np.outer(row, row)
+    C, _, _ = solve_moments(moments)
     assert angle_deg(C, truth.as_matrix()) < 1e-3
 
 

@@ -25,10 +25,10 @@ import math
 
 from ins_align.config import Config
 from ins_align.estimation.declaration import Fit
-from ins_align.estimation.moments import AttitudeMoments
-from ins_align.estimation.track import InertialTrack
-from ins_align.geometry.rotation import Array, cross, orthonormalized
-from ins_align.gnss.messages import AntennaEpoch
+from ins_align.estimation.moments import solve_moments
+from ins_align.estimation.track import BodyTrack, InertialTrack
+from ins_align.geometry.rotation import Array, orthonormalized
+from ins_align.gnss.messages import AntennaEpoch, velocities_of
 from ins_align.imu.preintegration import Intervals, SensorErrors
 from ins_align.results import Nuisance
 import numpy as np
@@ -37,113 +37,33 @@ import numpy as np
 UNIFORM_STD = math.pi / math.sqrt(3.0)
 
 
-class BodyIntegrals:
+class VelocityIntegral:
     """
-    The body side of the formulas, accumulated interval by interval from t0.
+    s_p of velocities alone: the integral of `InertialTrack.s_v`.
 
     Attributes
     ----------
-    time : float
-        Seconds since t0.
-    C_b0b : ndarray, shape (3, 3)
-    omega_ib_b : ndarray, shape (3,)
-        Angular rate now; `omega_ib_b0` at t0.
-    int_f, int_int_f : ndarray, shape (3,)
-        Single and double integral of ``C_b0b f_b``.
-
-    """
-
-    def __init__(self, lever_b: Array, omega_ib_b0: Array) -> None:
-        """Start at t0."""
-        self.lever_b = np.asarray(lever_b, dtype=float)
-        self.omega_ib_b0 = self.omega_ib_b = np.asarray(omega_ib_b0, dtype=float)
-        self.time = 0.0
-        self.C_b0b = np.eye(3)
-        self.int_f = np.zeros(3)
-        self.int_int_f = np.zeros(3)
-
-    def advance(self, interval: Intervals, k: int) -> None:
-        """Append interval `k` of `interval`."""
-        duration = interval.duration[k]
-        self.int_int_f = (self.int_int_f + duration * self.int_f
-                          + self.C_b0b @ interval.p[k])
-        self.int_f = self.int_f + self.C_b0b @ interval.v[k]
-        self.C_b0b = orthonormalized(self.C_b0b @ interval.R[k])
-        self.omega_ib_b = interval.omega[k]
-        self.time += duration
-
-    @property
-    def a_v(self) -> Array:
-        """``int C_b0b f + C_b0b (omega_ib x lever)``: the free-start body velocity."""
-        return self.int_f + self.C_b0b @ cross(self.omega_ib_b, self.lever_b)
-
-    @property
-    def a_p(self) -> Array:
-        """``int int C_b0b f + C_b0b lever``: the free-start body position."""
-        return self.int_int_f + self.C_b0b @ self.lever_b
-
-    @property
-    def alpha_v(self) -> Array:
-        """Right side of the note's (9), short form."""
-        return self.a_v - cross(self.omega_ib_b0, self.lever_b)
-
-    @property
-    def alpha_p(self) -> Array:
-        """Right side of the position form, Remark 2.3."""
-        return (self.a_p - self.lever_b
-                - self.time * cross(self.omega_ib_b0, self.lever_b))
-
-
-class NavigationSide:
-    """
-    The navigation side of the formulas, from velocities: s_v, and s_p as its integral.
-
-    Attributes
-    ----------
-    time : float
-        Seconds since t0.
-    v_n0 : ndarray, shape (3,)
-        Antenna velocity at t0, ENU, m/s.
-    s_v : ndarray, shape (3,)
-        Free-start velocity, ``C_n0n v_n + int C_n0n (omega_ie x v_n) - int C_n0n g_n``, which is
-        `InertialTrack.s_v`.
     s_p : ndarray, shape (3,)
-        Free-start position, one more integral.
+        The integral from t0 to the last velocity, m.
 
     """
 
-    def __init__(self, v_n0: Array) -> None:
-        """Start at t0."""
-        self.time = 0.0
-        self.v_n0 = self.s_v = v_n0
+    def __init__(self, s_v: Array) -> None:
+        """Start at t0 with s_v there, m/s."""
         self.s_p = np.zeros(3)
+        self._time, self._s_v = 0.0, s_v
         self._before: tuple[float, Array] | None = None
 
     def advance(self, time: float, s_v: Array) -> None:
-        """Append an epoch; s_p follows the parabola through the last three of them."""
-        h, last = time - self.time, self.s_v
+        """Append s_v `time` seconds after t0; a parabola goes through the last three."""
+        h, last = time - self._time, self._s_v
         area = h / 2 * (last + s_v)
         if self._before is not None and 0.5 <= h / self._before[0] <= 2.0:
             g, first = self._before
             area = h / 6 * ((3 * g + 2 * h) / (g + h) * s_v + (3 * g + h) / g * last
                             - h * h / (g * (g + h)) * first)
-        self.time, self.s_v, self.s_p = time, s_v, self.s_p + area
+        self._time, self._s_v, self.s_p = time, s_v, self.s_p + area
         self._before = h, last
-
-    @property
-    def beta_v(self) -> Array:
-        """Left side of the note's (9)."""
-        return self.s_v - self.v_n0
-
-    @property
-    def beta_p(self) -> Array:
-        """Left side of the position form, Remark 2.3."""
-        return self.s_p - self.time * self.v_n0
-
-
-def _mean_variance(covariance: Array) -> float:
-    """Mean of the three axes' variances."""
-    return float(np.trace(covariance)) / 3
 
 
 class NoteMethod:
@@ -175,81 +95,80 @@ class NoteMethod:
         self._config = config
         self._lever_b = np.array(config.lever_arm)
         self._free = config.free_start
-        self._position_form = config.method == 'pif'
-        self._from_positions = self._position_form and use_position
-        self._body = BodyIntegrals(self._lever_b, imu.omega[0])
+        self._kind = int(config.method == 'pif')            # 0: velocity form, 1: position form
+        self._from_positions = config.method == 'pif' and use_position
         self._track = InertialTrack.start(epoch.latitude, epoch.longitude, epoch.altitude)
-        self._navigation = None if epoch.v_n is None else NavigationSide(epoch.v_n)
-        nuisance = 0
-        if self._position_form:
-            nuisance = 2 if self._free else int(self._from_positions)
-        elif self._free:
-            nuisance = 1
-        self._moments = AttitudeMoments(nuisance)
-        self._nuisance = nuisance
+        self._body = BodyTrack().along(imu).at(0)
+        self._integral = VelocityIntegral(velocities_of([epoch])[0])
+        # The start is a constant, and in the position form a slope. What is not free of them is
+        # known, (n, 6): the pairs of positions and of velocities at t0.
+        kinds = ([] if self._free else [1] if self._from_positions
+                 else [1, 0] if self._kind else [0])
+        self._known = np.array([self._vectors(epoch, kind) for kind in kinds]).reshape(-1, 6)
+        self._nuisance = 1 + self._kind - len(kinds)
+        self._moments = np.zeros((6 + self._nuisance, 6 + self._nuisance))
         self._offered = 0
         self._variance = 0.0                # of the receiver, summed over pairs
-        self._start_variance = _mean_variance(epoch.position_covariance if self._from_positions
-                                              else epoch.velocity_covariance)
+        self._start_variance = self._receiver_variance(epoch)
         self._solution: tuple[Array, Array] | None = None
         self._solved_s = 0.0
         self._residual = 0.0
-        if self._free or self._from_positions:
+        if self._nuisance:
             self._pair(epoch)
 
     def advance(self, epochs: Sequence[AntennaEpoch], imu: Intervals) -> Iterator[AntennaEpoch]:
         """Process epochs and the IMU intervals before each; see `Bank.advance`."""
+        track, body = self._track.along(epochs, self.t0_ns), self._body.along(imu)
         for k, epoch in enumerate(epochs):
-            self._body.advance(imu, k)
-            self._track = self._track.along([epoch], self.t0_ns).at(0)
-            if epoch.v_n is not None and self._navigation is not None:
-                self._navigation.advance(float(self._track.time), self._track.s_v(epoch.v_n))
+            self._track, self._body = track.at(k), body.at(k)
+            if epoch.v_n is not None:
+                self._integral.advance(float(self._track.time), self._track.s_v(epoch.v_n))
             self._pair(epoch)
             yield epoch
 
-    def _pair(self, epoch: AntennaEpoch) -> None:
-        """Add the pair of vectors of an epoch and solve."""
-        body, time = self._body, float(self._track.time)
-        if self._from_positions:
-            if not epoch.position_measured:
-                return
-            regressors = (1.0, time) if self._free else (time,)
-            first = 0.0 if self._free else 1.0
-            self._moments.add(self._track.s_p, body.a_p - first * self._lever_b, regressors)
-            self._variance += _mean_variance(epoch.position_covariance)
-        elif epoch.v_n is not None and self._navigation is not None:
-            navigation = self._navigation
-            if self._position_form:
-                if self._free:
-                    self._moments.add(navigation.s_p, body.a_p, (1.0, time))
-                else:
-                    self._moments.add(navigation.beta_p, body.alpha_p)
-            elif self._free:
-                self._moments.add(navigation.s_v, body.a_v, (1.0,))
-            else:
-                self._moments.add(navigation.beta_v, body.alpha_v)
-            self._variance += _mean_variance(epoch.velocity_covariance)
+    def _vectors(self, epoch: AntennaEpoch, kind: int) -> Array:
+        """Return s and a at an epoch, the last one, shape (6,): of velocity (0) or position."""
+        if kind:
+            s = self._track.s_p if self._from_positions else self._integral.s_p
+            a = self._body.a_p(self._lever_b)
         else:
+            s, a = self._track.s_v(velocities_of([epoch])[0]), self._body.a_v(self._lever_b)
+        return np.hstack([s, a])
+
+    def _receiver_variance(self, epoch: AntennaEpoch) -> float:
+        """Return the receiver's variance of what is used, mean of the three axes."""
+        covariance = (epoch.position_covariance if self._from_positions
+                      else epoch.velocity_covariance)
+        return float(np.trace(covariance)) / 3
+
+    def _pair(self, epoch: AntennaEpoch) -> None:
+        """Add the pair of vectors of an epoch, without the known start, and solve."""
+        if not epoch.position_measured if self._from_positions else epoch.v_n is None:
             return
+        time = float(self._track.time)
+        known, free = np.split(time ** np.arange(1 + self._kind), [len(self._known)])
+        row = np.hstack([self._vectors(epoch, self._kind) - known @ self._known, free])
+        self._moments += np.outer(row, row)
+        self._variance += self._receiver_variance(epoch)
         self._offered += 1
         self.counts['epochs_used'] += 1
         if self._rows <= 0:
             return
-        C, residual, A = self._moments.solve()
+        C, residual, A = solve_moments(self._moments)
         A_n = C @ A @ C.T
         information = np.trace(A_n) * np.eye(3) - A_n
         self._residual = float(residual)
         self._solved_s = time
         white, common = self._noise()
         # Noise that all pairs have in common does not average out.
-        self._solution = C, np.linalg.inv(information / (white + self._moments.count * common)
+        self._solution = C, np.linalg.inv(information / (white + self._offered * common)
                                           + np.eye(3) / UNIFORM_STD ** 2)
 
     def _noise(self) -> tuple[float, float]:
         """Return the white variance of a pair, and the variance that all pairs have in common."""
         variance = self._variance / self._offered
         start = 0.0 if self._free else self._start_variance
-        if not self._position_form or self._from_positions:
+        if not self._kind or self._from_positions:
             return variance, start
         # Integrated velocities are a random walk, of which a free start removes all but 1/15; the
         # error of the first velocity grows with time.
@@ -285,7 +204,7 @@ class NoteMethod:
     @property
     def _rows(self) -> int:
         """Return how many rows of the pairs are redundant."""
-        return 3 * (self._moments.count - 1 - self._nuisance)
+        return 3 * (self._offered - 1 - self._nuisance)
 
     def _factor(self) -> float:
         """Return the factor on variances for data that fit worse than stated."""

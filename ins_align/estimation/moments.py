@@ -17,49 +17,24 @@ from ins_align.geometry.rotation import Array, matrix_from_quaternion
 import numpy as np
 
 
-class AttitudeMoments:
-    """
-    Sums from which ``min_C sum |s - (unknown start) - C a|^2`` is solved: constant memory.
-
-    Parameters
-    ----------
-    nuisance : int
-        0: the note to the letter, nothing but C is unknown. 1: a free constant (velocity form).
-        2: a free constant and a free slope (position form).
-
-    """
-
-    def __init__(self, nuisance: int) -> None:
-        """Start with empty sums."""
-        self.count = 0
-        self._moments = np.zeros((6 + nuisance, 6 + nuisance))
-
-    def add(self, s: Array, a: Array, regressors: tuple[float, ...] = ()) -> None:
-        """Add one pair; `regressors` are the values that multiply the unknown start."""
-        row = np.concatenate([s, a, regressors])
-        self._moments += np.outer(row, row)
-        self.count += 1
-
-    def solve(self) -> tuple[Array, Array, Array]:
-        """Return attitude, residual and moments of a, see `solve_moments`."""
-        return solve_moments(self._moments)
-
-
 def solve_moments(moments: Array) -> tuple[Array, Array, Array]:
     """
-    Davenport's q-method on the moments left when the nuisance parameters are regressed out.
+    Davenport's q-method for ``sum |s - (unknown start) - C a|^2``, vectors not normalised.
+
+    The start is regressed out of the moments first.
 
     Parameters
     ----------
-    moments : ndarray, shape (..., 6 + nuisance, 6 + nuisance)
-        Sums of the products of each pair: s, a and the regressors.
+    moments : ndarray, shape (..., 6 + n, 6 + n)
+        Sums of the products of each pair: s, a and the n values that multiply the unknown start.
+        With a free start that is 1 for velocities, 1 and time for positions.
 
     Returns
     -------
     C : ndarray, shape (..., 3, 3)
         The attitude.
     residual : ndarray, shape (...)
-        Weighted residual sum of squares.
+        Residual sum of squares, the smallest eigenvalue of ``K = total I - 2 D`` (not negative).
     A : ndarray, shape (..., 3, 3)
         Moments of a about the regression.
 
@@ -67,28 +42,7 @@ def solve_moments(moments: Array) -> tuple[Array, Array, Array]:
     zm = moments[..., 6:, :6]
     m = moments[..., :6, :6] - zm.swapaxes(-1, -2) @ np.linalg.pinv(
         moments[..., 6:, 6:], hermitian=True) @ zm
-    C, residual = attitude_from_moments(m[..., :3, 3:], np.trace(m, axis1=-2, axis2=-1))
-    return C, residual, m[..., 3:, 3:]
-
-
-def attitude_from_moments(B: Array, total: Array) -> tuple[Array, Array]:
-    """
-    Davenport's q-method for ``sum |s - C a|^2`` with vectors that are not normalised.
-
-    Parameters
-    ----------
-    B : ndarray, shape (..., 3, 3)
-        ``sum s a^T``.
-    total : ndarray, shape (...)
-        ``sum |s|^2 + |a|^2``.
-
-    Returns
-    -------
-    C : ndarray, shape (..., 3, 3)
-    residual : ndarray, shape (...)
-        Smallest eigenvalue of ``K = total I - 2 D``, the residual sum (not negative).
-
-    """
+    B, total = m[..., :3, 3:], np.trace(m, axis1=-2, axis2=-1)
     trace = np.trace(B, axis1=-2, axis2=-1)
     twist = B.swapaxes(-1, -2) - B
     D = np.empty((*trace.shape, 4, 4))
@@ -96,4 +50,5 @@ def attitude_from_moments(B: Array, total: Array) -> tuple[Array, Array]:
     D[..., :3, 3] = D[..., 3, :3] = twist[..., [1, 2, 0], [2, 0, 1]]
     D[..., 3, 3] = trace
     values, vectors = np.linalg.eigh(np.multiply.outer(total, np.eye(4)) - 2 * D)
-    return matrix_from_quaternion(vectors[..., 0]), np.maximum(values[..., 0], 0.0)
+    return (matrix_from_quaternion(vectors[..., 0]), np.maximum(values[..., 0], 0.0),
+            m[..., 3:, 3:])

@@ -27,9 +27,8 @@ from ins_align.estimation.filter import Filters, of_heading
 from ins_align.estimation.moments import solve_moments
 from ins_align.estimation.receiver import LEAST_NOISE, LOUD, MOVING, QUIET
 from ins_align.estimation.states import FIRST, PHI, PHI0, RHO, triads, XI
-from ins_align.estimation.track import InertialTrack
-from ins_align.geometry.rotation import (
-    apply, Array, cross, cumulative_rotations, exp_so3, log_so3, skew)
+from ins_align.estimation.track import BodyTrack, InertialTrack
+from ins_align.geometry.rotation import Array, exp_so3, log_so3, skew
 from ins_align.gnss.messages import AntennaEpoch, velocities_of
 from ins_align.imu.preintegration import Intervals
 import numpy as np
@@ -186,18 +185,12 @@ class Start:
 
     def _pairs(self, kind: int) -> tuple[Array, Array]:
         """Return times, and rows of s, a, 1 and for positions time, for all epochs."""
-        epochs, imu, first = self.epochs, self.imu, self.epochs[0]
+        epochs, first = self.epochs, self.epochs[0]
         track = InertialTrack.start(first.latitude, first.longitude, first.altitude).along(
             epochs, first.stamp_ns)
-        C = np.concatenate([np.eye(3)[None], cumulative_rotations(imu.R)])
-        steps = apply(C[:-1], imu.v)
-        v = np.cumsum(steps, axis=0)
-        if kind:
-            p = np.cumsum(imu.duration[:, None] * (v - steps) + apply(C[:-1], imu.p), axis=0)
-            s, a = track.s_p, p + C[1:] @ self._lever
-        else:
-            swing = cross(imu.omega, np.broadcast_to(self._lever, imu.omega.shape))
-            s, a = track.s_v(velocities_of(epochs)), v + apply(C[1:], swing)
+        body = BodyTrack().along(self.imu)
+        s, a = ((track.s_p, body.a_p(self._lever)) if kind else
+                (track.s_v(velocities_of(epochs)), body.a_v(self._lever)))
         start = np.vander(track.time, 1 + kind, increasing=True)
         return track.time, np.hstack([s, a, start])
 
