@@ -27,6 +27,7 @@ from node_harness import Listener, overrides, values_of
 import numpy as np
 import pytest
 import rclpy
+from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
@@ -39,8 +40,8 @@ TOO_FAST = 80.0  # rad/s
 class StillNode(AlignmentNode):
     """A node whose worker works when it is told to, by a clock that the test sets."""
 
-    def __init__(self):
-        super().__init__()
+    def __init__(self, **options):
+        super().__init__(**options)
         self.seconds, self.lines, statuses = 100.0, [], []
         self.statuses = statuses
         self._status_publishers = [SimpleNamespace(publish=statuses.append)]
@@ -102,6 +103,15 @@ def samples_of(frames, start=0, rate=0.0):
 AT_ONCE = samples_of(['first', 'second'] * 200)
 # The second is in use for a second, falls silent, and the first comes back.
 BACK = samples_of(['first'] * 200 + ['second'] * 200) + samples_of(['first'] * 400, 700)
+
+
+def test_a_program_may_host_nodes_with_options_of_its_own(still_node):
+    with still_node(hold_time=2.0) as node:
+        other = StillNode(namespace='/robot1',
+                          parameter_overrides=[Parameter('hold_time', value=3.0)])
+        assert other.get_fully_qualified_name() == '/robot1/ins_align'
+        assert node._config.hold_time == 2.0 and other._config.hold_time == 3.0
+        other.destroy_node()
 
 
 @pytest.mark.parametrize('samples, pieces, used, left_out', [
