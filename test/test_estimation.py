@@ -332,7 +332,7 @@ def test_a_refuted_level_can_come_back_unless_its_biases_have_gone_astray():
     for _ in went(bank, epochs, imu, 10):
         pass
     filters = bank._filters
-    likeliest, *others = np.flatnonzero(filters.counts)
+    likeliest, *others = np.flatnonzero(filters.mixed)
     _, accel = biases(filters.x.shape[1])
     held = []
     expected_std = np.sqrt(filters.accel_variance[others[0]])

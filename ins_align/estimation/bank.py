@@ -336,7 +336,7 @@ class Bank:
         inertial = self._inertial.along(epochs, self._n0_ns)
         self._filters = filters = Filters(np.concatenate(C), v_n, x, rival, np.array(P),
                                           np.array([known.walk for known in self._known]),
-                                          self._rivals.prior, self._rivals.counts)
+                                          self._rivals.prior, self._rivals.mixed)
         for k in range(len(epochs)):
             one = slice(k, k + 1)
             model = self._model(filters, self._point_of(filters), imu.take(one))

@@ -104,8 +104,8 @@ class Filters:
         Random walk: what P gains on its diagonal in a second.
     prior : ndarray, shape (M,)
         Log probability of each rival before the data.
-    counts : ndarray of bool, shape (M,)
-        Whether a rival is part of results; the others may only speak against them.
+    mixed : ndarray of bool, shape (M,)
+        Whether a rival is part of results, the mixture; the others may speak against it.
 
     Attributes
     ----------
@@ -128,17 +128,17 @@ class Filters:
     """
 
     _OF_MEANS = 'C', 'u', 'w', 'x', 'C0', 'rival', 'weight'
-    _OF_RIVALS = 'P', 'walk', 'spurious', 'accel_variance', 'evidence', 'counts', 'ids'
+    _OF_RIVALS = 'P', 'walk', 'spurious', 'accel_variance', 'evidence', 'mixed', 'ids'
 
     def __init__(self, C: Array, u: Array, x: Array, rival: Index, P: Array, walk: Array,
-                 prior: Array, counts: np.ndarray) -> None:
+                 prior: Array, mixed: np.ndarray) -> None:
         """Put all means at the same velocity and parameters."""
         B, M = len(C), len(P)
         self.C, self.C0 = C, C.copy()
         self.u, self.w, self.x = np.tile(u, (B, 1)), np.zeros((B, 3)), np.tile(x, (B, 1))
         self.rival, self.ids = rival, np.arange(M)
         self.weight = -np.log(np.bincount(rival))[rival]
-        self.evidence, self.counts = prior, counts
+        self.evidence, self.mixed = prior, mixed
         self.P, self.walk, self.spurious = P, walk, np.zeros(M)
         accel = biases(x.size)[1]
         self.accel_expected = x[accel]
@@ -156,8 +156,8 @@ class Filters:
 
     @property
     def best(self) -> int:
-        """Return the index in `ids` of the likeliest rival that counts."""
-        return int(np.where(self.counts, self.evidence, -np.inf).argmax())
+        """Return the index in `ids` of the likeliest rival of the mixture."""
+        return int(np.where(self.mixed, self.evidence, -np.inf).argmax())
 
     def _find_places(self) -> None:
         self.place: 'Index | slice' = (slice(None) if self.single
@@ -462,9 +462,9 @@ class Filters:
         """
         Return the attitudes at t0 and now, C_n0b, and their covariances in the axes of n0.
 
-        Both are of shape (2, 3, 3), and of all means of the rivals that count.
+        Both are of shape (2, 3, 3), and of all means of the rivals that are mixed.
         """
-        level = np.where(self.counts, self.evidence, -np.inf)
+        level = np.where(self.mixed, self.evidence, -np.inf)
         likely = level > level.max() - NEGLIGIBLE
         use = np.flatnonzero(likely[self.place])
         of = np.arange(len(likely))[self.place][use]

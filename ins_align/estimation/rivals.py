@@ -96,8 +96,9 @@ class Rival:
 # Levels: factors on the biases of gyros and accelerometers, and log prior; the first level is the
 # configuration. Scale factors and misalignment are at most so many times larger. The last level is
 # also at least as bad as the next worse preset: `mems`, or `chip` for MEMS. Where an IMU of
-# navigation grade is configured a MEMS IMU is a contradiction: its biases would explain a velocity
-# in another frame as well.
+# navigation grade is configured, with gyro biases below PRECISE of those of `tactical`, a MEMS IMU
+# is a contradiction: its biases would explain a velocity in another frame as well.
+PRECISE = 0.5
 WORSE = ((1, 1, 0), (1, 3, -3), (1, 10, -5), (3, 1, -5.5), (10, 1, -11), (10, 10, -16))
 WORSE_SCALE = 3.0
 LEVELS = tuple(Rival(gyro=gyro, accel=accel, prior=prior) for gyro, accel, prior in WORSE)
@@ -123,7 +124,7 @@ CERTAIN = (
 def rivals_of(config: Config) -> tuple[Rival, ...]:
     """Return the rivals of a configuration, which itself comes first."""
     bias = config.imu_noise.gyro_bias_std
-    precise = bias < 0.5 * PRESETS['tactical'].gyro_bias_std    # clearly better than tactical
+    precise = bias < PRECISE * PRESETS['tactical'].gyro_bias_std
     worse = '' if precise else next(
         (grade for grade in ('mems', 'chip') if PRESETS[grade].gyro_bias_std > bias), '')
     levels = (*LEVELS[:-1], replace(LEVELS[-1], grade=worse),
@@ -145,7 +146,7 @@ class Rivals:
         R rivals, of which the first is the configuration.
     signs, prior, along : ndarray, shapes (R, 4), (R,), (R,)
         Their fields.
-    counts : ndarray of bool, shape (R,)
+    mixed : ndarray of bool, shape (R,)
         Whether a rival is part of results. Wrong rivals are not, nor those without the assumption
         on a vehicle where one is configured, which are there to contradict it.
 
@@ -158,7 +159,7 @@ class Rivals:
         self.prior = np.array([rival.prior for rival in self.table])
         self.along = np.array([rival.along for rival in self.table])
         self._wrong = np.array([bool(rival.wrong) for rival in self.table])
-        self.counts = ~self._wrong & ((self.along != 0) | (config.vehicle == 'none'))
+        self.mixed = ~self._wrong & ((self.along != 0) | (config.vehicle == 'none'))
 
     def select(self, filters: Filters) -> None:
         """Drop means and rivals that are unlikely, merge means that agree."""
@@ -195,7 +196,7 @@ class Rivals:
             return '', False
         # How much likelier each wrong rival is than all levels together.
         level = filters.evidence
-        ahead = np.where(wrong, level - log_sum(level[filters.counts]), -np.inf)
+        ahead = np.where(wrong, level - log_sum(level[filters.mixed]), -np.inf)
         if not np.any(ahead > -MARGIN):
             return '', False
         C = np.stack([filters.C0[filters.lead], filters.C[filters.lead]], axis=1)
@@ -209,7 +210,7 @@ class Rivals:
                        else ('the IMU axes', 'the signs of the IMU axes are'))
         # The prior of a bad IMU must not make a wrong configuration likely: before it is called
         # wrong, the rival has to fit better than each level does without its prior.
-        fits = np.max((level - self.prior[filters.ids])[filters.counts])
+        fits = np.max((level - self.prior[filters.ids])[filters.mixed])
         if level[worst] - fits > MARGIN:
             return f'the data fit better with {rival.wrong}: check {what}', True
         return f'{known} not confirmed by the motion yet: turn and change speed', False

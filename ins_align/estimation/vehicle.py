@@ -138,6 +138,6 @@ class Vehicle:
     def in_words(self, filters: Filters) -> str:
         """Return that the direction is not known, as the end of a sentence, or ''."""
         level = filters.evidence
-        likely = filters.lead[filters.counts & (level > level[filters.best] - MARGIN)]
+        likely = filters.lead[filters.mixed & (level > level[filters.best] - MARGIN)]
         x_n0 = apply(filters.C[likely], self._axes[:, 0])
         return AMBIGUOUS if np.any(x_n0 @ x_n0.T < 0) else ''
