@@ -13,16 +13,18 @@
 # limitations under the License.
 """Alignment of recorded data: `replay` for recordings, `align` for arrays."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import repeat
 import os
 from typing import Any
 
 from ins_align.aligner import Aligner
 from ins_align.config import Config, config_from_mapping, ConfigError, STANDARD_GRAVITY
 from ins_align.geometry.rotation import Array, Index, Transform
-from ins_align.gnss import messages
-from ins_align.gnss.messages import Fix, numbers_of, usable, Velocity
+from ins_align.gnss.messages import (
+    Fix, fix_from_numbers, numbers_of, usable, Velocity, velocity_from_numbers)
 from ins_align.gnss.motion import differences, series_of, series_of_rows, track
 from ins_align.imu.buffer import MAX_GAP_NS
 from ins_align.recordings.motion_fit import fit_motion, MAX_DELAY_STD
@@ -290,15 +292,11 @@ def _messages(name: str, given: Any, kind: type, unit_ns: float, config: Config)
     if unit_ns == 1.0 and 0 < np.ptp(stamps_ns) < len(table) * MIN_INTERVAL_NS:
         raise ValueError(f'the stamps of {name} must be nanoseconds, as those of the IMU, which '
                          'are integers: they look like another unit')
-    known = table.shape[1] > 4
-    covariances = np.zeros((len(table), 3, 3))
+    covariances: Iterable[Any] = repeat(None)
     if table.shape[1] == 7:
         # The square keeps the sign: a negative one means that it is not known.
-        covariances[:, [0, 1, 2], [0, 1, 2]] = table[:, 4:] * np.abs(table[:, 4:])
-    elif known:
-        covariances = table[:, 4:].reshape(-1, 3, 3)
-    if kind is Velocity:
-        return messages.velocities(stamps_ns, '', table[:, 1:4],
-                                   covariances if known else None, config)
-    kinds = np.full(len(table), int(known))
-    return messages.fixes(stamps_ns, table[:, 1:4], covariances, kinds, 0 * kinds)
+        covariances = [np.diag(std * np.abs(std)) for std in table[:, 4:]]
+    elif table.shape[1] == 13:
+        covariances = table[:, 4:]
+    make = fix_from_numbers if kind is Fix else partial(velocity_from_numbers, config)
+    return [make(*row) for row in zip(stamps_ns, table[:, 1:4], covariances)]

@@ -17,18 +17,9 @@ from types import SimpleNamespace as Msg
 
 from ins_align.config import Config
 from ins_align.gnss.messages import (
-    fixes_from_msgs, imu_from_msg, MessageError, sound_covariance, stamp_from_msg,
-    velocities_from_msgs)
+    fix_from_msg, imu_from_msg, MessageError, sound_covariance, stamp_from_msg, velocity_from_msg)
 import numpy as np
 import pytest
-
-
-def fix_from_msg(msg):
-    return fixes_from_msgs([msg])[0]
-
-
-def velocity_from_msg(msg, config):
-    return velocities_from_msgs([msg], config)[0]
 
 
 def header(frame_id='gnss_link', sec=12, nanosec=34):
@@ -161,15 +152,15 @@ def test_possible_correlation_is_kept_and_made_symmetric():
 
 def test_other_velocity_types():
     stamped = Msg(header=header('world'), twist=Msg(linear=xyz(1.0, 2.0, 3.0)))
-    result = velocity_from_msg(stamped, Config(velocity_type='TwistStamped'))
+    result = velocity_from_msg(stamped, Config())
     np.testing.assert_array_equal(result.velocity, [1.0, 2.0, 3.0])
     assert result.covariance is None
     vector = Msg(header=header('world'), vector=xyz(1.0, 2.0, 3.0))
-    result = velocity_from_msg(vector, Config(velocity_type='Vector3Stamped'))
+    result = velocity_from_msg(vector, Config())
     np.testing.assert_array_equal(result.velocity, [1.0, 2.0, 3.0])
     odometry = twist_with_covariance((1.0, 2.0, 3.0), np.eye(3), 'base_link')
     odometry.child_frame_id = 'gps'
-    result = velocity_from_msg(odometry, Config(velocity_type='Odometry'))
+    result = velocity_from_msg(odometry, Config())
     np.testing.assert_array_equal(result.covariance, np.eye(3))
 
 
@@ -182,9 +173,9 @@ def test_body_frame_velocity_is_refused(frame):
         velocity_from_msg(msg, Config())
     msg.header.frame_id, msg.child_frame_id = 'map', frame
     with pytest.raises(MessageError, match='body frame'):
-        velocity_from_msg(msg, Config(velocity_type='Odometry'))
+        velocity_from_msg(msg, Config())
     # Who says in which world frame it is knows better than the frame_id.
-    velocity = velocity_from_msg(msg, Config(velocity_type='Odometry', velocity_frame='ned'))
+    velocity = velocity_from_msg(msg, Config(velocity_frame='ned'))
     np.testing.assert_array_equal(velocity.velocity, [2.0, 1.0, -3.0])
 
 

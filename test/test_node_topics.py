@@ -22,7 +22,8 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TwistStamped, Vector3Stamped
 from ins_align.config import Config, ConfigError
 from ins_align.geometry.rotation import matrix_from_quaternion, roll_pitch_yaw
-from ins_align.ros.inputs import gnss_from_msg, gnss_topics, message_class
+from ins_align.gnss.drivers import gnss_from_msg
+from ins_align.ros.inputs import gnss_topics, message_class
 from ins_align.ros.node import ReasonLog
 from ins_align.simulation.simulate import simulate
 from node_harness import (
@@ -202,7 +203,7 @@ def test_receiver_messages_need_their_package_and_bring_the_velocity(monkeypatch
         header=Header(stamp=Time(sec=12)), status=SimpleNamespace(status=0), latitude=48.0,
         longitude=11.0, altitude=300.0, position_covariance=np.zeros(9),
         position_covariance_type=0, speed=5.0, track=90.0, climb=1.0, err_speed=0.2, err_climb=0.4)
-    fix, velocity = gnss_from_msg('fix', message, config)
+    fix, velocity = gnss_from_msg(message, 'gps_msgs/msg/GPSFix', config)
     assert fix[:4] == (12_000_000_000, 48.0, 11.0, 300.0) and fix.covariance is None
     assert velocity.velocity == pytest.approx([5.0, 0.0, 1.0])
     assert velocity.covariance == pytest.approx(np.diag([0.01, 0.01, 0.04]))

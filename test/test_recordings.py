@@ -23,8 +23,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ins_align.config import Config
 from ins_align.gnss.drivers import VELOCITY_TYPES
-from ins_align.gnss.messages import (
-    fixes_from_msgs, imu_from_msg, MessageError, velocities_from_msgs)
+from ins_align.gnss.messages import fix_from_msg, imu_from_msg, MessageError, velocity_from_msg
 from ins_align.recordings import bag as bags
 from ins_align.recordings import BagError, Topic
 from ins_align.recordings.bag import Bag
@@ -544,8 +543,7 @@ def test_imu_of_any_bytes(encoding, edits):
 @pytest.mark.parametrize('msgtype', [FIX_TYPE, *VELOCITY_TYPES])
 def test_gnss_as_one_by_one(encoding, little, msgtype, frame):
     topic = Topic('/gnss', msgtype, encoding)
-    config = Config(velocity_frame=frame, velocity_type=msgtype.rsplit('/', 1)[-1]
-                    if msgtype != FIX else 'Odometry')
+    config = Config(velocity_frame=frame)
     raws = [b''] + [raw for group in zip(*(
         serialized(encoding, msgtype, frame_id, little) for frame_id in ('gps', 'base_link', 'ü')
         )) for raw in group] + [b'\xff' * 200]
@@ -557,8 +555,7 @@ def test_gnss_as_one_by_one(encoding, little, msgtype, frame):
         if kind == 'velocity' and b'base_link' in raw and frame == 'auto':
             assert message.counter == 'velocity_body_frame' and "'base_link'" in message.why
             continue
-        expected, = (fixes_from_msgs([read]) if kind == 'fix'
-                     else velocities_from_msgs([read], config))
+        expected = fix_from_msg(read) if kind == 'fix' else velocity_from_msg(read, config)
         for mine, other in zip(message, expected):
             assert type(mine) is type(other)
             np.testing.assert_array_equal(mine, other)

@@ -29,7 +29,8 @@ from typing import Any
 
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.geometry.rotation import Array
-from ins_align.gnss.messages import fixes, MessageError, velocities
+from ins_align.gnss.messages import (
+    BodyFrameError, fix_from_numbers, refuse_body_frame, velocity_from_numbers)
 from ins_align.simulation.scenarios import displaced
 from ins_align.simulation.simulate import Simulation
 import numpy as np
@@ -127,15 +128,17 @@ class Stream:
         reason why a message cannot be used.
         """
         fix, sent, nothing = self.fix, self.velocity, itertools.repeat(None)
-        stated = None if config.velocity_type == 'TwistStamped' else sent['covariance']
+        stated = nothing if config.velocity_type == 'TwistStamped' else sent['covariance']
+        measured: Iterable[Any] = map(partial(velocity_from_numbers, config), sent['stamp'],
+                                      sent['velocity'], stated)
         try:
-            measured: Iterable[Any] = velocities(
-                sent['stamp'], ''.join(set(sent['frame_id'])), sent['velocity'], stated, config)
-        except MessageError:
+            refuse_body_frame(''.join(set(sent['frame_id'])), config)
+        except BodyFrameError:
             measured = itertools.repeat('velocity_body_frame')
         events = sorted(((int(time), kind, payload) for kind, times, payloads in (
             ('imu', self.imu['arrival'], itertools.count()),
-            ('fix', fix['arrival'], fixes(*(fix[name] for name in fix.dtype.names[1:]))),
+            ('fix', fix['arrival'], map(fix_from_numbers, *(
+                fix[name] for name in fix.dtype.names[1:]))),
             ('velocity', sent['arrival'], measured),
             ('update', self.updates, nothing), ('reset', self.resets, nothing))
             for time, payload in zip(times, payloads)), key=itemgetter(0))

@@ -16,13 +16,14 @@
 from __future__ import annotations
 
 import calendar
-from collections.abc import Callable, Mapping
-import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 import math
 from typing import Any, NamedTuple
 
 from ins_align.config import Config
-from ins_align.gnss.messages import Fix, fixes, MessageError, stamp_from_msg, velocities, Velocity
+from ins_align.gnss.messages import (
+    Fix, fix_from_msg, fix_from_numbers, MessageError, stamp_from_msg, Velocity,
+    velocity_from_msg, velocity_from_numbers)
 import numpy as np
 
 FRD_SIGNS = np.array([1.0, -1.0, -1.0])
@@ -97,6 +98,13 @@ LIVE_TYPES = {name.rsplit('/', 1)[-1]: name for name in (
     'sensor_msgs/msg/NavSatFix', 'gps_msgs/msg/GPSFix', 'ublox_msgs/msg/NavPVT', *VELOCITY_TYPES)}
 
 
+def gnss_from_msg(msg: Any, msgtype: str, config: Config) -> Sequence[Fix | Velocity]:
+    """Convert a message with a position, a velocity or both; a MessageError says why it fails."""
+    if msgtype in RECEIVERS:
+        return receiver_from_msg(msg, msgtype, config)
+    return [velocity_from_msg(msg, config) if msgtype in VELOCITY_TYPES else fix_from_msg(msg)]
+
+
 def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velocity]:
     """
     Convert a message of one of `RECEIVERS`; sigmas that are not stated are those of `config`.
@@ -119,18 +127,16 @@ def receiver_from_msg(msg: Any, msgtype: str, config: Config) -> tuple[Fix, Velo
             raise MessageError(
                 f'{field} of {type_in_words(msgtype)} comes to {degrees:.6g} deg: it must be in '
                 f'units of {row.position[field]:.6g} deg')
-    fix, = fixes([stamp_ns], [position], _covariance(position_std),
-                 [getattr(msg, 'position_covariance_type', 2)], [0 if has_fix else -1])
+    fix = fix_from_numbers(stamp_ns, position, _covariance(position_std),
+                           getattr(msg, 'position_covariance_type', 2), 0 if has_fix else -1)
     frame = row.frame
     if frame == 'track':
         speed, course, climb = velocity_numbers
         east, north = math.sin(math.radians(course)), math.cos(math.radians(course))
         velocity_numbers, frame = [speed * east, speed * north, climb], 'enu'
-    velocity, = velocities(
-        [stamp_ns], '', [velocity_numbers if has_velocity else [math.nan] * 3],
-        _covariance(velocity_std) if velocity_std else None,
-        dataclasses.replace(config, velocity_frame=frame))
-    return fix, velocity
+    return fix, velocity_from_numbers(
+        config, stamp_ns, velocity_numbers if has_velocity else [math.nan] * 3,
+        _covariance(velocity_std) if velocity_std else None, frame)
 
 
 def imu_from_driver(msg: Any, msgtype: str) -> tuple[int, np.ndarray, np.ndarray]:
@@ -161,11 +167,11 @@ def _numbers(msg: Any, row: Receiver, fields: Mapping[str, float]) -> list[Any]:
 
 def _covariance(std: list[Any]) -> np.ndarray:
     """
-    Return a covariance, shape (1, 3, 3), from sigmas (horizontal, vertical) or as sent.
+    Return a covariance, nine numbers, from sigmas (horizontal, vertical) or as sent.
 
     It has the sign of the sigmas: negative ones are not known.
     """
     if np.ndim(std[0]):
-        return np.reshape(std[0], (1, 3, 3))
-    sigmas = np.diag([std[0], std[0], std[-1]])[None]
+        return np.asarray(std[0])
+    sigmas = np.diag([std[0], std[0], std[-1]])
     return sigmas * np.abs(sigmas)

@@ -19,7 +19,7 @@ Objects with the fields of the ROS message are as good as messages.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import math
 import re
@@ -55,6 +55,10 @@ UNKNOWN_ALTITUDE_STD = 1e4  # m, of an altitude that a fix does not have
 
 class MessageError(ValueError):
     """A message that cannot be used; the text says why."""
+
+
+class BodyFrameError(MessageError):
+    """A velocity in a body frame."""
 
 
 class Fix(NamedTuple):
@@ -170,71 +174,64 @@ def imu_from_msg(msg: Any) -> tuple[int, np.ndarray, np.ndarray]:
     return stamp_from_msg(msg), rate, force
 
 
-def fixes_from_msgs(msgs: Sequence[Any]) -> list[Fix]:
-    """Convert sensor_msgs/NavSatFix; a covariance of unknown type or without meaning is None."""
-    return fixes([stamp_from_msg(msg) for msg in msgs],
-                 [[msg.latitude, msg.longitude, msg.altitude] for msg in msgs],
-                 np.array([msg.position_covariance for msg in msgs], float).reshape(-1, 3, 3),
-                 [msg.position_covariance_type for msg in msgs],
-                 [msg.status.status for msg in msgs])
+def fix_from_msg(msg: Any) -> Fix:
+    """Convert sensor_msgs/NavSatFix."""
+    return fix_from_numbers(
+        stamp_from_msg(msg), [msg.latitude, msg.longitude, msg.altitude], msg.position_covariance,
+        msg.position_covariance_type, msg.status.status)
 
 
-def fixes(stamps_ns: ArrayLike, places: ArrayLike, covariances: np.ndarray,
-          covariance_types: ArrayLike, status: ArrayLike) -> list[Fix]:
+def fix_from_numbers(stamp_ns: int, place: Iterable[float], covariance: ArrayLike | None,
+                     covariance_type: int = 3, status: int = 0) -> Fix:
     """
-    Return fixes from the columns of N messages, with types and status as in sensor_msgs/NavSatFix.
+    Return a fix; a covariance of type 0 or without meaning is not known.
 
-    Places, (N, 3), are latitude and longitude, degrees, and altitude, m; covariances, (N, 3, 3),
-    m^2, are as sent.
+    The place is latitude and longitude, degrees, and altitude, m. The covariance, nine numbers,
+    m^2, is as sent, None: it is not known; its type and the status are as in
+    sensor_msgs/NavSatFix.
     """
-    columns = (stamps_ns, *np.asarray(places, float).T, covariance_types, status)
-    return [Fix(stamp, latitude, longitude, altitude,
-                sound_covariance(covariance) if kind != 0 else None, mode)
-            for (stamp, latitude, longitude, altitude, kind, mode), covariance
-            in zip(zip(*(np.asarray(column).tolist() for column in columns)), covariances)]
+    sent = (None if covariance is None or covariance_type == 0
+            else np.array(covariance, dtype=float).reshape(3, 3))
+    latitude, longitude, altitude = map(float, place)
+    return Fix(int(stamp_ns), latitude, longitude, altitude, sound_covariance(sent), int(status))
 
 
-def velocities_from_msgs(msgs: Sequence[Any], config: Config) -> list[Velocity]:
-    """Convert messages of ``config.velocity_type``, all in one frame, as `velocities` does."""
-    covariances = None
-    if config.velocity_type == 'Vector3Stamped':
-        linear = [msg.vector for msg in msgs]
-    elif config.velocity_type == 'TwistStamped':
-        linear = [msg.twist.linear for msg in msgs]
+def velocity_from_msg(msg: Any, config: Config) -> Velocity:
+    """Convert a message of one of the types of ``velocity_type``; checks its frame_id."""
+    covariance = None
+    if hasattr(msg, 'vector'):  # Vector3Stamped
+        linear = msg.vector
+    elif hasattr(msg.twist, 'linear'):  # TwistStamped
+        linear = msg.twist.linear
     else:
-        linear = [msg.twist.twist.linear for msg in msgs]
-        covariances = np.array([msg.twist.covariance for msg in msgs], float).reshape(-1, 6, 6)
-    return velocities([stamp_from_msg(msg) for msg in msgs],
-                      frame_of_velocity(msgs[0], config.velocity_type),
-                      [[each.x, each.y, each.z] for each in linear], covariances, config)
+        linear = msg.twist.twist.linear
+        covariance = np.reshape(msg.twist.covariance, (6, 6))[:3, :3]
+    refuse_body_frame(str(getattr(msg, 'child_frame_id', msg.header.frame_id)), config)
+    return velocity_from_numbers(config, stamp_from_msg(msg), [linear.x, linear.y, linear.z],
+                                 covariance)
 
 
-def frame_of_velocity(msg: Any, velocity_type: str) -> str:
-    """Return the frame_id of the velocity in a message."""
-    return str(msg.child_frame_id if velocity_type == 'Odometry' else msg.header.frame_id)
-
-
-def velocities(stamps_ns: ArrayLike, frame: str, linear: ArrayLike,
-               covariances: np.ndarray | None, config: Config) -> list[Velocity]:
-    """
-    Return velocities from the columns of N messages with the same frame_id, `frame`.
-
-    `linear`, (N, 3), m/s, is ENU unless ``config.velocity_frame`` is ned. Of covariances, which
-    may be those of twists, (N, 6, 6), the first three rows and columns are used, as in
-    `sound_covariance`. Raises MessageError if `frame` is a body frame and
-    ``config.velocity_frame`` is auto.
-    """
+def refuse_body_frame(frame: str, config: Config) -> None:
+    """Raise BodyFrameError if a frame_id is that of a body and ``velocity_frame`` is auto."""
     if config.velocity_frame == 'auto' and _BODY_FRAME.search(frame):
-        raise MessageError(
+        raise BodyFrameError(
             f'the velocity is given in the body frame {frame[:80]!r}: an alignment needs it in a '
             'world frame, east-north-up or north-east-down; if it is in one, whatever its '
             'frame_id says, set velocity_frame to enu or ned')
+
+
+def velocity_from_numbers(config: Config, stamp_ns: int, linear: ArrayLike,
+                          covariance: ArrayLike | None, frame: str = '') -> Velocity:
+    """
+    Return a velocity; `linear`, (3,), m/s, is ENU unless ``config.velocity_frame`` is ned.
+
+    The covariance, nine numbers, m^2/s^2, is as sent, None: it is not known. `frame`, enu or ned,
+    takes the place of ``config.velocity_frame``.
+    """
     velocity = np.array(linear, dtype=float)
-    sent: Array = (np.zeros((len(velocity), 3, 3)) if covariances is None
-                   else covariances[:, :3, :3])
-    if config.velocity_frame == 'ned':
+    sent = None if covariance is None else np.array(covariance, dtype=float).reshape(3, 3)
+    if (frame or config.velocity_frame) == 'ned':
         velocity = enu_from_ned(velocity)
-        sent = enu_from_ned(enu_from_ned(sent).swapaxes(1, 2))
+        sent = None if sent is None else enu_from_ned(enu_from_ned(sent).T)
     stds = config.velocity_std, config.velocity_std, config.velocity_std_vertical
-    return [Velocity(stamp_ns, vector, sound_covariance(covariance, stds)) for
-            stamp_ns, vector, covariance in zip(np.asarray(stamps_ns).tolist(), velocity, sent)]
+    return Velocity(int(stamp_ns), velocity, sound_covariance(sent, stds))

@@ -73,6 +73,7 @@ class Bag:
         self.path = Path(path)
         self.warnings: list[str] = []  # sentences on what could not be read or used
         self._topics: dict[int, Topic] = {}  # by id() of a connection
+        self._first: dict[Topic, Sequence[bytes]] = {}
         with ExitStack() as stack:
             self._readers = self._open_files(stack)
             with _bag_errors(self.path):
@@ -124,8 +125,10 @@ class Bag:
 
     def first_messages(self, topic: Topic) -> Sequence[bytes]:
         """Return the first messages of a topic, at most `FIRST`."""
-        block = next(self.blocks([topic], size=FIRST), None)
-        return block.messages[0] if block else ()
+        if topic not in self._first:
+            block = next(self.blocks([topic], size=FIRST), None)
+            self._first[topic] = block.messages[0] if block else ()
+        return self._first[topic]
 
     def _records(self, numbers: Mapping[int, int], start_ns: int | None, stop_ns: int | None,
                  ) -> Iterator[tuple[int, int, bytes]]:

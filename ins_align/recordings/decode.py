@@ -15,16 +15,14 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-import dataclasses
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 from ins_align.config import Config
 from ins_align.gnss.drivers import (
-    DRIVER_TYPES, imu_from_driver, INERTIAL_UNITS, receiver_from_msg, RECEIVERS, type_in_words,
+    DRIVER_TYPES, gnss_from_msg, imu_from_driver, INERTIAL_UNITS, RECEIVERS, type_in_words,
     VELOCITY_TYPES)
-from ins_align.gnss.messages import (
-    Fix, fixes_from_msgs, imu_from_msg, MessageError, velocities_from_msgs, Velocity)
+from ins_align.gnss.messages import BodyFrameError, Fix, imu_from_msg, MessageError, Velocity
 from ins_align.recordings import Topic
 import numpy as np
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
@@ -136,38 +134,21 @@ def _decode_imu_rows(data: np.ndarray, encoding: str) -> tuple[np.ndarray, np.nd
 
 def decode_gnss(messages: Sequence[bytes], topic: Topic, config: Config) -> dict[str, list[Gnss]]:
     """Decode messages with positions, velocities or both: by kind, one `Gnss` per message."""
-    kinds = KINDS[topic.msgtype]
-    if topic.msgtype in VELOCITY_TYPES:
-        config = dataclasses.replace(config, velocity_type=short_name(topic.msgtype))
     rows = [_decode_gnss_message(data, topic, config) for data in messages]
-    return {kind: [row[column] for row in rows] for column, kind in enumerate(kinds)}
+    return {kind: [row[column] for row in rows]
+            for column, kind in enumerate(KINDS[topic.msgtype])}
 
 
 def _decode_gnss_message(data: bytes, topic: Topic, config: Config) -> Sequence[Gnss]:
     """Decode one message: one `Gnss` for each of its kinds."""
-    kinds = KINDS[topic.msgtype]
-    if topic.msgtype in RECEIVERS:
-        try:
-            return receiver_from_msg(deserialize(data, topic), topic.msgtype, config)
-        except MessageError as error:
-            return [Refused(f'{kind}_undecodable', str(error)) for kind in kinds]
-    message = deserialize_or_none(data, topic)
-    if message is None:
-        return [Refused(f'{kinds[0]}_undecodable')]
-    if topic.msgtype == FIX_TYPE:
-        return fixes_from_msgs([message])
     try:
-        return velocities_from_msgs([message], config)
-    except MessageError as error:
+        return gnss_from_msg(deserialize(data, topic), topic.msgtype, config)
+    except BodyFrameError as error:
         return [Refused('velocity_body_frame', str(error))]
-
-
-def deserialize_or_none(data: bytes, topic: Topic) -> Any:
-    """Deserialise one message as `deserialize` does; return None where that raises an error."""
-    try:
-        return deserialize(data, topic)
-    except MessageError:
-        return None
+    except MessageError as error:
+        # Damaged messages of standard types are only counted.
+        why = str(error) if topic.msgtype in RECEIVERS else ''
+        return [Refused(f'{kind}_undecodable', why) for kind in KINDS[topic.msgtype]]
 
 
 def short_name(msgtype: str) -> str:

@@ -15,24 +15,23 @@
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
-import dataclasses
 import itertools
 from operator import itemgetter
 import os
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ins_align.config import Config
 from ins_align.geometry.rotation import Transform
 from ins_align.gnss.drivers import (
-    DRIVER_TYPES, imu_from_driver, INERTIAL_UNITS, LIVE_TYPES, NoTimeError, receiver_from_msg,
+    DRIVER_TYPES, gnss_from_msg, imu_from_driver, INERTIAL_UNITS, LIVE_TYPES, NoTimeError,
     RECEIVERS, type_in_words, VELOCITY_TYPES)
-from ins_align.gnss.messages import MessageError, velocities_from_msgs
+from ins_align.gnss.messages import MessageError
 from ins_align.mounting import find_mounting, FixedFrames, Mounting
 from ins_align.recordings import BagError, listed, Topic
 from ins_align.recordings.bag import Bag, Block
 from ins_align.recordings.decode import (
-    decode, decode_imu, deserialize, deserialize_or_none, FIX_TYPE, Gnss, IMU_TYPE, ImuSamples,
-    short_name, TF_TYPE, VECTOR_TYPE)
+    decode, decode_imu, deserialize, FIX_TYPE, Gnss, IMU_TYPE, ImuSamples, short_name, TF_TYPE,
+    VECTOR_TYPE)
 from ins_align.results import Severity
 import numpy as np
 
@@ -57,7 +56,7 @@ class Part(NamedTuple):
     """Consecutive decoded messages of a recording."""
 
     topics: Topics
-    config: Config  # as requested, with the type of velocity and lever arm of this recording
+    config: Config  # as requested, with the lever arm of this recording
     imu: ImuSamples
     gnss: tuple[tuple[int, Gnss], ...]  # each with the number of IMU samples in `imu` before it
     reference: ImuSamples  # whose orientations are the reference
@@ -80,8 +79,6 @@ def read(path: str | os.PathLike[str], config: Config = Config(), imu_topic: str
         except BagError as error:
             reasons = f' ({bag.warnings[0]})' if bag.warnings else ''
             raise BagError(f'{error}{reasons}') from None
-        if topics.velocity is not None and topics.velocity.msgtype in VELOCITY_TYPES:
-            config = dataclasses.replace(config, velocity_type=short_name(topics.velocity.msgtype))
         mounting = _mounting(bag, topics, config)
         config, topics = mounting.config, topics._replace(base=mounting.base)
         wanted = list(dict.fromkeys(topic for topic in topics if isinstance(topic, Topic)))
@@ -127,11 +124,16 @@ def _mounting(bag: Bag, topics: Topics, config: Config) -> Mounting:
 
 def frame_id_of(bag: Bag, topic: Topic) -> str:
     """Return the first frame_id in the first messages of a topic; empty if there is none."""
+    frame_ids = (str(message.header.frame_id) for message in _first_readable(bag, topic)
+                 if hasattr(message, 'header'))
+    return next(filter(None, frame_ids), '')
+
+
+def _first_readable(bag: Bag, topic: Topic) -> Iterator[Any]:
+    """Yield those of the first messages of a topic that can be deserialised."""
     for data in bag.first_messages(topic):
-        with suppress(MessageError, AttributeError):
-            if frame_id := str(deserialize(data, topic).header.frame_id):
-                return frame_id
-    return ''
+        with suppress(MessageError):
+            yield deserialize(data, topic)
 
 
 def _decoded(block: Block, wanted: list[Topic], topics: Topics, config: Config, done: float,
@@ -194,7 +196,7 @@ def _velocity(bag: Bag, config: Config, fix: Topic, name: str | None) -> Topic |
     elif topic.msgtype in preferred:
         if names := sorted(f'{other.name} ({short_name(other.msgtype)})'
                            for other in candidates(bag, others)
-                           if not doubt(bag.first_messages(other), other)):
+                           if not doubt(bag, other)):
             bag.warn(f'the velocity is read from {topic.name} ({short_name(topic.msgtype)}), '
                      f'not from {", ".join(names)}: --velocity-topic chooses')
     return topic
@@ -255,21 +257,18 @@ def candidates(bag: Bag, types: Collection[str]) -> list[Topic]:
     return found
 
 
-def doubt(first: Sequence[bytes], topic: Topic, config: Config = Config()) -> str:
+def doubt(bag: Bag, topic: Topic, config: Config = Config()) -> str:
     """Return why a topic is not what its type promises, judged by one of its messages, or ''."""
+    first = bag.first_messages(topic)
     if not first:
         return 'it has no messages'
-    read = (deserialize_or_none(data, topic) for data in first)
     try:
-        message = next(filter(None, read), None) or deserialize(first[0], topic)
-        if topic.msgtype in RECEIVERS:
-            with suppress(NoTimeError):
-                receiver_from_msg(message, topic.msgtype, config)
-        elif topic.msgtype in INERTIAL_UNITS:
+        message = next(_first_readable(bag, topic), None) or deserialize(first[0], topic)
+        if topic.msgtype in INERTIAL_UNITS:
             imu_from_driver(message, topic.msgtype)
-        elif topic.msgtype in VELOCITY_TYPES:
-            velocities_from_msgs([message], dataclasses.replace(
-                config, velocity_type=short_name(topic.msgtype)))
+        elif topic.msgtype != IMU_TYPE:
+            with suppress(NoTimeError):
+                gnss_from_msg(message, topic.msgtype, config)
     except MessageError as error:
         return str(error)
     if topic.msgtype != IMU_TYPE:
@@ -283,7 +282,7 @@ def doubt(first: Sequence[bytes], topic: Topic, config: Config = Config()) -> st
 
 def _can_be_used(bag: Bag, topic: Topic, config: Config) -> bool:
     """Tell whether a topic is what its type promises by its first messages; warn if not."""
-    if why := doubt(bag.first_messages(topic), topic, config):
+    if why := doubt(bag, topic, config):
         bag.warn(f'{topic.name} cannot be used: {why}')
     return not why
 

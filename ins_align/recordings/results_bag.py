@@ -20,13 +20,14 @@ import math
 import os
 from pathlib import Path
 import tempfile
+from types import SimpleNamespace
 from typing import Any
 
 from ins_align.imu.buffer import MAX_GAP_NS, MAX_RATE
 from ins_align.imu.prediction import Prediction
 from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
-from ins_align.recordings.decode import decode_imu, deserialize
+from ins_align.recordings.decode import decode_imu, deserialize, IMU_TYPE, VECTOR_TYPE
 from ins_align.recordings.reader import frame_id_of
 from ins_align.results import Epoch, FOR_PLOTS, level_of, Result, State, Status, status_values
 import numpy as np
@@ -34,11 +35,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
 NAMESPACE = '/ins_align'
-IMU, ATTITUDE = 'sensor_msgs/msg/Imu', 'geometry_msgs/msg/QuaternionStamped'
-STATUS, VECTOR = 'diagnostic_msgs/msg/DiagnosticArray', 'geometry_msgs/msg/Vector3Stamped'
-XYZ = 'geometry_msgs/msg/Vector3'
-TOPICS = {'imu': IMU, 'initial_attitude': ATTITUDE, 'status': STATUS,
-          **dict.fromkeys(FOR_PLOTS, VECTOR)}
+TOPICS = {'imu': IMU_TYPE, 'initial_attitude': 'geometry_msgs/msg/QuaternionStamped',
+          'status': 'diagnostic_msgs/msg/DiagnosticArray',
+          **dict.fromkeys(FOR_PLOTS, VECTOR_TYPE)}
 STATUS_PERIOD_NS = 1_000_000_000  # a change of the state is written at once
 # Without GNSS there is an epoch every 2 s; the gyros carry no older attitude forward.
 MAX_AGE_NS = 2_500_000_000
@@ -58,24 +57,25 @@ def write_results(result: Result, path: str | os.PathLike[str]) -> None:
     if path.exists():
         raise BagError(f'{path} exists already: choose another name for the results or remove it')
     store = get_typestore(Stores.ROS2_JAZZY)
+    ros = SimpleNamespace(**{name.split('/')[-1]: kind for name, kind in store.types.items()})
     with tempfile.TemporaryDirectory(prefix=f'.{path.name}.', dir=path.parent) as directory:
         unfinished = Path(directory) / path.name
         with Writer(unfinished, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
             connections = {name: writer.add_connection(f'{NAMESPACE}/{name}', msgtype,
                                                        typestore=store)
                            for name, msgtype in TOPICS.items()}
-            for name, time_ns, message in _Results(result, store.types).records():
+            for name, time_ns, message in _Results(result, ros).records():
                 writer.write(connections[name], time_ns,
                              store.serialize_cdr(message, TOPICS[name]))
         unfinished.rename(path)
 
 
 class _Results:
-    """Makes the ROS messages of a result."""
+    """Makes the ROS messages of a result; `ros` has their types by name."""
 
-    def __init__(self, result: Result, types: Any) -> None:
+    def __init__(self, result: Result, ros: SimpleNamespace) -> None:
         assert result.topics is not None
-        self._result, self._types = result, types
+        self._result, self._ros = result, ros
         self._topic, self._base = result.topics.imu, result.topics.base
         self._imu_frame = ''
         self._state: State | None = None  # of the epoch before
@@ -141,12 +141,12 @@ class _Results:
         first, now = epoch.initial, epoch.current
         declared = epoch.state is State.ALIGNED and self._state is not State.ALIGNED
         if declared and first is not None:
-            yield 'initial_attitude', time_ns, self._make(
-                ATTITUDE, self._header(first.stamp_ns), self._quaternion(first.quaternion_xyzw))
+            yield 'initial_attitude', time_ns, self._ros.QuaternionStamped(
+                self._header(first.stamp_ns), self._quaternion(first.quaternion_xyzw))
         if now is not None:
             for name in FOR_PLOTS:
-                yield name, time_ns, self._make(
-                    VECTOR, self._header(now.stamp_ns), self._make(XYZ, *getattr(now, name)))
+                yield name, time_ns, self._ros.Vector3Stamped(
+                    self._header(now.stamp_ns), self._ros.Vector3(*getattr(now, name)))
         since_ns = abs(epoch.stamp_ns - self._status_ns)  # the clock may have been set back
         if epoch.state is not self._state or since_ns >= STATUS_PERIOD_NS:
             self._status_ns = epoch.stamp_ns
@@ -160,30 +160,26 @@ class _Results:
         """Return the input message with its orientation set."""
         orientation = self._quaternion(prediction.quaternion_xyzw)
         covariance = np.array(prediction.covariance)
-        if self._topic.msgtype == IMU:
+        if self._topic.msgtype == IMU_TYPE:
             return dataclasses.replace(deserialize(data, self._topic), orientation=orientation,
                                        orientation_covariance=covariance)
         # A driver's own type has neither a header nor an orientation.
-        return self._make(
-            IMU, self._header(prediction.stamp_ns), orientation, covariance,
-            self._make(XYZ, *gyro.tolist()), np.zeros(9),
-            self._make(XYZ, *accel.tolist()), np.zeros(9))
+        return self._ros.Imu(
+            self._header(prediction.stamp_ns), orientation, covariance,
+            self._ros.Vector3(*gyro.tolist()), np.zeros(9),
+            self._ros.Vector3(*accel.tolist()), np.zeros(9))
 
     def _status(self, status: Status) -> Any:
         values = status_values(status, self._result.config.base_frame, self._base)
-        return self._make(STATUS, self._header(status.stamp_ns or 0), [self._make(
-            'diagnostic_msgs/msg/DiagnosticStatus', level_of(status.state),
-            'ins_align: alignment', f'{status.state.value}: {status.reason}'.removesuffix(': '),
-            self._imu_frame, [self._make('diagnostic_msgs/msg/KeyValue', *each)
-                                    for each in values.items()])])
+        return self._ros.DiagnosticArray(self._header(status.stamp_ns or 0), [
+            self._ros.DiagnosticStatus(
+                level_of(status.state), 'ins_align: alignment',
+                f'{status.state.value}: {status.reason}'.removesuffix(': '), self._imu_frame,
+                [self._ros.KeyValue(*each) for each in values.items()])])
 
     def _header(self, stamp_ns: int) -> Any:
-        return self._make('std_msgs/msg/Header', self._make(
-            'builtin_interfaces/msg/Time', *divmod(stamp_ns, 1_000_000_000)),
-            self._result.config.world_frame_id)
+        return self._ros.Header(self._ros.Time(*divmod(stamp_ns, 1_000_000_000)),
+                                self._result.config.world_frame_id)
 
     def _quaternion(self, xyzw: Any) -> Any:
-        return self._make('geometry_msgs/msg/Quaternion', *map(float, xyzw))
-
-    def _make(self, msgtype: str, *fields: Any) -> Any:
-        return self._types[msgtype](*fields)
+        return self._ros.Quaternion(*map(float, xyzw))

@@ -29,7 +29,7 @@ from ins_align.gnss.motion import GRID, Series, series_of
 from ins_align.imu.buffer import MAX_ACCELERATION, MAX_RATE, SAME_VALUES
 from ins_align.imu.noise import force_fault, white_noise
 from ins_align.recordings import Topic
-from ins_align.recordings.bag import Bag, FIRST
+from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import decode, Gnss, ImuSamples, KINDS, Refused
 from ins_align.recordings.reader import candidates, doubt
 import numpy as np
@@ -129,17 +129,17 @@ class Recorded(Surveyed):
     msgtype: str
     kind: str  # imu, fix or velocity
 
-    def __init__(self, topic: Topic, kind: str, start_ns: int, first: Sequence[bytes],
-                 messages: int, parts: Sequence[Columns]) -> None:
-        """Survey a topic by its first messages, the number of all and their decoded parts."""
+    def __init__(self, bag: Bag, topic: Topic, kind: str, messages: int,
+                 parts: Sequence[Columns]) -> None:
+        """Survey a topic by the number of its messages and their decoded parts."""
         super().__init__()
         self.name, self.msgtype, self.kind = topic.name, type_in_words(topic.msgtype), kind
         # Why the messages may not be what their type promises; '' if there is no doubt.
-        self.doubt = doubt(first, topic)
+        self.doubt = doubt(bag, topic)
         data = Columns(*map(np.concatenate, zip(*parts))) if parts else NOTHING
         self.recorded_ns, self.stamps_ns, self.values = data[:3]
         self.usable = data.usable  # without stamps that are astray, see below
-        self._start_ns, self._age_ns = start_ns, 0
+        self._start_ns, self._age_ns = bag.start_ns, 0
         count = self.stamps_ns.size
         self.add('', messages=messages)
         if not count:
@@ -217,20 +217,17 @@ class Recorded(Surveyed):
 def read_candidates(bag: Bag) -> list[Recorded]:
     """Read and survey every topic that an alignment could read, sorted by name."""
     topics = sorted(candidates(bag, KINDS))
-    first: dict[Topic, list[bytes]] = defaultdict(list)
     counts: Counter[Topic] = Counter()
     parts: dict[tuple[Topic, str], list[Columns]] = defaultdict(list)
     for block in bag.blocks(topics):
         for number, (topic, messages) in enumerate(zip(topics, block.messages)):
-            first[topic] += messages[:FIRST - len(first[topic])]
             counts[topic] += len(messages)
             times_ns = block.times_ns[block.topics == number]
             # The frame_id of a velocity is ignored: the motion will show its frame.
             decoded = decode(messages, topic, Config(velocity_frame='enu'))
             for kind, data in decoded.items():
                 parts[topic, kind].append(columns_of(times_ns, data))
-    return [Recorded(topic, kind, bag.start_ns, first[topic], counts[topic],
-                     parts[topic, kind])
+    return [Recorded(bag, topic, kind, counts[topic], parts[topic, kind])
             for topic in topics for kind in KINDS[topic.msgtype]]
 
 

@@ -27,10 +27,8 @@ from typing import Any, NamedTuple
 
 from ins_align.config import Config, ConfigError
 from ins_align.geometry.rotation import Transform
-from ins_align.gnss.drivers import (
-    LIVE_TYPES, receiver_from_msg, RECEIVERS, type_in_words, VELOCITY_TYPES)
-from ins_align.gnss.messages import (
-    Fix, fixes_from_msgs, imu_from_msg, velocities_from_msgs, Velocity)
+from ins_align.gnss.drivers import LIVE_TYPES, RECEIVERS, type_in_words, VELOCITY_TYPES
+from ins_align.gnss.messages import imu_from_msg
 from ins_align.mounting import Lookup, transform_from_msg
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -177,16 +175,6 @@ def topic_faults(node: Node, inputs: Mapping[str, str], expected: Sequence[str])
         settable = topic == VELOCITY_TOPIC and other in VELOCITY_TYPES
         hint = f': set velocity_type to {other.split("/")[-1]}' if settable else ''
         yield f'{name} is published as {type_in_words(other)}, not {type_in_words(wanted)}{hint}'
-
-
-def gnss_from_msg(topic: str, msg: Any, config: Config) -> Sequence[Fix | Velocity]:
-    """Convert a message of a GNSS topic; a MessageError says why it cannot be used."""
-    if topic == VELOCITY_TOPIC:
-        return velocities_from_msgs([msg], config)
-    fix_type = LIVE_TYPES[config.fix_type]
-    if fix_type in RECEIVERS:
-        return receiver_from_msg(msg, fix_type, config)
-    return fixes_from_msgs([msg])
 
 
 def open_static_tf(node: Node, config: Config) -> Lookup | None:

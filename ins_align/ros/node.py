@@ -32,13 +32,14 @@ from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
 from ins_align.config import (
     Config, config_from_mapping, ConfigError, listed_choices, NODE_NAME, RCLPY_PARAMETERS,
     without_unknown)
+from ins_align.gnss.drivers import gnss_from_msg
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
 from ins_align.mounting import Mounting, MountingSearch
 from ins_align.results import FOR_PLOTS, level_of, Severity, status_values, WARN
 from ins_align.ros.inputs import (
-    FIX_TOPIC, Gate, gnss_from_msg, gnss_topics, ImuSample, inputs_in_words, message_class,
-    open_static_tf, queued, read_imu, REJECTED_AS, topic_faults, VELOCITY_TOPIC, with_orientation)
+    FIX_TOPIC, Gate, gnss_topics, ImuSample, inputs_in_words, message_class, open_static_tf,
+    queued, read_imu, REJECTED_AS, topic_faults, VELOCITY_TOPIC, with_orientation)
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
@@ -194,7 +195,7 @@ class AlignmentNode(Node):
             self._search.antenna_frame = header.frame_id if header else ''
         items: Iterable[Any]
         try:
-            items = gnss_from_msg(topic, msg, self._config)
+            items = gnss_from_msg(msg, self._inputs[topic], self._config)
         except MessageError as error:
             why = str(error)
             items = [lambda: self._aligner.reject(REJECTED_AS[topic], why)]
