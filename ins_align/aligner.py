@@ -302,7 +302,8 @@ class Aligner:
         self._done.append(Epoch(
             epoch.stamp_ns, (epoch.stamp_ns - (self._first_t0_ns or 0)) * 1e-9, verdict.state,
             self._initial, self._current, fit.innovation, sensors.gyro_bias, sensors.accel_bias,
-            epoch.dry, verdict.reason, self._started_over))
+            method.nuisance().gyro_bias_std, sensors.gyro_matrix, epoch.dry, verdict.reason,
+            self._started_over))
         self._started_over = ''
 
     def _decide(self, epoch: AntennaEpoch, method: Bank | NoteMethod, fit: Fit) -> Verdict:

@@ -136,6 +136,8 @@ class Epoch:
     innovation: Array
     gyro_bias: Array  #: (3,), rad/s
     accel_bias: Array  #: (3,), m/s^2
+    gyro_bias_std: Array  #: (3,), rad/s
+    gyro_matrix: Array  #: (3, 3), scale factors and misalignment, see `SensorErrors`
     dry: bool = False  #: whether the epoch has no measurement and only divides a GNSS outage
     reason: str = ''  #: why the state is as it is
     #: Why the alignment started over since the previous epoch; empty if it did not.

@@ -15,6 +15,8 @@
 
 import math
 
+from alignment import feed
+from ins_align.aligner import Aligner
 from ins_align.cli import main
 from ins_align.config import Config
 from ins_align.geometry.rotation import log_so3, matrix_from_quaternion
@@ -106,6 +108,25 @@ def test_orientation_against_truth(drive):
     epochs = np.searchsorted([epoch.stamp_ns for epoch in result.epochs], stamps)
     steps = np.abs(np.diff(errors, axis=0))[np.diff(epochs) == 0]
     assert steps.max() < 0.01 < np.degrees(np.abs(simulation.gyro[:, 2]).max()) * PERIOD_NS * 1e-9
+
+
+def test_the_last_orientation_is_that_of_the_node(tmp_path):
+    """Gyros that are a chip's turn by degrees too much; both take that off."""
+    flight = simulate('flight', seed=3, duration=60.0, imu_rate=50.0, gnss_rate=1.0,
+                      gyro_scale_std=0.03)
+    config = Config(lever_arm=(1.0, 1.0, 1.0), imu_grade='chip', heading_std_threshold=8.0,
+                    tilt_std_threshold=4.0)
+    write_bag(flight, tmp_path / 'flight')
+    write_results(replay(tmp_path / 'flight', config), tmp_path / 'out')
+    _, last = read(tmp_path / 'out')['/ins_align/imu'][-1]
+    aligner = Aligner(config)
+    feed(aligner, flight)
+    now = aligner.attitude_now()
+    turn = last.orientation
+    assert stamp_from_msg(last) == now.stamp_ns > aligner.status().stamp_ns
+    assert np.array([turn.x, turn.y, turn.z, turn.w]) == pytest.approx(
+        now.quaternion_xyzw, abs=1e-6)
+    assert last.orientation_covariance == pytest.approx(now.covariance.ravel(), rel=1e-6)
 
 
 def test_status_is_that_of_the_result(drive):

@@ -165,7 +165,8 @@ def follow(aligner: Aligner, stream: Stream) -> Iterator[list[Epoch]]:
             status = aligner.status()
             current = aligner.attitude_now() if stream.between else status.current
             epochs = [Epoch(stamp_ns, math.nan, status.state, status.initial, current,
-                            np.full(3, np.nan), status.gyro_bias, status.accel_bias, dry=True)]
+                            np.full(3, np.nan), status.gyro_bias, status.accel_bias,
+                            status.gyro_bias_std, np.zeros((3, 3)), dry=True)]
         yield epochs
         due = now + UPDATE_EVERY * SECOND
         if kind == 'reset':

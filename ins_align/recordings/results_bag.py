@@ -83,9 +83,8 @@ class _Results:
         nan = np.full(3, math.nan)
         # An Epoch does not hold these values of a Status.
         self._unknown = dataclasses.replace(
-            result.status, gyro_bias_std=nan, accel_bias_std=nan, lever_arm=nan,
-            lever_arm_std=nan, gnss_delay=math.nan, gnss_delay_std=math.nan, counts={},
-            time_to_align_s=None)
+            result.status, accel_bias_std=nan, lever_arm=nan, lever_arm_std=nan,
+            gnss_delay=math.nan, gnss_delay_std=math.nan, counts={}, time_to_align_s=None)
 
     def records(self) -> Iterator[Record]:
         """Yield IMU messages with the attitude, and between them the messages of the epochs."""
@@ -132,9 +131,9 @@ class _Results:
         """Return a prediction from an epoch with this rate, rad/s; None unless it is declared."""
         if epoch.state is not State.ALIGNED or epoch.current is None:
             return None
-        noise = self._result.config.imu_noise
-        return Prediction(epoch.current, epoch.gyro_bias, np.zeros((3, 3)),
-                          noise.gyro_bias_std, noise.angle_random_walk, rate, interval)
+        return Prediction(epoch.current, epoch.gyro_bias, epoch.gyro_matrix,
+                          float(np.max(epoch.gyro_bias_std)),
+                          self._result.config.imu_noise.angle_random_walk, rate, interval)
 
     def _of_epoch(self, epoch: Epoch, time_ns: int) -> Iterator[Record]:
         """Yield the messages of an epoch: initial attitude, values for plots, status."""
@@ -153,7 +152,8 @@ class _Results:
             yield 'status', time_ns, self._status(dataclasses.replace(
                 self._unknown, state=epoch.state, reason=epoch.reason, stamp_ns=epoch.stamp_ns,
                 t0_ns=first and first.stamp_ns, initial=first, current=now,
-                gyro_bias=epoch.gyro_bias, accel_bias=epoch.accel_bias))
+                gyro_bias=epoch.gyro_bias, gyro_bias_std=epoch.gyro_bias_std,
+                accel_bias=epoch.accel_bias))
         self._state = epoch.state
 
     def _imu(self, prediction: Prediction, data: bytes, gyro: Any, accel: Any) -> Any:
