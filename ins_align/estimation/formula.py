@@ -143,7 +143,8 @@ class NoteMethod:
 
     def _pair(self, epoch: AntennaEpoch) -> None:
         """Add the pair of vectors of an epoch, without the known start, and solve."""
-        if not epoch.position_measured if self._from_positions else epoch.v_n is None:
+        used = epoch.position_measured if self._from_positions else epoch.v_n is not None
+        if not used:
             return
         time = float(self._track.time)
         known, free = np.split(time ** np.arange(1 + self._kind), [len(self._known)])
