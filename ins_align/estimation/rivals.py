@@ -125,9 +125,9 @@ def rivals_of(config: Config) -> tuple[Rival, ...]:
     """Return the rivals of a configuration, which itself comes first."""
     bias = config.imu_noise.gyro_bias_std
     precise = bias < PRECISE * PRESETS['tactical'].gyro_bias_std
-    worse = '' if precise else next(
+    grade = '' if precise else next(
         (grade for grade in ('mems', 'chip') if PRESETS[grade].gyro_bias_std > bias), '')
-    levels = (*LEVELS[:-1], replace(LEVELS[-1], grade=worse),
+    levels = (*LEVELS[:-1], replace(LEVELS[-1], grade=grade),
               *(level for name, std, level in CERTAIN if getattr(config, name) < std))
     rivals = (*levels, *(() if config.trust_imu_axes else SIGNS), *((GRADE,) if precise else ()))
     if config.vehicle == 'none':

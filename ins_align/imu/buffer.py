@@ -63,17 +63,17 @@ class ImuBuffer:
     IMU samples that are not integrated yet, sorted by their stamps and counted in `counts`.
 
     Samples may arrive out of order by up to `lateness_ns`. `stated` is the noise that the sensors
-    have at least. `check` is called with samples as they came, stamps, (N,), and values, (N, 6).
+    have at least. `watch` is called with samples as they came, stamps, (N,), and values, (N, 6).
     """
 
     def __init__(self, lateness_ns: int, counts: Counter[str],
                  stated: ImuNoise = ImuNoise(0.0, 0.0, 0.0, 0.0),
-                 check: Callable[[Index, Array], None] | None = None) -> None:
+                 watch: Callable[[Index, Array], None] | None = None) -> None:
         self._lateness_ns = lateness_ns
         self._reach_ns = max(lateness_ns, MAX_GAP_NS)
         self._counts = counts
         self._stated = np.array(stated[:2])
-        self._check_sent = check
+        self._watch = watch
         # Stamps, (N,), strictly increasing, ns; angular rate, rad/s, and specific force, m/s^2,
         # (N, 6), in Fortran order so that each axis is contiguous.
         self.stamps = np.zeros(0, np.int64)
@@ -184,8 +184,8 @@ class ImuBuffer:
         new, self._new = self._new, []
         stamps = np.concatenate([stamps for stamps, _ in new])
         samples = np.asfortranarray(np.concatenate([samples for _, samples in new])).T
-        if self._check_sent is not None:
-            self._check_sent(stamps, samples.T)
+        if self._watch is not None:
+            self._watch(stamps, samples.T)
         self._counts['imu'] += stamps.size
         with np.errstate(invalid='ignore'):
             good = np.all(np.abs(samples) < _LIMITS, axis=0)
