@@ -82,7 +82,8 @@ class Aligner:
         self._checks = InputChecks(self.config)
         self._imu = ImuBuffer(lateness_ns, self._counts, self.config.imu_noise,
                               self._checks.add_imu)
-        self._gnss = GnssBuffer(lateness_ns, self._counts, max(-self._delay_ns, 0))
+        self._gnss = GnssBuffer(lateness_ns, self._counts, max(-self._delay_ns, 0),
+                                self._checks.add_gnss)
         self._refusal = ''                          # why the last velocity could not be used
         self._first_t0_ns: int | None = None
         self._forget(None)
@@ -140,7 +141,7 @@ class Aligner:
 
     def add_fix(self, fix: Fix) -> None:
         """Take a GNSS position."""
-        self._add_gnss(fix)
+        self._gnss.add(fix._replace(stamp_ns=fix.stamp_ns - self._delay_ns), self._imu.newest_ns)
 
     def add_velocity(self, velocity: Velocity) -> None:
         """Take a GNSS velocity."""
@@ -148,12 +149,8 @@ class Aligner:
         if self.config.use_velocity is False:
             self._counts['velocity'] += 1
             return
-        self._add_gnss(velocity)
-
-    def _add_gnss(self, message: Fix | Velocity) -> None:
-        message = message._replace(stamp_ns=message.stamp_ns - self._delay_ns)
-        self._checks.add_gnss(message, self._imu.newest_ns)
-        self._gnss.add(message, self._imu.newest_ns)
+        self._gnss.add(velocity._replace(stamp_ns=velocity.stamp_ns - self._delay_ns),
+                       self._imu.newest_ns)
 
     def reject(self, reason: str, why: str = '') -> None:
         """Count a message that the caller could not use; `why`, in words, is an event once."""
@@ -447,7 +444,7 @@ class Aligner:
         sensors = method.sensor_errors()
         prediction = Prediction(
             current, sensors.gyro_bias, sensors.gyro_matrix,
-            float(np.max(method.nuisance().gyro_bias_std)),
+            method.nuisance().gyro_bias_std,
             self.config.imu_noise.angle_random_walk, rate, usual)
         carried = all(prediction.propagate(*sample)
                       for sample in zip(stamps.tolist(), rates.tolist()))

@@ -22,7 +22,7 @@ import math
 from ins_align.config import Config, STANDARD_GRAVITY
 from ins_align.geometry.rotation import Array, cumulative_rotations, exp_so3, Index
 from ins_align.gnss.buffer import MAX_AHEAD_NS
-from ins_align.gnss.messages import Fix, numbers_of, usable, Velocity
+from ins_align.gnss.messages import Fix, numbers_of, Velocity
 from ins_align.gnss.motion import (
     GRID, on_grid, Series, series_of_rows, track, velocity_frame, velocity_from_positions,
     VelocityFrame, without_wild_positions)
@@ -139,15 +139,12 @@ class InputChecks:
         self._fixes: deque[tuple[float, ...]] = deque(maxlen=GNSS_MESSAGES)
         self._velocities: deque[tuple[float, ...]] = deque(maxlen=GNSS_MESSAGES)
 
-    def add_gnss(self, message: Fix | Velocity, imu_newest_ns: int | None) -> None:
-        """Take a message, its stamp less gnss_delay, and the stamp of the newest IMU sample."""
-        behind_ns = 0 if imu_newest_ns is None else imu_newest_ns - message.stamp_ns
-        late = behind_ns * 1e-9 - max(self._config.gnss_delay, 0.0)
-        self._late.append(late)
-        message, fault = usable(message)
-        numbers = numbers_of(message)
+    def add_gnss(self, message: Fix | Velocity, fault: str, behind_ns: int) -> None:
+        """Take a message as a `GnssBuffer` shows it, its stamp less gnss_delay."""
+        self._late.append(behind_ns * 1e-9 - max(self._config.gnss_delay, 0.0))
         if -behind_ns > MAX_AHEAD_NS:
             return  # of another clock
+        numbers = numbers_of(message)
         if not fault:
             rows = self._velocities if isinstance(message, Velocity) else self._fixes
             rows.append((message.stamp_ns * 1e-9, *numbers))
@@ -155,7 +152,7 @@ class InputChecks:
             self._beyond_the_poles += 1
 
     def add_imu(self, stamps_ns: Index, samples: Array) -> None:
-        """Take samples as sent: stamps, ns, (N,); rates and forces, rad/s, m/s^2, (N, 6)."""
+        """Take samples as an `ImuBuffer` shows them: stamps, ns, (N,); rad/s and m/s^2, (N, 6)."""
         rates, forces = np.abs(samples).reshape(-1, 2, 3).max(axis=2).T
         self._samples += stamps_ns.size
         self._too_fast += np.count_nonzero(rates > ANY_GYRO_RATE)
@@ -185,9 +182,10 @@ class InputChecks:
         degrees = degrees_fault(
             self._too_fast > TOO_FAST_SHARE * self._samples, (np.array(cells) + 0.5) * GRID,
             *np.split(sums[:, 1:] / sums[:, :1], 2, axis=1), motion)
+        exchanged = BEYOND_THE_POLES if self._beyond_the_poles > MIN_LATE else ''
         # Of late messages, positions and velocities may have different clocks.
-        exchanged = not self.late_messages() and exchange_fault(fixes, velocities) or (
-            BEYOND_THE_POLES if self._beyond_the_poles > MIN_LATE else '')
+        if not self.late_messages():
+            exchanged = exchange_fault(fixes, velocities) or exchanged
         return [fault for fault in (degrees, exchanged) if fault]
 
     def late_messages(self) -> list[str]:

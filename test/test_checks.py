@@ -13,12 +13,14 @@
 # limitations under the License.
 """Units, coordinates and clocks that are wrong: node, replay and info say the same."""
 
+from collections import Counter
 import dataclasses
 import re
 
 from ins_align.checks import BEYOND_THE_POLES, exchange_fault, InputChecks, lateness_advice
 from ins_align.config import Config, config_from_mapping
 from ins_align.geometry.rotation import matrix_from_rpy
+from ins_align.gnss.buffer import GnssBuffer
 from ins_align.gnss.messages import Fix, Velocity
 from ins_align.gnss.motion import Series
 from ins_align.offline import replay
@@ -157,8 +159,9 @@ def test_what_is_no_number_says_nothing():
     assert checks.faults() == []
     for values in (nan, huge):
         checks.add_imu(np.arange(3), values)
-        checks.add_gnss(Fix(0, np.nan, np.nan, np.nan, None, 0), 1)
-        checks.add_gnss(Velocity(0, values[0, :3], None), 1)
+        buffer = GnssBuffer(0, Counter(), watch=checks.add_gnss)
+        buffer.add(Fix(0, np.nan, np.nan, np.nan, None, 0), 1)
+        buffer.add(Velocity(0, values[0, :3], None), 1)
     fault, = checks.faults()  # of the huge ones
     assert DEGREES in fault
     nothing = Series(np.zeros(0), np.zeros((0, 3)))
@@ -168,6 +171,7 @@ def test_what_is_no_number_says_nothing():
 def checked(simulation, samples=500, config=Config(), checks=None, kinds=(Fix, Velocity)):
     """Give the checks a simulation as it arrives, so many samples at a time."""
     checks = checks or InputChecks(config)
+    buffer = GnssBuffer(0, Counter(), watch=checks.add_gnss)
     stamps = simulation.imu_stamps_ns
     values = np.hstack([simulation.gyro, simulation.accel])
     after = np.searchsorted(stamps, simulation.gnss_arrival_ns)
@@ -179,6 +183,6 @@ def checked(simulation, samples=500, config=Config(), checks=None, kinds=(Fix, V
             for message in (Fix(stamp, *simulation.lla_deg[k].tolist(), None, 0),
                             Velocity(stamp, simulation.velocity[k], None)):
                 if isinstance(message, kinds):
-                    checks.add_gnss(message, newest)
+                    buffer.add(message, newest)
         checks.add_imu(stamps[part], values[part])
     return checks

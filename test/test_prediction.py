@@ -35,14 +35,14 @@ COVARIANCE = np.array([[4.0, 0.5, 0.2], [0.5, 3.0, -0.1], [0.2, -0.1, 9.0]]) * 1
 
 
 def prediction():
-    return Prediction(Attitude(0, START.as_matrix(), COVARIANCE), BIAS, MATRIX, 1e-3, 2e-3,
-                      np.array(RATE), 1e-9 * STEP_NS)
+    return Prediction(Attitude(0, START.as_matrix(), COVARIANCE), BIAS, MATRIX, np.full(3, 1e-3),
+                      2e-3, np.array(RATE), 1e-9 * STEP_NS)
 
 
 def still(stamp_ns, rate):
     """Return the attitude with its axes in ENU, for gyros without errors."""
     return Prediction(Attitude(stamp_ns, np.eye(3), COVARIANCE), np.zeros(3), np.zeros((3, 3)),
-                      0.0, 0.0, rate, 1e-9 * STEP_NS)
+                      np.zeros(3), 0.0, rate, 1e-9 * STEP_NS)
 
 
 def truth(count):

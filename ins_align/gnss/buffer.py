@@ -14,6 +14,7 @@
 """The queue of GNSS messages: sorted by stamp, paired, those of no use counted by reason."""
 
 from collections import Counter
+from collections.abc import Callable
 import math
 from typing import NamedTuple
 
@@ -50,13 +51,16 @@ class GnssBuffer:
     GNSS messages that are not used yet, by stamp.
 
     `counts` counts them, and also epochs that only repeat the one before or are later than the
-    last IMU sample, and velocities of a receiver without a fix.
+    last IMU sample, and velocities of a receiver without a fix. `watch` is called with each
+    message, why it cannot be used ('' if it can), and how far it is behind the IMU, ns.
     """
 
-    def __init__(self, lateness_ns: int, counts: Counter[str], earliness_ns: int = 0) -> None:
+    def __init__(self, lateness_ns: int, counts: Counter[str], earliness_ns: int = 0,
+                 watch: Callable[[Fix | Velocity, str, int], None] | None = None) -> None:
         """Start empty; `earliness_ns` adds to the time that stamps may be ahead of the IMU."""
         self._lateness_ns, self._ahead_ns = lateness_ns, MAX_AHEAD_NS + earliness_ns
         self._counts = counts
+        self._watch = watch
         self._pending: dict[int, GnssEpoch] = {}
         self._last_values: tuple[float, ...] = ()   # position and velocity of the last epoch
         # Stamp of the last message without a fix; None: there was a fix since.
@@ -71,6 +75,8 @@ class GnssBuffer:
         message, fault = usable(message)
         stamp_ns = message.stamp_ns
         behind_ns = 0 if imu_newest_ns is None else imu_newest_ns - stamp_ns
+        if self._watch is not None:
+            self._watch(message, fault, behind_ns)
         off = behind_ns > self._lateness_ns or behind_ns < -self._ahead_ns
         if fault:
             self._counts[f'{kind}_{fault}'] += 1

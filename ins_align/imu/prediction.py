@@ -39,12 +39,13 @@ class Prediction:
     An attitude that gyroscopes carry on from an epoch.
 
     The rate is ``measured - gyro_matrix @ measured - gyro_bias``, rad/s, with a constant error of
-    sigma `gyro_bias_std`; the Earth rate counts as an error, too. `angle_random_walk` is in
-    rad/sqrt(s), `rate`, (3,), is measured at the epoch, `interval` is between samples, s.
+    sigma `gyro_bias_std`, (3,), of which the largest counts; the Earth rate counts as an error,
+    too. `angle_random_walk` is in rad/sqrt(s), `rate`, (3,), is measured at the epoch, `interval`
+    is between samples, s.
     """
 
     def __init__(self, attitude: Attitude, gyro_bias: Array, gyro_matrix: Array,
-                 gyro_bias_std: float, angle_random_walk: float, rate: Array,
+                 gyro_bias_std: Array, angle_random_walk: float, rate: Array,
                  interval: float) -> None:
         self.stamp_ns = self._epoch_ns = attitude.stamp_ns
         x, y, z, w = attitude.quaternion_xyzw.tolist()
@@ -54,7 +55,7 @@ class Prediction:
         self._matrix = (np.eye(3) - gyro_matrix).tolist()
         self._rate = tuple(rate.tolist())   # last measured
         self._white_variance = angle_random_walk ** 2
-        self._rate_variance = gyro_bias_std ** 2 + EARTH_RATE ** 2
+        self._rate_variance = float(np.max(gyro_bias_std)) ** 2 + EARTH_RATE ** 2
         self._longest_step, self._gaps_variance = GAP_STEPS * interval, 0.0
 
     def propagate(self, stamp_ns: int, gyro: Sequence[float]) -> bool:

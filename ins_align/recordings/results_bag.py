@@ -132,8 +132,8 @@ class _Results:
         if epoch.state is not State.ALIGNED or epoch.current is None:
             return None
         return Prediction(epoch.current, epoch.gyro_bias, epoch.gyro_matrix,
-                          float(np.max(epoch.gyro_bias_std)),
-                          self._result.config.imu_noise.angle_random_walk, rate, interval)
+                          epoch.gyro_bias_std, self._result.config.imu_noise.angle_random_walk,
+                          rate, interval)
 
     def _of_epoch(self, epoch: Epoch, time_ns: int) -> Iterator[Record]:
         """Yield the messages of an epoch: initial attitude, values for plots, status."""
