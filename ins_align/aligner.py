@@ -462,7 +462,8 @@ class Aligner:
         """
         Return the state, the reason for it, the estimates and the counts.
 
-        While nothing is ALIGNED, it is a FAULT if units or coordinates are found to be wrong.
+        While nothing is ALIGNED, it is a FAULT if units or coordinates are found to be wrong. This
+        looks through the messages of minutes: call it about once a second, not at each epoch.
         """
         method = self._method
         nuisance = Nuisance.configured(self.config) if method is None else method.nuisance()

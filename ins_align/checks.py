@@ -93,12 +93,15 @@ def exchange_fault(positions_deg: Series, velocities: Series) -> str:
     vectors = positions_deg.vectors
     if vectors.shape[0] < 2 or np.abs(vectors[:, 1]).max() > 90.0:
         return ''
-    as_sent, exchanged = (
-        velocity_frame(velocities, without_wild_positions(track(
-            Series(positions_deg.times, vectors[:, order])))) for order in ([0, 1, 2], [1, 0, 2]))
+
+    def compared(order: list[int]) -> VelocityFrame:
+        positions = track(Series(positions_deg.times, vectors[:, order]))
+        return velocity_frame(velocities, without_wild_positions(positions))
+
+    as_sent = compared([0, 1, 2])
     # Velocities in NED would fit the positions as they were sent, in length too.
     if (as_sent.frame in ('enu', 'unknown')
-            or _misfit(as_sent) <= _misfit(exchanged) + MIN_MISFIT):
+            or _misfit(as_sent) <= _misfit(compared([1, 0, 2])) + MIN_MISFIT):
         return ''
     return ('the GNSS velocity fits the change of position with latitude and longitude exchanged: '
             'they are exchanged in the positions')
