@@ -306,25 +306,24 @@ class Aligner:
     def _decide(self, epoch: AntennaEpoch, method: Bank | NoteMethod, fit: Fit) -> Verdict:
         """Set the attitudes after an epoch; return the verdict of the declaration."""
         stamp_ns, declaration = epoch.stamp_ns, self._declaration
-        initial, current = method.initial(), method.current()
+        attitudes = method.attitudes()
         self._initial = self._current = None
         measured = epoch.v_n is not None or (
             epoch.position_measured and self.config.use_position is not False)
         if measured:
             self._measured_ns = stamp_ns
         silent_s = (stamp_ns - self._measured_ns) * 1e-9
-        if initial is None or current is None:
+        if attitudes is None:
             return declaration.update_without_attitude(silent_s, fit)
+        P0, P = (attitude.covariance for attitude in attitudes)
         if measured:
-            verdict = declaration.update((stamp_ns - self._start_ns) * 1e-9, initial[1],
-                                         current[1], fit)
+            verdict = declaration.update((stamp_ns - self._start_ns) * 1e-9, P0, P, fit)
             if declaration.move_t0:
                 method.move_t0()
-                initial = method.initial() or initial
+                attitudes = method.attitudes() or attitudes
         else:
-            verdict = declaration.update_without_gnss(silent_s, initial[1], current[1], fit)
-        self._initial = Attitude(method.t0_ns, *initial)
-        self._current = Attitude(stamp_ns, *current)
+            verdict = declaration.update_without_gnss(silent_s, P0, P, fit)
+        self._initial, self._current = attitudes
         return verdict
 
     # Start, outages, loss

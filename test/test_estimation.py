@@ -37,7 +37,6 @@ from ins_align.gnss.buffer import GnssBuffer
 from ins_align.imu.buffer import ImuBuffer
 from ins_align.imu.preintegration import Noise, preintegrate, SensorErrors
 from ins_align.imu.recent import recent_motion
-from ins_align.results import Attitude
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -217,8 +216,8 @@ def went(bank, epochs, imu, block=1):
         yield from bank.advance(epochs[k:k + block], imu.take(slice(k, k + block)))
 
 
-def sigmas(solution):
-    return np.sqrt(np.diag(solution[1]))
+def sigmas(attitude):
+    return np.sqrt(np.diag(attitude.covariance))
 
 
 SETTINGS = {'aeroplane': ('flight', {}), 'car': ('car', {}),
@@ -240,12 +239,12 @@ def test_estimate_and_sigma_are_those_of_the_dense_solution(setting):
         s = simulated(scenario, imu_grade='mems', duration=22.2, seed=seed)
         bank, epochs, imu = prepared(s, **changes)
         list(went(bank, epochs, imu, 50))
-        C, P = bank.initial()
+        initial, _ = bank.attitudes()
         C_dense, P_dense = dense_solution(s, lever_arm_std=changes.get('lever_arm_std', 0.0),
                                           delay_std=changes.get('gnss_delay_std', 0.0))
         reference = np.sqrt(np.diag(P_dense)[:3])
-        off.append(log_so3(C @ C_dense.T) / reference)
-        ratios.append(np.sqrt(np.diag(P)) / reference)
+        off.append(log_so3(initial.C_nb @ C_dense.T) / reference)
+        ratios.append(sigmas(initial) / reference)
     assert np.sqrt(np.mean(np.square(off))) < 0.33
     assert np.all(np.array(ratios) > 0.95) and np.mean(ratios) < 1.25
 
@@ -263,12 +262,11 @@ def test_errors_are_as_large_as_stated_and_sigmas_those_of_the_bound(options):
                       heading_deg=18.0 * seed, **options)
         bank, epochs, imu = prepared(s, velocity=velocity)
         list(went(bank, epochs, imu, 50))
-        squares += [normalised_error(Attitude(stamp_ns, *solution), s) for stamp_ns, solution in (
-            (bank.t0_ns, bank.initial()), (epochs[-1].stamp_ns, bank.current()))]
+        squares += [normalised_error(attitude, s) for attitude in bank.attitudes()]
         first = int(np.searchsorted(s.gnss_stamps_ns, bank.t0_ns))
         since = replace(s, gnss_stamps_ns=s.gnss_stamps_ns[first:])
         least = bound(since, positions=not velocity).covariance[-1]
-        ratios.append(sigmas(bank.initial())[2] / np.sqrt(least[2, 2]))
+        ratios.append(sigmas(bank.attitudes()[0])[2] / np.sqrt(least[2, 2]))
     low, high = chi2.ppf([0.001, 0.999], 3 * len(seeds))
     assert np.all(low < squares) and np.all(squares < high)
     assert 0.95 < np.mean(ratios) < 1.25
@@ -284,17 +282,18 @@ def test_blocks_of_any_length_give_the_same(scenario, changes):
         taken, found = [], []
         for epoch in went(bank, epochs, imu, block):
             taken.append(epoch.stamp_ns)
-            if bank.current() is not None:
-                found.append([bank.initial(), bank.current()])
+            if both := bank.attitudes():
+                found.append(both)
         assert taken == [epoch.stamp_ns for epoch in epochs]
         results.append(found)
     for others in results[1:]:
         assert len(others) == len(results[0]) > 80
         for both, same in zip(results[0], others):
-            for (C, P), (D, Q) in zip(both, same):
+            for one, other in zip(both, same):
                 # Rounding of an unknown position, 10 km, against parts in a millionth.
-                assert np.abs(log_so3(C @ D.T)).max() < 1e-5 * np.sqrt(P[0, 0])
-                assert np.allclose(P, Q, rtol=1e-5, atol=1e-5 * P[0, 0])
+                P = one.covariance
+                assert np.abs(log_so3(one.C_nb @ other.C_nb.T)).max() < 1e-5 * np.sqrt(P[0, 0])
+                assert np.allclose(P, other.covariance, rtol=1e-5, atol=1e-5 * P[0, 0])
 
 
 STEPS = ('flight', 'mems'), ('car', 'mems'), ('launch', 'tactical'), ('hover', 'mems')
@@ -314,9 +313,9 @@ def test_no_sigma_steps_up(scenario, grade, levels, most, monkeypatch):
     before, rejected, compared = None, 0, 0
     for _ in went(bank, epochs, imu):
         # While there are many headings to choose from, it is the choice that varies.
-        if bank.current() is None or sigmas(bank.initial())[2] > RESOLVED_STD:
+        if not (attitudes := bank.attitudes()) or sigmas(attitudes[0])[2] > RESOLVED_STD:
             continue
-        now = np.concatenate([sigmas(bank.initial()), sigmas(bank.current())])
+        now = np.concatenate([sigmas(attitude) for attitude in attitudes])
         if before is not None and bank.fit().rejected == rejected:
             assert np.all(now < most * before), now / before
             compared += 1
@@ -378,18 +377,20 @@ def test_a_later_t0_is_exact():
         list(went(one, epochs[:half], imu, 7))
     bank.move_t0()
     assert bank.t0_ns == epochs[half - 1].stamp_ns and bank.counts['rebases'] == 1
-    for (C, P), (D, Q) in ((bank.initial(), other.current()), (bank.current(), other.current())):
-        assert np.allclose(C, D, atol=1e-9) and np.allclose(P, Q, rtol=1e-6, atol=1e-12)
-    at_move = sigmas(bank.initial())
+    _, now = other.attitudes()
+    for moved in bank.attitudes():
+        assert np.allclose(moved.C_nb, now.C_nb, atol=1e-9)
+        assert np.allclose(moved.covariance, now.covariance, rtol=1e-6, atol=1e-12)
+    at_move = sigmas(bank.attitudes()[0])
     for one in (bank, other):
         list(went(one, epochs[half:], imu.take(slice(half, None)), 7))
     # Means of rivals are merged when they agree at t0 too: the same to a hundredth of a sigma.
-    (C, P), (D, Q) = bank.current(), other.current()
-    assert np.all(np.abs(log_so3(C @ D.T)) < 0.01 * sigmas((D, Q)))
-    assert np.allclose(np.diag(P), np.diag(Q), rtol=0.01)
-    assert np.all(sigmas(bank.initial()) < at_move)         # what came later tells of it
-    for stamp_ns, solution in ((bank.t0_ns, bank.initial()), (other.t0_ns, other.initial())):
-        assert normalised_error(Attitude(stamp_ns, *solution), s) < chi2.ppf(0.9999, 3)
+    (later, now), (earlier, same) = bank.attitudes(), other.attitudes()
+    assert np.all(np.abs(log_so3(now.C_nb @ same.C_nb.T)) < 0.01 * sigmas(same))
+    assert np.allclose(np.diag(now.covariance), np.diag(same.covariance), rtol=0.01)
+    assert np.all(sigmas(later) < at_move)                  # what came later tells of it
+    for initial in (later, earlier):
+        assert normalised_error(initial, s) < chi2.ppf(0.9999, 3)
 
 
 def test_a_new_start_keeps_what_was_learnt():

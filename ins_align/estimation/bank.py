@@ -39,7 +39,7 @@ from ins_align.estimation.vehicle import NOT_USED, Vehicle
 from ins_align.geometry.rotation import Array, Transform
 from ins_align.gnss.messages import AntennaEpoch
 from ins_align.imu.preintegration import Intervals, SensorErrors
-from ins_align.results import Nuisance
+from ins_align.results import Attitude, Nuisance
 import numpy as np
 
 # The model is linearised again when parameters of a likeliest mean have moved this far: lever arm
@@ -348,19 +348,14 @@ class Bank:
 
     # Results
 
-    def initial(self) -> tuple[Array, Array] | None:
-        """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
+    def attitudes(self) -> tuple[Attitude, Attitude] | None:
+        """Return the attitudes at t0 and at the last epoch; None while there are none."""
         if self._mixture is None:
             return None
-        C, P = self._mixture
-        return C[0], self._receiver.inflation * P[0]
-
-    def current(self) -> tuple[Array, Array] | None:
-        """Return ``C_nb`` at the last epoch and the covariance of its error in ENU."""
-        if self._mixture is None:
-            return None
-        C, P = self._mixture
-        return self._C_nn0 @ C[1], self._receiver.inflation * self._C_nn0 @ P[1] @ self._C_nn0.T
+        (C0, C), (P0, P) = self._mixture
+        C_nn0, inflation = self._C_nn0, self._receiver.inflation
+        return (Attitude(self.t0_ns, C0, inflation * P0),
+                Attitude(self._last.stamp_ns, C_nn0 @ C, inflation * C_nn0 @ P @ C_nn0.T))
 
     def fit(self) -> Fit:
         """Return how well the data fit, and what speaks against a declaration."""

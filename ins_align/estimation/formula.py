@@ -30,7 +30,7 @@ from ins_align.estimation.track import BodyTrack, InertialTrack
 from ins_align.geometry.rotation import Array, orthonormalized
 from ins_align.gnss.messages import AntennaEpoch, velocities_of
 from ins_align.imu.preintegration import Intervals, SensorErrors
-from ins_align.results import Nuisance
+from ins_align.results import Attitude, Nuisance
 import numpy as np
 
 # Sigma of an angle that is uniformly distributed, radians.
@@ -89,7 +89,7 @@ class NoteMethod:
     def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals,
                  use_position: bool) -> None:
         """Start at t0."""
-        self.t0_ns = epoch.stamp_ns
+        self.t0_ns = self._last_ns = epoch.stamp_ns
         self.counts: Counter[str] = Counter()
         self.restarted = ''
         self._config = config
@@ -120,7 +120,7 @@ class NoteMethod:
         """Process epochs and the IMU intervals before each; see `Bank.advance`."""
         track, body = self._track.along(epochs, self.t0_ns), self._body.along(imu)
         for k, epoch in enumerate(epochs):
-            self._track, self._body = track.at(k), body.at(k)
+            self._track, self._body, self._last_ns = track.at(k), body.at(k), epoch.stamp_ns
             if epoch.v_n is not None:
                 self._integral.advance(float(self._track.time), self._track.s_v(epoch.v_n))
             self._pair(epoch)
@@ -177,23 +177,20 @@ class NoteMethod:
         walk = variance * time / self._offered * time
         return 0.0, walk / 15 if self._free else walk / 2 + start * time ** 2 / 3
 
-    def initial(self) -> tuple[Array, Array] | None:
-        """Return ``C_nb(t0)`` and the covariance of its error in ENU."""
-        if self._solution is None:
-            return None
-        return self._solution[0], self._factor() * self._solution[1]
-
-    def current(self) -> tuple[Array, Array] | None:
-        """Return ``C_nb`` at the last epoch and the covariance of its error in ENU."""
+    def attitudes(self) -> tuple[Attitude, Attitude] | None:
+        """Return the attitudes at t0 and at the last epoch; None while there are none."""
         if self._solution is None:
             return None
         C, covariance = self._solution
         C_nn0 = self._track.C_n0n.T
+        # Data that fit worse than stated are noisier.
+        factor = max(1.0, self.fit().misfit)
         # Without measurements the gyros alone carry the attitude.
         noise, silent_s = self._config.imu_noise, float(self._track.time) - self._solved_s
         drift = noise.angle_random_walk ** 2 * silent_s + (noise.gyro_bias_std * silent_s) ** 2
-        return (orthonormalized(C_nn0 @ C @ self._body.C_b0b),
-                self._factor() * (C_nn0 @ covariance @ C_nn0.T + drift * np.eye(3)))
+        return (Attitude(self.t0_ns, C, factor * covariance),
+                Attitude(self._last_ns, orthonormalized(C_nn0 @ C @ self._body.C_b0b),
+                         factor * (C_nn0 @ covariance @ C_nn0.T + drift * np.eye(3))))
 
     def fit(self) -> Fit:
         """Return how well the data fit."""
@@ -206,10 +203,6 @@ class NoteMethod:
     def _rows(self) -> int:
         """Return how many rows of the pairs are redundant."""
         return 3 * (self._offered - 1 - self._nuisance)
-
-    def _factor(self) -> float:
-        """Return the factor on variances for data that fit worse than stated."""
-        return max(1.0, self.fit().misfit)
 
     def move_t0(self) -> None:
         """Leave t0 where it is."""
