@@ -24,7 +24,7 @@ import dataclasses
 from ins_align.checks import InputChecks
 from ins_align.config import Config, ConfigError
 from ins_align.estimation.bank import Bank, Learnt, REJECTED
-from ins_align.estimation.declaration import Declaration, Fit
+from ins_align.estimation.declaration import Declaration
 from ins_align.estimation.formula import NoteMethod
 from ins_align.geometry.rotation import Array, Transform
 from ins_align.gnss.antenna import Antenna
@@ -278,7 +278,17 @@ class Aligner:
             self.declared = self._time_to_align_s = None
             self._start_ns, method.restarted = epoch.stamp_ns, ''
         # 7. The declaration decides on the state and words the reason.
-        verdict = self._decide(epoch, method, fit)
+        attitudes = method.attitudes()
+        if epoch.v_n is not None or (
+                epoch.position_measured and self.config.use_position is not False):
+            self._measured_ns = epoch.stamp_ns
+        verdict = self._declaration.update(
+            (epoch.stamp_ns - self._start_ns) * 1e-9, (epoch.stamp_ns - self._measured_ns) * 1e-9,
+            [attitude.covariance for attitude in attitudes or ()], fit)
+        if self._declaration.move_t0:
+            method.move_t0()
+            attitudes = method.attitudes()
+        self._initial, self._current = attitudes or (None, None)
         if epoch.v_n is not None:
             self._without_velocity = False
         if fault := self._force_check.fault or epoch.fault:
@@ -302,29 +312,6 @@ class Aligner:
             method.nuisance().gyro_bias_std, sensors.gyro_matrix, epoch.dry, verdict.reason,
             self._started_over))
         self._started_over = ''
-
-    def _decide(self, epoch: AntennaEpoch, method: Bank | NoteMethod, fit: Fit) -> Verdict:
-        """Set the attitudes after an epoch; return the verdict of the declaration."""
-        stamp_ns, declaration = epoch.stamp_ns, self._declaration
-        attitudes = method.attitudes()
-        self._initial = self._current = None
-        measured = epoch.v_n is not None or (
-            epoch.position_measured and self.config.use_position is not False)
-        if measured:
-            self._measured_ns = stamp_ns
-        silent_s = (stamp_ns - self._measured_ns) * 1e-9
-        if attitudes is None:
-            return declaration.update_without_attitude(silent_s, fit)
-        P0, P = (attitude.covariance for attitude in attitudes)
-        if measured:
-            verdict = declaration.update((stamp_ns - self._start_ns) * 1e-9, P0, P, fit)
-            if declaration.move_t0:
-                method.move_t0()
-                attitudes = method.attitudes() or attitudes
-        else:
-            verdict = declaration.update_without_gnss(silent_s, P0, P, fit)
-        self._initial, self._current = attitudes
-        return verdict
 
     # Start, outages, loss
 

@@ -35,7 +35,7 @@ def judge(declaration, start, seconds, P, the_fit=None, rate=5.0, doubt='', dela
     """Judge a stretch of epochs; return the last verdict."""
     verdict = None
     for k in range(int(seconds * rate) + 1):
-        verdict = declaration.update(start + k / rate, P, P,
+        verdict = declaration.update(start + k / rate, 0.0, (P, P),
                                      the_fit or fit(delay=delay, doubt=doubt))
     return verdict
 
@@ -109,7 +109,7 @@ def test_a_minute_without_gnss_holds_nothing():
     declaration = Declaration(Config(hold_time=2.0))
     judge(declaration, 0.0, 0.0, GOOD)
     for silent in range(2, 62, 2):
-        declaration.update_without_gnss(float(silent), GOOD, GOOD, fit())
+        declaration.update(0.0, float(silent), (GOOD, GOOD), fit())
     assert judge(declaration, 62.0, 1.8, GOOD).state is State.ALIGNING
     assert judge(declaration, 64.0, 0.0, GOOD).state is State.ALIGNED
 
@@ -129,7 +129,7 @@ def test_tilt_is_that_about_the_worst_horizontal_axis(seed):
     sigma = np.degrees(np.sqrt(np.linalg.eigvalsh(P[:2, :2])[1]))
     for factor, state in ((0.99, State.ALIGNING), (1.01, State.ALIGNED)):
         config = Config(hold_time=0.0, tilt_std_threshold=float(factor * sigma))
-        verdict = Declaration(config).update(0.0, P, P, fit())
+        verdict = Declaration(config).update(0.0, 0.0, (P, P), fit())
         assert verdict.state is state and f'tilt sigma {sigma:.2g}' in verdict.reason
 
 
@@ -143,7 +143,7 @@ def test_thresholds_are_the_parameters():
 def test_the_worse_of_initial_and_current_counts():
     declaration = Declaration(Config(hold_time=2.0))
     for k in range(20):
-        verdict = declaration.update(0.2 * k, GOOD, LEVEL, fit())
+        verdict = declaration.update(0.2 * k, 0.0, (GOOD, LEVEL), fit())
     assert verdict.state is State.LEVELLED and not declaration.move_t0
 
 
@@ -151,18 +151,18 @@ def test_a_later_t0_is_wanted_where_only_the_present_heading_is_good():
     declaration = Declaration(Config(hold_time=2.0))
     wanted = []
     for k in range(20):
-        verdict = declaration.update(0.2 * k, LEVEL, GOOD, fit())
+        verdict = declaration.update(0.2 * k, 0.0, (LEVEL, GOOD), fit())
         wanted.append(declaration.move_t0)
     assert verdict.state is State.LEVELLED
     assert wanted == [False] * 10 + [True] * 10
     # When t0 has moved, what has held before it counts.
-    assert declaration.update(4.0, GOOD, GOOD, fit()).state is State.ALIGNED
+    assert declaration.update(4.0, 0.0, (GOOD, GOOD), fit()).state is State.ALIGNED
     assert not declaration.move_t0
 
 
 def test_no_later_t0_while_the_signs_are_in_doubt():
     declaration = Declaration(Config(hold_time=0.0))
-    declaration.update(0.0, LEVEL, GOOD, fit(doubt='turn'))
+    declaration.update(0.0, 0.0, (LEVEL, GOOD), fit(doubt='turn'))
     assert not declaration.move_t0
 
 
@@ -170,7 +170,7 @@ def test_no_later_t0_while_the_signs_are_in_doubt():
     (GOOD, covariance(5.0, 0.5)), (covariance(5.0, 14.0), covariance(5.0, 0.5))])
 def test_no_later_t0_while_the_present_tilt_is_bad(initial, current):
     declaration = Declaration(Config(hold_time=0.0))
-    verdict = declaration.update(0.0, initial, current, fit())
+    verdict = declaration.update(0.0, 0.0, (initial, current), fit())
     assert verdict.state is State.ALIGNING and not declaration.move_t0
 
 
@@ -178,7 +178,7 @@ def test_no_later_t0_while_the_present_tilt_is_bad(initial, current):
 def test_an_initial_tilt_that_is_bad_declares_nothing(doubt):
     """What is good now is worth a later start, but for a doubt about it."""
     declaration = Declaration(Config(hold_time=0.0))
-    verdict = declaration.update(0.0, covariance(0.8, 0.5), GOOD, fit(doubt=doubt))
+    verdict = declaration.update(0.0, 0.0, (covariance(0.8, 0.5), GOOD), fit(doubt=doubt))
     assert verdict.state is State.ALIGNING and not declaration.levelled
     assert declaration.move_t0 == (not doubt)
 
@@ -230,18 +230,18 @@ def test_declared_heading_goes_with_the_tilt():
 def test_without_gnss_nothing_is_declared_and_what_gets_lost_is_withdrawn():
     declaration = Declaration(Config(hold_time=2.0))
     for silent in (2.0, 4.0, 60.0):
-        verdict = declaration.update_without_gnss(silent, GOOD, GOOD, fit())
+        verdict = declaration.update(0.0, silent, (GOOD, GOOD), fit())
         assert verdict.state is State.ALIGNING
         assert verdict.reason.endswith(f'hold for 2 s; no GNSS for {silent:g} s')
     assert judge(declaration, 60.2, 3.0, GOOD).state is State.ALIGNED
-    kept = declaration.update_without_gnss(2.0, GOOD, covariance(0.1, 1.9), fit())
+    kept = declaration.update(0.0, 2.0, (GOOD, covariance(0.1, 1.9)), fit())
     assert kept.state is State.ALIGNED and 'sigma 1.9' in kept.reason
     assert 'no GNSS for 2 s' in kept.reason
-    lost = declaration.update_without_gnss(4.0, GOOD, covariance(0.1, 2.1), fit())
+    lost = declaration.update(0.0, 4.0, (GOOD, covariance(0.1, 2.1)), fit())
     assert lost.state is State.LEVELLED and 'no GNSS' in lost.reason
-    again = declaration.update_without_gnss(6.0, GOOD, GOOD, fit())
+    again = declaration.update(0.0, 6.0, (GOOD, GOOD), fit())
     assert again.state is State.LEVELLED
-    fallen = declaration.update_without_gnss(8.0, GOOD, covariance(1.1, 2.1), fit())
+    fallen = declaration.update(0.0, 8.0, (GOOD, covariance(1.1, 2.1)), fit())
     assert fallen.state is State.ALIGNING
 
 
@@ -253,7 +253,7 @@ def test_without_gnss_what_spoke_against_a_declaration_is_still_said(P, the_fit,
     declaration = Declaration(Config(hold_time=2.0))
     before = judge(declaration, 0.0, 3.0, P, the_fit, doubt=doubt)
     for silent in (2.0, 4.0, 60.0):
-        verdict = declaration.update_without_gnss(silent, P, P, the_fit or fit())
+        verdict = declaration.update(0.0, silent, (P, P), the_fit or fit())
         assert verdict == Verdict(before.state, f'{before.reason}; no GNSS for {silent:g} s')
 
 
@@ -263,7 +263,7 @@ def test_without_gnss_what_spoke_against_a_declaration_is_still_said(P, the_fit,
 def test_without_gnss_the_worse_sigma_counts(initial, current, state):
     declaration = Declaration(Config(hold_time=2.0))
     assert judge(declaration, 0.0, 3.0, GOOD).state is State.ALIGNED
-    assert declaration.update_without_gnss(2.0, initial, current, fit()).state is state
+    assert declaration.update(0.0, 2.0, (initial, current), fit()).state is state
 
 
 def test_an_objection_withdraws_and_is_the_reason():
@@ -282,7 +282,7 @@ def test_not_before_there_is_redundancy():
 def test_nothing_is_contradicted_without_redundancy(rows):
     """A handful of rows that do not fit, or none at all: more are needed."""
     few = fit(rows=rows, misfit=1e3, offered=4, delay=9.0, objection='another lever arm')
-    verdict = Declaration(Config()).update(0.0, GOOD, GOOD, few)
+    verdict = Declaration(Config()).update(0.0, 0.0, (GOOD, GOOD), few)
     assert verdict.state is State.ALIGNING and verdict.reason.startswith('4 GNSS epochs so far')
 
 
@@ -291,29 +291,29 @@ def test_a_new_start_remembers_what_contradicted_the_one_before():
     judge(declaration, 0.0, 3.0, GOOD, fit(objection='another lever arm', offered=650))
     few = fit(rows=5, offered=653)
     words = 'another lever arm; it has started over'
-    assert declaration.update_without_attitude(0.0, few) == Verdict(State.ALIGNING, words)
-    assert declaration.update(3.2, GOOD, GOOD, few) == Verdict(State.ALIGNING, words)
-    assert declaration.update_without_gnss(4.0, GOOD, GOOD, few).reason == (
+    assert declaration.update(0.0, 0.0, (), few) == Verdict(State.ALIGNING, words)
+    assert declaration.update(3.2, 0.0, (GOOD, GOOD), few) == Verdict(State.ALIGNING, words)
+    assert declaration.update(0.0, 4.0, (GOOD, GOOD), few).reason == (
         f'{words}; no GNSS for 4 s')
     judge(declaration, 3.4, 0.0, GOOD, fit(offered=660))
     few = fit(rows=5, offered=3)
-    assert declaration.update_without_attitude(0.0, few).reason == (
+    assert declaration.update(0.0, 0.0, (), few).reason == (
         '3 GNSS epochs so far: more are needed')
-    assert declaration.update_without_attitude(4.0, few).reason.endswith('needed; no GNSS for 4 s')
+    assert declaration.update(0.0, 4.0, (), few).reason.endswith('needed; no GNSS for 4 s')
 
 
 def test_an_attitude_that_is_gone_is_withdrawn():
     """The bank may start again by itself: what it finds then has to hold for a while too."""
     declaration = Declaration(Config(hold_time=2.0))
     assert judge(declaration, 0.0, 3.0, GOOD).state is State.ALIGNED
-    declaration.update_without_attitude(0.0, fit(rows=0, offered=4))
-    assert declaration.update(3.2, GOOD, GOOD, fit()).state is State.ALIGNING
+    declaration.update(0.0, 0.0, (), fit(rows=0, offered=4))
+    assert declaration.update(3.2, 0.0, (GOOD, GOOD), fit()).state is State.ALIGNING
     assert judge(declaration, 3.4, 3.0, GOOD).state is State.ALIGNED
 
 
 def test_figures_in_reasons_are_not_rounded_to_what_they_exceed():
     late = Declaration(Config(gnss_delay=0.1, gnss_delay_std=0.001)).update(
-        0.0, GOOD, GOOD, fit(delay=0.104))
+        0.0, 0.0, (GOOD, GOOD), fit(delay=0.104))
     assert 'seem to be 0.104 s late, gnss_delay is 0.1 ' in late.reason
     wide = np.diag(np.radians([0.1, 0.1, 1.03]) ** 2)
     reason = judge(Declaration(Config()), 0.0, 70.0, wide).reason

@@ -18,6 +18,7 @@ An attitude is declared when its sigma, inflated where the data fit badly, has b
 threshold and the residuals have been within limits for the hold time.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 import math
 
@@ -74,66 +75,53 @@ class Declaration:
         self._against = ''                  # what spoke against a declaration at the last epoch
         self._contradiction = ''            # at the last epoch with redundancy
         self._rejected = 0
-        self._time_s = 0.0
+        self._time_s = 0.0                  # of the last epoch with a measurement
 
-    def update(self, time_s: float, initial: Array, current: Array, fit: Fit) -> Verdict:
+    def update(self, time_s: float, silent_s: float, covariances: Sequence[Array],
+               fit: Fit) -> Verdict:
         """
         Judge an epoch, `time_s` seconds after the first one of the alignment.
 
-        `initial` and `current`, (3, 3), are covariances of the attitude at t0 and of that now, in
-        ENU. Both must be good enough; where only that now is, `move_t0` is set.
+        `silent_s` are the seconds since the last measurement: at an epoch without one nothing is
+        declared, but it may be withdrawn. `covariances`, (3, 3), are those of the attitude at t0
+        and of that now, in ENU; there are none where there is no attitude, or none any more. Both
+        must be good enough; where only that now is, `move_t0` is set.
         """
-        self._time_s = time_s
-        contradiction = self._contradicted_by(fit)
-        if fit.rows >= MIN_ROWS:
-            self._contradiction = contradiction
-        tilt, heading = _sigmas_deg(initial)
-        tilt_now, heading_now = _sigmas_deg(current)
-        tilt, heading = max(tilt, tilt_now), max(heading, heading_now)
-        just_rejected, self._rejected = fit.rejected > self._rejected, fit.rejected
-        good = not contradiction and not just_rejected and fit.rows >= MIN_ROWS
-        max_tilt, max_heading = self.config.tilt_std_threshold, self.config.heading_std_threshold
-        self._level_since_s = _since(self._level_since_s, time_s, good and tilt <= max_tilt)
-        self._heading_since_s = _since(self._heading_since_s, time_s, good
-                                       and tilt_now <= max_tilt and heading_now <= max_heading)
         self.move_t0 = False
-        self._against = contradiction
-        if contradiction:
+        silence = f'; no GNSS for {silent_s:.0f} s' if silent_s else ''
+        if not covariances:
             self.withdraw()
-            return Verdict(State.ALIGNING, contradiction)
-        self.levelled = self.levelled or self._held(self._level_since_s, time_s)
-        doubt = ''
-        if not self.aligned and self._held(self._heading_since_s, time_s):
-            self._against = doubt = fit.doubt
-            self.aligned = not doubt and tilt <= max_tilt and heading <= max_heading
-            self.move_t0 = not doubt and not self.aligned
-        self._withdraw_lost(tilt, heading)
-        if doubt:
-            return Verdict(State.LEVELLED if self.levelled else State.ALIGNING, doubt)
-        return self._verdict(tilt, heading, fit)
-
-    def update_without_gnss(self, silent_s: float, initial: Array, current: Array,
-                            fit: Fit) -> Verdict:
-        """
-        Judge an epoch without a measurement: nothing is declared, but it may be withdrawn.
-
-        `silent_s` are the seconds since the last measurement, the others are as for `update`.
-        """
-        if silent_s > MAX_SILENCE:
+            return Verdict(State.ALIGNING, (fit.doubt or self._too_few(fit)) + silence)
+        (tilt, heading), now = map(_sigmas_deg, covariances)
+        tilt, heading = max(tilt, now[0]), max(heading, now[1])
+        if not silent_s:
+            self._time_s = time_s
+            self._declare(tilt, heading, *now, fit)
+        elif silent_s > MAX_SILENCE:
             self._level_since_s = self._heading_since_s = None
-        tilt, heading = (max(worse) for worse in zip(*(
-            _sigmas_deg(P) for P in (initial, current))))
         self._withdraw_lost(tilt, heading)
         verdict = self._verdict(tilt, heading, fit)
-        return Verdict(verdict.state,
-                       f'{self._against or verdict.reason}{_silence(silent_s)}')
+        return Verdict(verdict.state, (self._against or verdict.reason) + silence)
 
-    def update_without_attitude(self, silent_s: float, fit: Fit) -> Verdict:
-        """Judge an epoch at which there is no attitude, or none any more; parameters as above."""
-        self.withdraw()
-        return Verdict(State.ALIGNING,
-                       (fit.doubt or self._too_few(fit))
-                       + (_silence(silent_s) if silent_s else ''))
+    def _declare(self, tilt: float, heading: float, tilt_now: float, heading_now: float,
+                 fit: Fit) -> None:
+        """Declare what has been good enough for the hold time, unless something is against it."""
+        self._against = self._contradicted_by(fit)
+        if fit.rows >= MIN_ROWS:
+            self._contradiction = self._against
+        just_rejected, self._rejected = fit.rejected > self._rejected, fit.rejected
+        good = not self._against and not just_rejected and fit.rows >= MIN_ROWS
+        max_tilt, max_heading = self.config.tilt_std_threshold, self.config.heading_std_threshold
+        self._level_since_s = self._since(self._level_since_s, good and tilt <= max_tilt)
+        self._heading_since_s = self._since(self._heading_since_s, good and tilt_now <= max_tilt
+                                            and heading_now <= max_heading)
+        if self._against:
+            self.withdraw()
+        self.levelled = self.levelled or self._held(self._level_since_s)
+        if not self.aligned and self._held(self._heading_since_s):
+            self._against = fit.doubt
+            self.aligned = not fit.doubt and tilt <= max_tilt and heading <= max_heading
+            self.move_t0 = not fit.doubt and not self.aligned
 
     def withdraw(self) -> None:
         """Withdraw all that is declared; the hold time begins again."""
@@ -180,8 +168,14 @@ class Declaration:
             return f'{self._contradiction}; it has started over'
         return f'{fit.offered + fit.waiting} GNSS epochs so far: more are needed'
 
-    def _held(self, since_s: float | None, time_s: float) -> bool:
-        return since_s is not None and time_s - since_s >= self.config.hold_time - 1e-6
+    def _since(self, since_s: float | None, good: bool) -> float | None:
+        """Return the time since which something has been good, or None."""
+        if not good:
+            return None
+        return self._time_s if since_s is None else since_s
+
+    def _held(self, since_s: float | None) -> bool:
+        return since_s is not None and self._time_s - since_s >= self.config.hold_time - 1e-6
 
     def _contradicted_by(self, fit: Fit) -> str:
         """Return what in the data contradicts the model; empty when nothing does."""
@@ -206,10 +200,6 @@ class Declaration:
         return ''
 
 
-def _silence(silent_s: float) -> str:
-    return f'; no GNSS for {silent_s:.0f} s'
-
-
 def _above(sigma_deg: float, threshold_deg: float) -> str:
     """Return a sigma with enough digits to be above its threshold."""
     text = _deg(sigma_deg)
@@ -226,10 +216,3 @@ def _sigmas_deg(P: Array) -> tuple[float, float]:
     (ee, en, _), (_, nn, _), (_, _, uu) = P.tolist()
     tilt = math.sqrt(0.5 * (ee + nn) + math.hypot(0.5 * (ee - nn), en))
     return math.degrees(tilt), math.degrees(math.sqrt(uu))
-
-
-def _since(since_s: float | None, time_s: float, good: bool) -> float | None:
-    """Return the time since which something has been good, or None."""
-    if not good:
-        return None
-    return time_s if since_s is None else since_s
