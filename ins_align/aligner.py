@@ -305,12 +305,11 @@ class Aligner:
             self._counts['withdrawals'] += 1
         self._set_verdict(verdict)
         # 8. The epoch is ready for `update` to return.
-        sensors = method.sensor_errors()
+        body = method.nuisance()
         self._done.append(Epoch(
             epoch.stamp_ns, (epoch.stamp_ns - (self._first_t0_ns or 0)) * 1e-9, verdict.state,
-            self._initial, self._current, fit.innovation, sensors.gyro_bias, sensors.accel_bias,
-            method.nuisance().gyro_bias_std, sensors.gyro_matrix, epoch.dry, verdict.reason,
-            self._started_over))
+            self._initial, self._current, fit.innovation, body.gyro_bias, body.accel_bias,
+            body.gyro_bias_std, body.gyro_matrix, epoch.dry, verdict.reason, self._started_over))
         self._started_over = ''
 
     # Start, outages, loss
@@ -427,10 +426,9 @@ class Aligner:
         stamps, rates, rate, usual = self._imu.rates_since(current.stamp_ns)
         if stamps.size and self._imu.silence(current.stamp_ns, int(stamps[-1])):
             return None
-        sensors = method.sensor_errors()
+        body = method.nuisance()
         prediction = Prediction(
-            current, sensors.gyro_bias, sensors.gyro_matrix,
-            method.nuisance().gyro_bias_std,
+            current, body.gyro_bias, body.gyro_matrix, body.gyro_bias_std,
             self.config.imu_noise.angle_random_walk, rate, usual)
         carried = all(prediction.propagate(*sample)
                       for sample in zip(stamps.tolist(), rates.tolist()))

@@ -137,7 +137,7 @@ class Epoch:
     gyro_bias: Array  #: (3,), rad/s
     accel_bias: Array  #: (3,), m/s^2
     gyro_bias_std: Array  #: (3,), rad/s
-    gyro_matrix: Array  #: (3, 3), scale factors and misalignment, see `SensorErrors`
+    gyro_matrix: Array  #: (3, 3), see `Nuisance`
     dry: bool = False  #: whether the epoch has no measurement and only divides a GNSS outage
     reason: str = ''  #: why the state is as it is
     #: Why the alignment started over since the previous epoch; empty if it did not.
@@ -162,6 +162,9 @@ class Nuisance:
 
     gyro_bias: Array  #: (3,), rad/s
     gyro_bias_std: Array
+    #: (3, 3), scale factors and, beside the diagonal, misalignment of the gyros:
+    #: true = measured - gyro_matrix @ measured - gyro_bias
+    gyro_matrix: Array
     accel_bias: Array  #: (3,), m/s^2
     accel_bias_std: Array
     lever_arm: Array  #: (3,), IMU to antenna in the IMU frame, m
@@ -173,7 +176,8 @@ class Nuisance:
     def configured(cls, config: Config) -> 'Nuisance':
         """Return what the configuration says, for use before the first epoch."""
         noise, zero = config.imu_noise, np.zeros(3)
-        return cls(zero, np.full(3, noise.gyro_bias_std), zero, np.full(3, noise.accel_bias_std),
+        return cls(zero, np.full(3, noise.gyro_bias_std), np.zeros((3, 3)),
+                   zero, np.full(3, noise.accel_bias_std),
                    np.array(config.lever_arm), np.full(3, config.lever_arm_std),
                    config.gnss_delay, config.gnss_delay_std)
 

@@ -14,6 +14,7 @@
 """What the tests of the core share: recordings through the aligner, their errors, IMU steps."""
 
 from functools import lru_cache
+from typing import NamedTuple
 
 from ins_align.aligner import Aligner
 from ins_align.experiments.common import exact_config_for
@@ -64,6 +65,21 @@ def nanoseconds(times):
 def cut_at(times, gyro, accel, epochs):
     """Return IMU steps between epochs; samples and epochs in seconds."""
     return split_at_epochs(nanoseconds(times), np.hstack([gyro, accel]), nanoseconds(epochs))
+
+
+class SensorErrors(NamedTuple):
+    """Constant errors of gyros and accelerometers: true = measured - matrix @ measured - bias."""
+
+    gyro_bias: np.ndarray
+    gyro_matrix: np.ndarray
+    accel_bias: np.ndarray
+    accel_matrix: np.ndarray
+
+    @staticmethod
+    def from_vector(vector):
+        """Return the errors in a vector, shape (24,), with the matrices row by row."""
+        return SensorErrors(vector[:3], vector[3:12].reshape(3, 3), vector[12:15],
+                            vector[15:].reshape(3, 3))
 
 
 def integrate(steps, noise=Noise(), recent=None):

@@ -18,7 +18,8 @@ from dataclasses import replace
 import math
 
 from alignment import (
-    aligned, config_for, cut_at, feed, integrate, nanoseconds, normalised_error, simulated)
+    aligned, config_for, cut_at, feed, integrate, nanoseconds, normalised_error, SensorErrors,
+    simulated)
 from dense_solution import dense_solution
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config, PRESETS, STANDARD_GRAVITY
@@ -35,7 +36,7 @@ from ins_align.geometry.rotation import exp_so3, log_so3, skew
 from ins_align.gnss.antenna import Antenna
 from ins_align.gnss.buffer import GnssBuffer
 from ins_align.imu.buffer import ImuBuffer
-from ins_align.imu.preintegration import Noise, preintegrate, SensorErrors
+from ins_align.imu.preintegration import Noise, preintegrate
 from ins_align.imu.recent import recent_motion
 import numpy as np
 import pytest

@@ -15,9 +15,9 @@
 
 from dataclasses import replace
 
-from alignment import cut_at, integrate, nanoseconds
+from alignment import cut_at, integrate, nanoseconds, SensorErrors
 from ins_align.imu.noise import white_noise
-from ins_align.imu.preintegration import Noise, SensorErrors, Steps
+from ins_align.imu.preintegration import Noise, Steps
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp

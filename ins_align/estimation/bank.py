@@ -33,12 +33,12 @@ from ins_align.estimation.rivals import level_in_words, Parameters, Rivals, SHAR
 from ins_align.estimation.start import (
     HEADINGS, OPEN_POSITION, redraw_headings, RoughAttitude, Start, STEADY_VELOCITY)
 from ins_align.estimation.states import (
-    biases, DELAY, FIRST, GYRO, Linearised, Measured, OF_VEHICLE, triads)
+    biases, DELAY, FIRST, GYRO, LEVER_ARM, Linearised, Measured, OF_VEHICLE, triads)
 from ins_align.estimation.track import InertialTrack
 from ins_align.estimation.vehicle import NOT_USED, Vehicle
 from ins_align.geometry.rotation import Array, Transform
 from ins_align.gnss.messages import AntennaEpoch
-from ins_align.imu.preintegration import Intervals, SensorErrors
+from ins_align.imu.preintegration import Intervals
 from ins_align.results import Attitude, Nuisance
 import numpy as np
 
@@ -400,20 +400,14 @@ class Bank:
         return x, P
 
     def nuisance(self) -> Nuisance:
-        """Return biases, lever arm and delay."""
+        """Return errors of the sensors, lever arm and delay at the last epoch."""
         x, P = self._body()
         std = np.sqrt(np.diag(P))
         gyro, accel = biases(x.size)
-        return Nuisance(x[gyro], std[gyro], x[accel], std[accel], x[:3], std[:3],
+        matrix = x[triads(x.size)[0]][3:].reshape(-1, 3)
+        return Nuisance(x[gyro], std[gyro], matrix if matrix.size else np.zeros((3, 3)),
+                        x[accel], std[accel], x[LEVER_ARM], std[LEVER_ARM],
                         float(self._config.gnss_delay + x[DELAY]), float(std[DELAY]))
-
-    def sensor_errors(self) -> SensorErrors:
-        """Return the errors of gyros and accelerometers at the last epoch."""
-        x, _ = self._body()
-        full = np.zeros((2, 12))
-        for errors, triad in zip(full, triads(x.size)):
-            errors[:triad.stop - triad.start] = x[triad]
-        return SensorErrors.from_vector(full.ravel())
 
     def learnt(self) -> Learnt | None:
         """Return the prior for another start; None while epochs do not fit."""

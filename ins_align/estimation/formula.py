@@ -29,7 +29,7 @@ from ins_align.estimation.moments import solve_moments
 from ins_align.estimation.track import BodyTrack, InertialTrack
 from ins_align.geometry.rotation import Array, orthonormalized
 from ins_align.gnss.messages import AntennaEpoch, velocities_of
-from ins_align.imu.preintegration import Intervals, SensorErrors
+from ins_align.imu.preintegration import Intervals
 from ins_align.results import Attitude, Nuisance
 import numpy as np
 
@@ -210,11 +210,8 @@ class NoteMethod:
     def nuisance(self) -> Nuisance:
         """Return what is assumed: no biases, lever arm and delay as configured."""
         zero = np.zeros(3)
-        return Nuisance(zero, zero, zero, zero, self._lever_b, zero, self._config.gnss_delay, 0.0)
-
-    def sensor_errors(self) -> SensorErrors:
-        """Return zeros."""
-        return SensorErrors.from_vector(np.zeros(24))
+        return Nuisance(zero, zero, np.zeros((3, 3)), zero, zero, self._lever_b, zero,
+                        self._config.gnss_delay, 0.0)
 
     def learnt(self) -> None:
         """Return nothing: only the attitude is estimated."""

@@ -35,32 +35,14 @@ UNEVEN = 0.1
 DERIVATIVE_STEPS = 4
 
 
-class SensorErrors(NamedTuple):
-    """
-    Constant errors of gyros and accelerometers: true = measured - matrix @ measured - bias.
-
-    A matrix has scale factor errors on its diagonal and misalignments beside it.
-    """
-
-    gyro_bias: Array        # (3,), rad/s
-    gyro_matrix: Array      # (3, 3)
-    accel_bias: Array       # (3,), m/s^2
-    accel_matrix: Array     # (3, 3)
-
-    @staticmethod
-    def from_vector(vector: Array) -> 'SensorErrors':
-        """Return the errors in a vector, shape (24,), with the matrices row by row."""
-        return SensorErrors(vector[:3], vector[3:12].reshape(3, 3), vector[12:15],
-                            vector[15:].reshape(3, 3))
-
-
 @dataclass(frozen=True)
 class Intervals:
     """
     Preintegrated IMU data of K intervals, each in the body frame at the interval's start.
 
     Errors of rotation multiply from the left (``R <- exp_so3(J_Rg d) R``). J are derivatives to
-    bias and matrix of the gyros (g) or of the accelerometers (a), in the order of `SensorErrors`.
+    bias and matrix, row by row, of the gyros (g) or of the accelerometers (a), whose errors are
+    constant: ``true = measured - matrix @ measured - bias``.
     """
 
     duration: Array     # (K,), s
