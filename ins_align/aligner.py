@@ -342,13 +342,9 @@ class Aligner:
             self._first_t0_ns = epoch.stamp_ns
         self._without_velocity = bool(no_velocity) and wanted and alone
         imu = preintegrate(*self._imu.start(epoch.stamp_ns))
-        if config.method == 'bank':
-            # With velocities, positions gain little, and they hurt where their errors wander or
-            # their stamps are a few milliseconds off.
-            use_position = alone or config.use_position is True
-            self._method = Bank(config, epoch, imu, use_position, self._learnt, self._base)
-        else:
-            self._method = NoteMethod(config, epoch, imu, alone)
+        # A method starts with positions where the first epoch has no velocity.
+        self._method = (Bank(config, epoch, imu, self._learnt, self._base)
+                        if config.method == 'bank' else NoteMethod(config, epoch, imu))
         self._judge(epoch, self._method)
 
     def _bridge_outage(self, upto_ns: int) -> None:

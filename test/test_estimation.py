@@ -206,7 +206,7 @@ def prepared(s, *, velocity=True, **changes):
     samples.add_in_order(s.imu_stamps_ns, s.gyro, s.accel)
     antenna = Antenna(config, counts)
     first, *epochs = map(antenna.epoch, messages.release(samples.settled_ns(True), True))
-    bank = Bank(config, first, preintegrate(*samples.start(first.stamp_ns)), not velocity)
+    bank = Bank(config, first, preintegrate(*samples.start(first.stamp_ns)))
     steps = samples.cut([epoch.stamp_ns for epoch in epochs], [0.0] * len(epochs))
     return bank, epochs, preintegrate(*steps)
 
@@ -401,13 +401,13 @@ def test_a_new_start_keeps_what_was_learnt():
     list(went(bank, epochs, imu, 50))
     learnt, known = bank.learnt(), bank.nuisance()
     start = imu.take(slice(-1, None)).end()
-    again, afresh = (Bank(config, epochs[-1], start, False, prior) for prior in (learnt, None))
+    again, afresh = (Bank(config, epochs[-1], start, prior) for prior in (learnt, None))
     assert np.array_equal(again.nuisance().gyro_bias, known.gyro_bias)
     assert np.allclose(again.nuisance().gyro_bias_std, known.gyro_bias_std, rtol=1e-6)
     assert np.all(known.gyro_bias_std < 0.5 * afresh.nuisance().gyro_bias_std)
     # Where time has passed the gyros have walked, but never further than was said at first.
     old = learnt._replace(stamp_ns=learnt.stamp_ns - 3600 * 10 ** 9)
-    later = Bank(config, epochs[-1], start, False, old).nuisance().gyro_bias_std
+    later = Bank(config, epochs[-1], start, old).nuisance().gyro_bias_std
     assert np.all(later > known.gyro_bias_std)
     assert np.all(later <= afresh.nuisance().gyro_bias_std * (1 + 1e-9))
 

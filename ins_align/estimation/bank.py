@@ -46,9 +46,9 @@ import numpy as np
 # (m), delay (s), bias and matrix of the gyros (rad/s, 1) and of the accelerometers (m/s^2, 1).
 REACH = np.array([0.2] * 3 + [0.01] + [3e-3] * 3 + [0.02] * 9 + [0.1] * 3 + [0.02] * 9)
 MAX_SPAN = 64       # epochs with one n0
-# Positions add little to velocities, and do harm when their errors wander. With use_position auto
-# the bank uses them after this long without a velocity (ns), and stops when velocities have come
-# for the second time (ns).
+# Positions add little to velocities, and do harm when their errors wander or their stamps are a
+# few ms off. With use_position auto the bank uses them if t0 has no velocity or after the first
+# time without one (ns), until velocities have come for the second (ns).
 VELOCITY_STOPPED_NS, VELOCITY_BACK_NS = 10_000_000_000, 2_000_000_000
 # After so many epochs in a row that no rival accepts the bank starts again.
 ASTRAY = 10
@@ -78,8 +78,6 @@ class Bank:
         The first epoch, t0.
     imu : Intervals
         The interval at t0, whose duration is zero.
-    use_position : bool
-        Whether positions are used from the start.
     prior : Learnt, optional
         What an earlier alignment found.
     base : Transform, optional
@@ -89,13 +87,13 @@ class Bank:
 
     _inertial: InertialTrack        # from the epoch at which n0 was frozen to the last epoch
 
-    def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals, use_position: bool,
+    def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals,
                  prior: Learnt | None = None, base: Transform | None = None) -> None:
         """Take the first epoch."""
         self._base = base or Transform(np.eye(3), np.zeros(3))
         self._not_used = ''
         self._config = config
-        self._use_position = use_position
+        self._use_position = epoch.v_n is None or config.use_position is True
         self._velocity_ns = epoch.stamp_ns          # stamp of the last velocity
         self._velocities_since_ns: int | None = None
         self.counts: Counter[str] = Counter()       # epochs by outcome, and moves of t0

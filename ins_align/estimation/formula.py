@@ -72,7 +72,7 @@ class NoteMethod:
 
     It does not model errors of the IMU: sigmas come from the centred moments, the noise of the
     receiver and the residuals, and without GNSS from the noise of the gyros. ``pif`` uses
-    positions where there are no velocities; the start velocity is then always free.
+    positions where t0 has no velocity; the start velocity is then always free.
 
     Parameters
     ----------
@@ -81,13 +81,10 @@ class NoteMethod:
         The first epoch, t0.
     imu : Intervals
         The interval at t0, whose duration is zero.
-    use_position : bool
-        For ``pif``: integrate positions, not velocities.
 
     """
 
-    def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals,
-                 use_position: bool) -> None:
+    def __init__(self, config: Config, epoch: AntennaEpoch, imu: Intervals) -> None:
         """Start at t0."""
         self.t0_ns = self._last_ns = epoch.stamp_ns
         self.counts: Counter[str] = Counter()
@@ -96,7 +93,7 @@ class NoteMethod:
         self._lever_b = np.array(config.lever_arm)
         self._free = config.free_start
         self._kind = int(config.method == 'pif')            # 0: velocity form, 1: position form
-        self._from_positions = config.method == 'pif' and use_position
+        self._from_positions = config.method == 'pif' and epoch.v_n is None
         self._track = InertialTrack.start(epoch.latitude, epoch.longitude, epoch.altitude)
         self._body = BodyTrack().along(imu).at(0)
         self._integral = VelocityIntegral(velocities_of([epoch])[0])
