@@ -318,7 +318,7 @@ class Aligner:
         """Make an epoch t0 if possible; otherwise say what is missing."""
         if self._first_fix_ns is None and epoch.position_measured:
             self._first_fix_ns = epoch.stamp_ns
-        if self._first_fix_ns is None or not (epoch.position_measured or epoch.v_n is not None):
+        if self._first_fix_ns is None or not any(epoch.measured):
             return
         config = self.config
         alone = epoch.v_n is None

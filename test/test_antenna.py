@@ -98,8 +98,8 @@ def test_an_antenna_counts_what_it_does_not_believe():
         covariance = scale * CORRELATED
         epoch = antenna.epoch(GnssEpoch(
             k, Fix(k, 48.0, 11.0, 300.0, covariance, 0), Velocity(k, np.ones(3), covariance)))
-        assert np.allclose(epoch.velocity_covariance, CORRELATED)
-        assert np.allclose(epoch.position_covariance, CORRELATED)
+        assert np.allclose(epoch.covariances[0], CORRELATED)
+        assert np.allclose(epoch.covariances[1], CORRELATED)
     assert (counts['velocity_covariance'], counts['fix_covariance']) == (3, 3)
 
 
@@ -117,9 +117,9 @@ def test_altitude_that_comes_and_goes(velocity):
     assert [epoch.altitude for epoch in epochs] == [0.0] * 3 + [2500.0] * 6 + [2501.0] * 2
     assert counts['fix_jump'] == 1 and not epochs[-1].position_measured
     for epoch, altitude in zip(epochs, altitudes):
-        up = epoch.position_covariance[2, 2]
+        up = epoch.covariances[1][2, 2]
         assert up == (1e8 if math.isnan(altitude) else Config().position_std_vertical ** 2)
-        assert epoch.position_covariance[0, 0] == Config().position_std ** 2
+        assert epoch.covariances[1][0, 0] == Config().position_std ** 2
 
 
 @pytest.mark.parametrize('vertical', (0.0, 1.0))
@@ -127,16 +127,16 @@ def test_a_vertical_velocity_that_is_told_to_be_absent_counts_for_nothing(vertic
     antenna = Antenna(Config(velocity_vertical='absent'), Counter())
     for k in range(3):
         epoch = antenna.epoch(told(k * SECOND, 0.0, (1.0, 2.0, vertical)))
-        assert np.array_equal(epoch.velocity_covariance[:2, :2], CORRELATED[:2, :2])
-        assert np.array_equal(epoch.velocity_covariance[2], [0.0, 0.0, 1e6])
-        assert np.array_equal(epoch.velocity_covariance[:, 2], [0.0, 0.0, 1e6])
+        assert np.array_equal(epoch.covariances[0][:2, :2], CORRELATED[:2, :2])
+        assert np.array_equal(epoch.covariances[0][2], [0.0, 0.0, 1e6])
+        assert np.array_equal(epoch.covariances[0][:, 2], [0.0, 0.0, 1e6])
 
 
 def test_a_receiver_that_has_measured_the_vertical_may_say_zero():
     antenna = Antenna(Config(), Counter())
     for k, up in enumerate((0.5, 0.0, -0.5, 0.0)):
         epoch = antenna.epoch(told(k * SECOND, 0.0, (3.0, 1.0, up)))
-        assert np.array_equal(epoch.velocity_covariance, CORRELATED)
+        assert np.array_equal(epoch.covariances[0], CORRELATED)
 
 
 @pytest.mark.parametrize('silent, off, believed', [

@@ -134,14 +134,11 @@ class NoteMethod:
 
     def _receiver_variance(self, epoch: AntennaEpoch) -> float:
         """Return the receiver's variance of what is used, mean of the three axes."""
-        covariance = (epoch.position_covariance if self._from_positions
-                      else epoch.velocity_covariance)
-        return float(np.trace(covariance)) / 3
+        return float(np.trace(epoch.covariances[self._from_positions])) / 3
 
     def _pair(self, epoch: AntennaEpoch) -> None:
         """Add the pair of vectors of an epoch, without the known start, and solve."""
-        used = epoch.position_measured if self._from_positions else epoch.v_n is not None
-        if not used:
+        if not epoch.measured[self._from_positions]:
             return
         time = float(self._track.time)
         known, free = np.split(time ** np.arange(1 + self._kind), [len(self._known)])

@@ -92,7 +92,7 @@ class Start:
 
     def add(self, epoch: AntennaEpoch, imu: Intervals) -> None:
         """Add an epoch and the interval before it."""
-        if self.epochs or _measured(epoch):
+        if self.epochs or any(epoch.measured):
             self._imu.append(imu if self.epochs else imu.end())
             self.epochs.append(epoch)
         if len(self.epochs) > MAX_WAITING:
@@ -107,11 +107,11 @@ class Start:
     @property
     def measured(self) -> int:
         """Return the number of epochs with a measurement."""
-        return sum(map(_measured, self.epochs))
+        return sum(any(epoch.measured) for epoch in self.epochs)
 
     def _drop_first(self) -> None:
         """Drop the first epochs: t0 is the next one with a measurement."""
-        later = [k for k, epoch in enumerate(self.epochs) if k and _measured(epoch)]
+        later = [k for k, epoch in enumerate(self.epochs) if k and any(epoch.measured)]
         first = later[0] if later else len(self.epochs)
         del self.epochs[:first], self._imu[:first]
         if later:
@@ -122,9 +122,9 @@ class Start:
         epochs = self.epochs
         if len(epochs) < FIRST_EPOCHS:
             return None
-        kind = 0 if sum(epoch.v_n is not None for epoch in epochs) >= FIRST_EPOCHS else 1
-        use = np.array([epoch.position_measured if kind else epoch.v_n is not None
-                        for epoch in epochs])
+        measured = np.array([epoch.measured for epoch in epochs])
+        kind = 0 if np.count_nonzero(measured[:, 0]) >= FIRST_EPOCHS else 1
+        use = measured[:, kind]
         variance = self._variance(kind)
         use &= variance <= UNCERTAIN ** 2 * np.min(variance[use], initial=np.inf)
         if np.count_nonzero(use) < FIRST_EPOCHS + kind or (kind and not use_position):
@@ -201,8 +201,7 @@ class Start:
         A vertical velocity that is not measured is taken as steady, an altitude as constant, with
         the variance of the horizontal ones.
         """
-        covariance = np.array([epoch.position_covariance if kind else epoch.velocity_covariance
-                               for epoch in self.epochs])
+        covariance = np.array([epoch.covariances[kind] for epoch in self.epochs])
         horizontal = np.trace(covariance[:, :2, :2], axis1=1, axis2=2)
         return np.minimum(np.trace(covariance, axis1=1, axis2=2) / 3, horizontal)
 
@@ -248,7 +247,7 @@ class Start:
             P[rows, PHI] = P[rows, PHI0] = attitude
             P[rows, FIRST:] = tilt @ known[accel]
             P[FIRST:, rows] = P[rows, FIRST:].T
-        steady = any(epoch.v_n is not None for epoch in self.epochs)
+        steady = any(epoch.measured[0] for epoch in self.epochs)
         P[XI, XI] = (STEADY_VELOCITY if steady else OPEN_VELOCITY) ** 2 * np.eye(3)
         P[RHO, RHO] = OPEN_POSITION ** 2 * np.eye(3)
         return C @ exp_so3(_EVEN * axis) @ exp_so3(tilt @ x[accel]), P
@@ -289,7 +288,3 @@ def redraw_headings(filters: Filters) -> None:
     filters.keep(np.concatenate(source))
     turned = exp_so3(np.concatenate(angle)[:, None] * np.array([0.0, 0.0, 1.0]))
     filters.C, filters.C0 = turned @ filters.C, turned @ filters.C0
-
-
-def _measured(epoch: AntennaEpoch) -> bool:
-    return epoch.v_n is not None or epoch.position_measured

@@ -117,10 +117,8 @@ class InertialTrack:
     def measured(self, epochs: Sequence[AntennaEpoch], use_position: bool) -> Measured:
         """Return what the GNSS measures at the epochs of the track."""
         C_n0n = self.C_n0n[:, None]
-        covariance = np.array([[epoch.velocity_covariance, epoch.position_covariance]
-                               for epoch in epochs])
-        present = np.array([(epoch.v_n is not None, epoch.position_measured and use_position)
-                            for epoch in epochs])
+        covariance = np.array([epoch.covariances for epoch in epochs])
+        present = np.array([epoch.measured for epoch in epochs]) & [True, use_position]
         vertical = np.any(present & (covariance[..., 2, 2] < UNMEASURED ** 2), axis=1)
         if use_position:            # epochs between positions must not reset the vertical
             vertical |= ~present[:, 1]

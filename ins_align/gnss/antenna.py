@@ -112,8 +112,9 @@ class Antenna:
         velocity_covariance = self._velocity_noise.covariance(
             None if velocity is None else velocity.covariance,
             self._vertical and (velocity is None or velocity.vertical))
-        return AntennaEpoch(message.stamp_ns, *self._place, v_n, velocity_covariance, believed,
-                            position_covariance, self.gravity_drift(message.stamp_ns),
+        return AntennaEpoch(message.stamp_ns, *self._place, v_n, believed,
+                            (velocity_covariance, position_covariance),
+                            self.gravity_drift(message.stamp_ns),
                             fault='' if self._v_n is None else self._check.fault,
                             dry=fix is None and velocity is None,
                             stated=(velocity is None or velocity.covariance is not None,

@@ -91,13 +91,18 @@ class AntennaEpoch:
     longitude: float
     altitude: float  # m
     v_n: Array | None  # (3,), ENU, m/s; None: not measured
-    velocity_covariance: Array  # (3, 3), ENU, m^2/s^2
     position_measured: bool  # whether the position is a measurement to align with
-    position_covariance: Array  # (3, 3), ENU, m^2
+    # Of velocity and position, (3, 3), ENU, m^2/s^2 and m^2, as they are used
+    covariances: tuple[Array, Array]
     gravity_drift: float = 0.0  # noise of gravity at an unknown place, m/s/sqrt(s)
     fault: str = ''  # of the velocities up to here, in words; '' when none is known
     dry: bool = False  # whether there is no GNSS message: an epoch that divides an outage
     stated: tuple[bool, bool] = (True, True)  # whether noise of velocity and position is stated
+
+    @property
+    def measured(self) -> tuple[bool, bool]:
+        """Whether velocity and position are measured."""
+        return self.v_n is not None, self.position_measured
 
 
 def velocities_of(epochs: Sequence[AntennaEpoch]) -> Array:
