@@ -29,7 +29,7 @@ from ins_align.estimation.declaration import Fit
 from ins_align.estimation.filter import Filters
 from ins_align.estimation.linearised import EARLIEST, LATEST, linearised
 from ins_align.estimation.receiver import MOVING, ReceiverNoise
-from ins_align.estimation.rivals import level_in_words, Parameters, Rivals, SHARE
+from ins_align.estimation.rivals import level_in_words, Rivals, SHARE
 from ins_align.estimation.start import (
     HEADINGS, OPEN_POSITION, redraw_headings, RoughAttitude, Start, STEADY_VELOCITY)
 from ins_align.estimation.states import (
@@ -107,18 +107,17 @@ class Bank:
         self._prior = prior
         force = imu.gained[0, -1]
         force = STANDARD_GRAVITY * force / max(float(np.linalg.norm(force)), 1e-3)
-        self._rivals = rivals = Rivals(self._config)
-        self._known = [Parameters.of(self._config, rival, force) for rival in rivals.table]
+        self._rivals = rivals = Rivals(self._config, force)
         self._vehicle: Vehicle | None = None
         if self._config.vehicle != 'none':
-            std = np.sqrt(self._known[0].P.diagonal()[-OF_VEHICLE:])
+            std = np.sqrt(rivals.P[0].diagonal()[-OF_VEHICLE:])
             self._vehicle = Vehicle(self._config, self._base, rivals.along, std)
         if prior is not None:
-            self._apply_prior(prior)
-        gyro, accel = triads(self._known[0].x.size)
+            rivals.use_prior(prior.x, prior.P, (self.t0_ns - prior.stamp_ns) * 1e-9)
+        gyro, accel = triads(rivals.x.size)
         errors = gyro.stop - gyro.start
         # Measurements are linear in the parameters of a vehicle.
-        self._reach = np.full(self._known[0].x.size, np.inf)
+        self._reach = np.full(rivals.x.size, np.inf)
         self._reach[:accel.stop] = np.concatenate([REACH[:gyro.stop], REACH[16:16 + errors]])
         self._filters: Filters | None = None
         self._mixture: tuple[Array, Array] | None = None
@@ -135,19 +134,6 @@ class Bank:
         # n0 and the point of linearisation are kept for `_span` epochs, of which `_left` are left.
         self._point: Array | None = None
         self._span = self._left = 1
-
-    def _apply_prior(self, learnt: Learnt) -> None:
-        """Use what an earlier alignment found, with a variance that has grown with its age."""
-        age = (self.t0_ns - learnt.stamp_ns) * 1e-9
-        for rival, known in zip(self._rivals.table, self._known):
-            if rival.wrong:
-                continue
-            body = slice(learnt.x.size)             # parameters of a vehicle may be missing
-            known.x[body] = learnt.x
-            walk, most = known.walk[FIRST:][body], known.P.diagonal()[body]
-            grown = np.minimum(learnt.P.diagonal() + age * walk, most)
-            known.P[body, body] = learnt.P + np.diag(
-                np.maximum(grown - learnt.P.diagonal(), 0.0))
 
     # Input
 
@@ -324,17 +310,15 @@ class Bank:
 
     def _begin_with(self, rough: RoughAttitude) -> None:
         """Start filters for all headings and rivals at t0, and process the epochs since."""
-        epochs, imu = self._start.epochs, self._start.imu
-        x = self._known[0].x
-        C, P = zip(*(self._start.means(rough, x, known.P, sign) for known, sign in zip(
-            self._known, self._rivals.signs[:, 3].tolist())))
-        rival = np.repeat(np.arange(len(self._rivals.table)), HEADINGS)
+        epochs, imu, rivals = self._start.epochs, self._start.imu, self._rivals
+        C, P = zip(*(self._start.means(rough, rivals.x, known, sign) for known, sign in zip(
+            rivals.P, rivals.signs[:, 3].tolist())))
+        rival = np.repeat(np.arange(len(rivals.table)), HEADINGS)
         v_n = next((epoch.v_n for epoch in epochs if epoch.v_n is not None), np.zeros(3))
         self._freeze(epochs[0])
         inertial = self._inertial.along(epochs, self._n0_ns)
-        self._filters = filters = Filters(np.concatenate(C), v_n, x, rival, np.array(P),
-                                          np.array([known.walk for known in self._known]),
-                                          self._rivals.prior, self._rivals.mixed)
+        self._filters = filters = Filters(np.concatenate(C), v_n, rivals.x, rival, np.array(P),
+                                          rivals.walk, rivals.prior, rivals.mixed)
         for k in range(len(epochs)):
             one = slice(k, k + 1)
             model = self._model(filters, self._point_of(filters), imu.take(one))
@@ -384,9 +368,9 @@ class Bank:
 
     def _body(self) -> tuple[Array, Array]:
         """Return the likeliest parameters of the body and their covariance."""
-        filters, known = self._filters, self._known[0]
+        filters, known, known_P = self._filters, self._rivals.x, self._rivals.P[0]
         if filters is None or self._mixture is None:
-            return known.x, known.P
+            return known, known_P
         best = filters.best
         x, P = filters.x[filters.lead[best]].copy(), filters.P[best, FIRST:, FIRST:].copy()
         if self._mixture[1][1, 2, 2] > RESOLVED_STD ** 2:
@@ -394,7 +378,7 @@ class Bank:
             # noise of the IMU, which looks like a swing that the GNSS does not see.
             antenna = slice(0, GYRO)
             P[antenna] = P[:, antenna] = 0.0
-            x[antenna], P[antenna, antenna] = known.x[antenna], known.P[antenna, antenna]
+            x[antenna], P[antenna, antenna] = known[antenna], known_P[antenna, antenna]
         return x, P
 
     def nuisance(self) -> Nuisance:

@@ -149,17 +149,34 @@ class Rivals:
     mixed : ndarray of bool, shape (R,)
         Whether a rival is part of results. Wrong rivals are not, nor those without the assumption
         on a vehicle where one is configured, which are there to contradict it.
+    x : ndarray, shape (m,)
+        Parameters of the body before the data.
+    P, walk : ndarray, shapes (R, m, m), (R, n)
+        Their covariance under each rival, and the random walk of all errors: what the covariance
+        gains on its diagonal in a second.
 
     """
 
-    def __init__(self, config: Config) -> None:
-        """Make the table."""
+    def __init__(self, config: Config, force: Array) -> None:
+        """Make the table; `force` is as in `parameters_of`."""
         self.table = rivals_of(config)
         self.signs = np.array([rival.signs for rival in self.table])
         self.prior = np.array([rival.prior for rival in self.table])
         self.along = np.array([rival.along for rival in self.table])
         self._wrong = np.array([bool(rival.wrong) for rival in self.table])
         self.mixed = ~self._wrong & ((self.along != 0) | (config.vehicle == 'none'))
+        (self.x, *_), P, walk = zip(*(parameters_of(config, rival, force) for rival in self.table))
+        self.P, self.walk = np.array(P), np.array(walk)
+
+    def use_prior(self, x: Array, P: Array, age: float) -> None:
+        """Start from what an earlier alignment found, with a variance that has grown since (s)."""
+        body = slice(x.size)                    # parameters of a vehicle may be missing
+        self.x[body] = x
+        variance = P.diagonal()
+        for k in np.flatnonzero(~self._wrong):
+            grown = np.minimum(variance + age * self.walk[k, FIRST:][body],
+                               self.P[k].diagonal()[body])
+            self.P[k, body, body] = P + np.diag(np.maximum(grown - variance, 0.0))
 
     def select(self, filters: Filters) -> None:
         """Drop means and rivals that are unlikely, merge means that agree."""
@@ -216,56 +233,39 @@ class Rivals:
         return f'{known} not confirmed by the motion yet: turn and change speed', False
 
 
-@dataclass
-class Parameters:
-    """The prior of the body's parameters under a rival."""
+def parameters_of(config: Config, rival: Rival, force: Array) -> tuple[Array, Array, Array]:
+    """
+    Return the parameters of the body under a rival, x, P and walk of `Rivals`, before the data.
 
-    x: Array  #: (m,)
-    P: Array  #: (m, m), covariance
-    walk: Array  #: (n,), random walk of all errors: what P gains on its diagonal in a second
-
-    @staticmethod
-    def of(config: Config, rival: Rival, force: Array) -> 'Parameters':
-        """
-        Return the prior of a configuration.
-
-        Parameters
-        ----------
-        config : Config
-            What is configured.
-        rival : Rival
-            What is assumed instead.
-        force : ndarray, shape (3,)
-            Specific force, m/s^2, at which all errors of the accelerometers together are as large
-            as their biases are said to be.
-
-        """
-        noise = config.imu_noise
-        matrices = noise.gyro_scale_std > 0
-        vehicle = config.vehicle != 'none'
-        x, std, walk = np.zeros((3, GYRO + (24 if matrices else 6) + OF_VEHICLE * vehicle))
-        accel = triads(x.size)[1].start
-        if vehicle:
-            drift = config.vehicle_velocity_std or DRIFTS[config.vehicle]
-            std[MOUNT], std[DRIFT] = math.radians(config.mount_yaw_std), drift
-            walk[DRIFT] = drift ** 2 / DRIFT_TIME
-        x[LEVER_ARM] = config.lever_arm
-        std[LEVER_ARM] = max(config.lever_arm_std, rival.lever_arm_std)
-        std[DELAY] = max(config.gnss_delay_std, rival.gnss_delay_std)
-        gyro_std, accel_std, walk_std, gyro_scale, accel_scale = rival.sigmas(noise)
-        std[GYRO:GYRO + 3], std[accel:accel + 3] = gyro_std, accel_std
-        walk[DELAY] = (DELAY_WANDER * config.gnss_delay_std) ** 2 / WANDER_TIME
-        walk[GYRO:GYRO + 3] = walk_std ** 2
-        walk[accel:accel + 3] = (ACCEL_WANDER * accel_std) ** 2 / WANDER_TIME
-        P = np.diag(std ** 2)
-        if matrices:
-            P[GYRO + 3:accel, GYRO + 3:accel] = np.diag(gyro_matrix_std(gyro_scale).ravel() ** 2)
-            # At the force f the error b + M f of bias b and matrix M has the sigma of the bias.
-            told = np.eye(12)
-            told[:3, 3:] = -np.kron(np.eye(3), force)
-            sigmas = np.repeat([accel_std, accel_scale], [3, 9])
-            P[accel:accel + 12, accel:accel + 12] = told @ np.diag(sigmas ** 2) @ told.T
-        return Parameters(x, P, np.concatenate([np.zeros(FIRST), walk]))
+    `force`, (3,), is the specific force, m/s^2, at which all errors of the accelerometers together
+    are as large as their biases are said to be.
+    """
+    noise = config.imu_noise
+    matrices = noise.gyro_scale_std > 0
+    vehicle = config.vehicle != 'none'
+    x, std, walk = np.zeros((3, GYRO + (24 if matrices else 6) + OF_VEHICLE * vehicle))
+    accel = triads(x.size)[1].start
+    if vehicle:
+        drift = config.vehicle_velocity_std or DRIFTS[config.vehicle]
+        std[MOUNT], std[DRIFT] = math.radians(config.mount_yaw_std), drift
+        walk[DRIFT] = drift ** 2 / DRIFT_TIME
+    x[LEVER_ARM] = config.lever_arm
+    std[LEVER_ARM] = max(config.lever_arm_std, rival.lever_arm_std)
+    std[DELAY] = max(config.gnss_delay_std, rival.gnss_delay_std)
+    gyro_std, accel_std, walk_std, gyro_scale, accel_scale = rival.sigmas(noise)
+    std[GYRO:GYRO + 3], std[accel:accel + 3] = gyro_std, accel_std
+    walk[DELAY] = (DELAY_WANDER * config.gnss_delay_std) ** 2 / WANDER_TIME
+    walk[GYRO:GYRO + 3] = walk_std ** 2
+    walk[accel:accel + 3] = (ACCEL_WANDER * accel_std) ** 2 / WANDER_TIME
+    P = np.diag(std ** 2)
+    if matrices:
+        P[GYRO + 3:accel, GYRO + 3:accel] = np.diag(gyro_matrix_std(gyro_scale).ravel() ** 2)
+        # At the force f the error b + M f of bias b and matrix M has the sigma of the bias.
+        told = np.eye(12)
+        told[:3, 3:] = -np.kron(np.eye(3), force)
+        sigmas = np.repeat([accel_std, accel_scale], [3, 9])
+        P[accel:accel + 12, accel:accel + 12] = told @ np.diag(sigmas ** 2) @ told.T
+    return x, P, np.concatenate([np.zeros(FIRST), walk])
 
 
 def level_in_words(level: Rival, config: Config, x: Array, P: Array) -> str:
