@@ -26,7 +26,7 @@ import math
 from ins_align.config import Config, ImuNoise, PRESETS
 from ins_align.estimation.filter import Filters, NEGLIGIBLE
 from ins_align.estimation.states import (
-    biases, DELAY, DRIFT, FIRST, GYRO, LEVER_ARM, log_sum, MARGIN, MOUNT, OF_VEHICLE, triads)
+    biases, DELAY, DRIFT, FIRST, GYRO, LEVER_ARM, MARGIN, MOUNT, OF_VEHICLE, triads)
 from ins_align.geometry.rotation import Array, log_so3
 import numpy as np
 
@@ -213,7 +213,7 @@ class Rivals:
             return '', False
         # How much likelier each wrong rival is than all levels together.
         level = filters.evidence
-        ahead = np.where(wrong, level - log_sum(level[filters.mixed]), -np.inf)
+        ahead = np.where(wrong, level - np.logaddexp.reduce(level[filters.mixed]), -np.inf)
         if not np.any(ahead > -MARGIN):
             return '', False
         C = np.stack([filters.C0[filters.lead], filters.C[filters.lead]], axis=1)

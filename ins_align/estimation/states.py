@@ -18,7 +18,6 @@ These are the indices, shapes and names that the modules of the estimation share
 """
 
 from dataclasses import dataclass
-import math
 
 from ins_align.geometry.rotation import apply, Array, cross, skew
 import numpy as np
@@ -87,12 +86,6 @@ def transport(d: Array, half: Array, rest: Array) -> Array:
     G[:, accel, PHI] = (back @ back @ skew(rest)
                         - skew(_felt(d[:, PHI], d[:, accel], back, rest)) @ back)
     return G
-
-
-def log_sum(values: Array) -> float:
-    """Return the log of the sum of exponentials."""
-    largest = float(np.max(values))
-    return largest + math.log(float(np.sum(np.exp(values - largest))))
 
 
 @dataclass

@@ -29,7 +29,7 @@ import math
 from ins_align.config import Config
 from ins_align.estimation.filter import Filters
 from ins_align.estimation.states import (
-    DRIFT, FIRST, Linearised, log_sum, MARGIN, Measured, MOUNT, OF_VEHICLE, PHI)
+    DRIFT, FIRST, Linearised, MARGIN, Measured, MOUNT, OF_VEHICLE, PHI)
 from ins_align.geometry.rotation import apply, Array, Index, skew, Transform
 import numpy as np
 
@@ -126,8 +126,8 @@ class Vehicle:
         """Return whether the motion contradicts what is assumed of the vehicle."""
         x = filters.x[filters.lead[filters.best], -OF_VEHICLE:]
         free = self._along[filters.ids] == 0
-        return bool(np.any(np.abs(x) > MOST * self._std) or log_sum(filters.evidence[free])
-                    >= log_sum(filters.evidence[~free]) + MARGIN)
+        any_way, along = (np.logaddexp.reduce(filters.evidence[use]) for use in (free, ~free))
+        return bool(np.any(np.abs(x) > MOST * self._std) or any_way >= along + MARGIN)
 
     def doubt(self, filters: Filters) -> str:
         """Return in words that the motion does not confirm the assumption yet, or ''."""
