@@ -168,11 +168,11 @@ class Aligner:
 
     def _start_over(self, counter: str, why: str) -> None:
         self._process()     # whatever came before, so that results do not depend on `update`
-        self._counts[counter] += 1
-        self._announce_restart(why)
+        self._announce_restart(counter, why)
         self._forget_all()
 
-    def _announce_restart(self, why: str) -> None:
+    def _announce_restart(self, counter: str, why: str) -> None:
+        self._counts[counter] += 1
         self._started_over = f'alignment starts over: {why}'
         self._events.append(Event(Severity.WARNING, self._started_over))
 
@@ -266,15 +266,14 @@ class Aligner:
             taken = method.advance(epochs[part], imu)
             for epoch, force, seconds in zip(taken, imu.force.tolist(), imu.duration.tolist()):
                 self._force_check.add(force, seconds)
-                self._judge(epoch, method)
+                self._finish(epoch, method)
 
-    def _judge(self, epoch: AntennaEpoch, method: Bank | NoteMethod) -> None:
+    def _finish(self, epoch: AntennaEpoch, method: Bank | NoteMethod) -> None:
         """Decide on the state after an epoch, and append the `Epoch` to the output."""
         # 6. The fit holds what the rival hypotheses object.
         fit = method.fit()
         if method.restarted:
-            self._counts['restarts'] += 1
-            self._announce_restart(method.restarted)
+            self._announce_restart('restarts', method.restarted)
             self.declared = self._time_to_align_s = None
             self._start_ns, method.restarted = epoch.stamp_ns, ''
         # 7. The declaration decides on the state and words the reason.
@@ -316,9 +315,9 @@ class Aligner:
 
     def _start(self, epoch: AntennaEpoch) -> None:
         """Make an epoch t0 if possible; otherwise say what is missing."""
-        if self._first_fix_ns is None and epoch.position_measured:
+        if self._first_fix_ns is None:      # the antenna has no epoch before there is a fix
             self._first_fix_ns = epoch.stamp_ns
-        if self._first_fix_ns is None or not any(epoch.measured):
+        if not any(epoch.measured):
             return
         config = self.config
         alone = epoch.v_n is None
@@ -345,7 +344,7 @@ class Aligner:
         # A method starts with positions where the first epoch has no velocity.
         self._method = (Bank(config, epoch, imu, self._learnt, self._base)
                         if config.method == 'bank' else NoteMethod(config, epoch, imu))
-        self._judge(epoch, self._method)
+        self._finish(epoch, self._method)
 
     def _bridge_outage(self, upto_ns: int) -> None:
         """Insert epochs without measurement, up to a stamp."""
@@ -357,8 +356,7 @@ class Aligner:
         self._align()
         learnt = self._learnt
         if self._method is not None:
-            self._counts['restarts'] += 1
-            self._announce_restart(why)
+            self._announce_restart('restarts', why)
             learnt = self._method.learnt()
         self._forget(learnt)
 

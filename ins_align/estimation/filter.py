@@ -36,7 +36,7 @@ from typing import NamedTuple
 
 from ins_align.config import STANDARD_GRAVITY
 from ins_align.estimation.states import (
-    biases, FIRST, GYRO, LEVER_ARM, Linearised, Measured, PHI, PHI0, RHO, transport,
+    biases, DELAY, FIRST, LEVER_ARM, Linearised, Measured, PHI, PHI0, RHO, transport,
     turned_parameters, XI)
 from ins_align.geometry.rotation import (
     apply, Array, exp_so3, Index, log_so3, nearest_rotation, skew)
@@ -215,7 +215,7 @@ class Filters:
         change = apply(model.J[k][q], self.x - model.point[q])
         moved = (model.moved[k][q] + change[:, 3:]).reshape(-1, 2, 3) @ self.C.swapaxes(1, 2)
         v, p = moved[:, 0], moved[:, 1]
-        self.w = self.w + duration * self.u + p - self.x[:, GYRO - 1:GYRO] * v
+        self.w = self.w + duration * self.u + p - self.x[:, DELAY, None] * v
         self.u = self.u + v
         self.C = self.C @ exp_so3(change[:, PHI]) @ model.R[k][q]
         F, Q, P = model.F[k], model.Q[k], self.P

@@ -217,7 +217,7 @@ class ImuBuffer:
         settled = int(np.searchsorted(self.stamps, self.due_ns, side='right'))
         # Interpolation at an epoch needs two samples after it, and the check for spikes a third.
         upto_ns = min(int(self.stamps[max(settled, 3) - 3]), self.due_ns)
-        self._check(upto_ns)
+        self._find_silences(upto_ns)
         return upto_ns
 
     @property
@@ -248,8 +248,8 @@ class ImuBuffer:
 
     # Steps between epochs
 
-    def _check(self, upto_ns: int) -> None:
-        """Find silences, and the samples up to a stamp that are at the end of the range."""
+    def _find_silences(self, upto_ns: int) -> None:
+        """Find silences, for which samples up to a stamp are checked for the end of the range."""
         stamps = self.stamps
         first, last = np.searchsorted(stamps, [self._checked_ns, upto_ns], side='right').tolist()
         samples, _ = without_spikes(stamps[:last + 1], self.samples[:last + 1])
