@@ -71,19 +71,18 @@ class Aligner:
         self._events: deque[Event] = deque(maxlen=MAX_EVENTS)
         self._warned: set[str] = set()
         self._done: list[Epoch] = []                # not yet returned by `update`
-        self._delay_ns = round(self.config.gnss_delay * 1e9)
         self._started_over = ''                     # the reason; '' from the next epoch on
         self._method: Bank | NoteMethod | None = None
         self._forget_all()
 
     def _forget_all(self) -> None:
         """Drop the queues and all that was learnt; counts, events and finished epochs stay."""
-        lateness_ns = round(self.config.gnss_lateness * 1e9) + max(self._delay_ns, 0)
+        delay_ns = round(self.config.gnss_delay * 1e9)
+        lateness_ns = round(self.config.gnss_lateness * 1e9) + max(delay_ns, 0)
         self._checks = InputChecks(self.config)
         self._imu = ImuBuffer(lateness_ns, self._counts, self.config.imu_noise,
                               self._checks.add_imu)
-        self._gnss = GnssBuffer(lateness_ns, self._counts, max(-self._delay_ns, 0),
-                                self._checks.add_gnss)
+        self._gnss = GnssBuffer(lateness_ns, self._counts, delay_ns, self._checks.add_gnss)
         self._refusal = ''                          # why the last velocity could not be used
         self._first_t0_ns: int | None = None
         self._forget(None)
@@ -141,7 +140,7 @@ class Aligner:
 
     def add_fix(self, fix: Fix) -> None:
         """Take a GNSS position."""
-        self._gnss.add(fix._replace(stamp_ns=fix.stamp_ns - self._delay_ns), self._imu.newest_ns)
+        self._gnss.add(fix, self._imu.newest_ns)
 
     def add_velocity(self, velocity: Velocity) -> None:
         """Take a GNSS velocity."""
@@ -149,8 +148,7 @@ class Aligner:
         if self.config.use_velocity is False:
             self._counts['velocity'] += 1
             return
-        self._gnss.add(velocity._replace(stamp_ns=velocity.stamp_ns - self._delay_ns),
-                       self._imu.newest_ns)
+        self._gnss.add(velocity, self._imu.newest_ns)
 
     def reject(self, reason: str, why: str = '') -> None:
         """Count a message that the caller could not use; `why`, in words, is an event once."""

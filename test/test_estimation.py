@@ -196,13 +196,12 @@ def prepared(s, *, velocity=True, **changes):
     """Return a bank at its t0, the epochs behind it and the IMU intervals before each."""
     config = config_for(s, **changes)
     counts = Counter()
-    samples, messages = ImuBuffer(0, counts, config.imu_noise), GnssBuffer(0, counts)
-    delay_ns = round(config.gnss_delay * 1e9)
+    samples = ImuBuffer(0, counts, config.imu_noise)
+    messages = GnssBuffer(0, counts, round(config.gnss_delay * 1e9))
     for k in range(len(s.gnss_stamps_ns)):
-        fix, measured = s.fix(k), s.velocity_measurement(k)
-        messages.add(fix._replace(stamp_ns=fix.stamp_ns - delay_ns), None)
+        messages.add(s.fix(k), None)
         if velocity:
-            messages.add(measured._replace(stamp_ns=measured.stamp_ns - delay_ns), None)
+            messages.add(s.velocity_measurement(k), None)
     samples.add_in_order(s.imu_stamps_ns, s.gyro, s.accel)
     antenna = Antenna(config, counts)
     first, *epochs = map(antenna.epoch, messages.release(samples.settled_ns(True), True))

@@ -48,17 +48,17 @@ class GnssEpoch(NamedTuple):
 
 class GnssBuffer:
     """
-    GNSS messages that are not used yet, by stamp.
+    GNSS messages that are not used yet, by stamp, from which `delay_ns` is taken off.
 
     `counts` counts them, and also epochs that only repeat the one before or are later than the
     last IMU sample, and velocities of a receiver without a fix. `watch` is called with each
     message, why it cannot be used ('' if it can), and how far it is behind the IMU, ns.
     """
 
-    def __init__(self, lateness_ns: int, counts: Counter[str], earliness_ns: int = 0,
+    def __init__(self, lateness_ns: int, counts: Counter[str], delay_ns: int = 0,
                  watch: Callable[[Fix | Velocity, str, int], None] | None = None) -> None:
-        """Start empty; `earliness_ns` adds to the time that stamps may be ahead of the IMU."""
-        self._lateness_ns, self._ahead_ns = lateness_ns, MAX_AHEAD_NS + earliness_ns
+        self._delay_ns, self._lateness_ns = delay_ns, lateness_ns
+        self._ahead_ns = MAX_AHEAD_NS + max(-delay_ns, 0)
         self._counts = counts
         self._watch = watch
         self._pending: dict[int, GnssEpoch] = {}
@@ -72,8 +72,8 @@ class GnssBuffer:
         """Add a message to the epoch of its stamp, if usable and the first of its kind there."""
         kind = 'fix' if isinstance(message, Fix) else 'velocity'
         self._counts[kind] += 1
-        message, fault = usable(message)
-        stamp_ns = message.stamp_ns
+        stamp_ns = message.stamp_ns - self._delay_ns
+        message, fault = usable(message._replace(stamp_ns=stamp_ns))
         behind_ns = 0 if imu_newest_ns is None else imu_newest_ns - stamp_ns
         if self._watch is not None:
             self._watch(message, fault, behind_ns)
