@@ -106,8 +106,7 @@ class Aligner:
         since = 'since it started over' if self._started_over else 'yet'
         self._verdict = Verdict(State.WAITING_FOR_IMU, f'no IMU sample {since}')
         self._time_to_align_s: float | None = None
-        self._initial: Attitude | None = None
-        self._current: Attitude | None = None
+        self._epoch: Epoch | None = None            # the last one; None before t0
         self.declared: Attitude | None = None
 
     # Input: step 2
@@ -285,7 +284,7 @@ class Aligner:
         if self._declaration.move_t0:
             method.move_t0()
             attitudes = method.attitudes()
-        self._initial, self._current = attitudes or (None, None)
+        initial, current = attitudes or (None, None)
         if epoch.v_n is not None:
             self._without_velocity = False
         if fault := self._force_check.fault or epoch.fault:
@@ -295,7 +294,7 @@ class Aligner:
             verdict = Verdict(verdict.state,
                               f'{verdict.reason}; no GNSS velocity is used: {why}')
         if verdict.state is State.ALIGNED and self.declared is None:
-            self.declared = self._initial
+            self.declared = initial
             self._time_to_align_s = (epoch.stamp_ns - self._start_ns) * 1e-9
         elif verdict.state is not State.ALIGNED and self.declared is not None:
             self.declared = self._time_to_align_s = None
@@ -303,10 +302,11 @@ class Aligner:
         self._set_verdict(verdict)
         # 8. The epoch is ready for `update` to return.
         body = method.nuisance()
-        self._done.append(Epoch(
+        self._epoch = Epoch(
             epoch.stamp_ns, (epoch.stamp_ns - (self._first_t0_ns or 0)) * 1e-9, verdict.state,
-            self._initial, self._current, fit.innovation, body.gyro_bias, body.accel_bias,
-            body.gyro_bias_std, body.gyro_matrix, epoch.dry, verdict.reason, self._started_over))
+            initial, current, fit.innovation, body.gyro_bias, body.accel_bias,
+            body.gyro_bias_std, body.gyro_matrix, epoch.dry, verdict.reason, self._started_over)
+        self._done.append(self._epoch)
         self._started_over = ''
 
     # Start, outages, loss
@@ -412,16 +412,13 @@ class Aligner:
 
     def prediction(self) -> Prediction | None:
         """Return a prediction that stands at the newest IMU sample; None as `attitude_now`."""
-        current, method = self._current, self._method
-        if current is None or method is None:
+        epoch = self._epoch
+        if epoch is None or epoch.current is None:
             return None
-        stamps, rates, rate, usual = self._imu.rates_since(current.stamp_ns)
-        if stamps.size and self._imu.silence(current.stamp_ns, int(stamps[-1])):
+        stamps, rates, rate, usual = self._imu.rates_since(epoch.stamp_ns)
+        if stamps.size and self._imu.silence(epoch.stamp_ns, int(stamps[-1])):
             return None
-        body = method.nuisance()
-        prediction = Prediction(
-            current, body.gyro_bias, body.gyro_matrix, body.gyro_bias_std,
-            self.config.imu_noise.angle_random_walk, rate, usual)
+        prediction = Prediction(epoch, self.config.imu_noise, rate, usual)
         carried = all(prediction.propagate(*sample)
                       for sample in zip(stamps.tolist(), rates.tolist()))
         return prediction if carried else None
@@ -441,12 +438,13 @@ class Aligner:
         While nothing is ALIGNED, it is a FAULT if units or coordinates are found to be wrong. This
         looks through the messages of minutes: call it about once a second, not at each epoch.
         """
-        method = self._method
+        method, epoch = self._method, self._epoch
         nuisance = Nuisance.configured(self.config) if method is None else method.nuisance()
         verdict = self._verdict
         if verdict.state is not State.ALIGNED:
             verdict = self._checks.judge(verdict)
         return Status(**vars(nuisance), **vars(verdict), stamp_ns=self._last_ns,
-                      t0_ns=None if method is None else method.t0_ns, initial=self._initial,
-                      current=self._current, time_to_align_s=self._time_to_align_s,
-                      counts=dict(self.counts))
+                      t0_ns=None if method is None else method.t0_ns,
+                      initial=None if epoch is None else epoch.initial,
+                      current=None if epoch is None else epoch.current,
+                      time_to_align_s=self._time_to_align_s, counts=dict(self.counts))

@@ -15,10 +15,11 @@
 
 from copy import copy
 
+from ins_align.config import ImuNoise
 from ins_align.geometry.earth import EARTH_RATE
 from ins_align.imu.noise import GAP_ANGULAR_ACCELERATION
 from ins_align.imu.prediction import Follower, MAX_GAP_NS, Prediction
-from ins_align.results import Attitude
+from ins_align.results import Attitude, Epoch, State
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -34,15 +35,20 @@ START = Rotation.from_rotvec([0.3, -0.2, 2.5])
 COVARIANCE = np.array([[4.0, 0.5, 0.2], [0.5, 3.0, -0.1], [0.2, -0.1, 9.0]]) * 1e-6
 
 
+def predicted(stamp_ns, C_nb, bias, matrix, bias_std, noise, rate):
+    attitude, zero = Attitude(stamp_ns, C_nb, COVARIANCE), np.zeros(3)
+    epoch = Epoch(stamp_ns, 0.0, State.ALIGNED, attitude, attitude, zero, bias, zero,
+                  np.full(3, bias_std), matrix)
+    return Prediction(epoch, ImuNoise(noise, 0.0, 0.0, 0.0), rate, 1e-9 * STEP_NS)
+
+
 def prediction():
-    return Prediction(Attitude(0, START.as_matrix(), COVARIANCE), BIAS, MATRIX, np.full(3, 1e-3),
-                      2e-3, np.array(RATE), 1e-9 * STEP_NS)
+    return predicted(0, START.as_matrix(), BIAS, MATRIX, 1e-3, 2e-3, np.array(RATE))
 
 
 def still(stamp_ns, rate):
     """Return the attitude with its axes in ENU, for gyros without errors."""
-    return Prediction(Attitude(stamp_ns, np.eye(3), COVARIANCE), np.zeros(3), np.zeros((3, 3)),
-                      np.zeros(3), 0.0, rate, 1e-9 * STEP_NS)
+    return predicted(stamp_ns, np.eye(3), np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, rate)
 
 
 def truth(count):

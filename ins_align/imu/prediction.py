@@ -22,11 +22,12 @@ from collections import deque
 from collections.abc import Sequence
 import math
 
+from ins_align.config import ImuNoise
 from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import Array, matrix_from_quaternion
 from ins_align.imu.buffer import MAX_GAP_NS, MAX_RATE
 from ins_align.imu.noise import GAP_ANGULAR_ACCELERATION, GAP_STEPS
-from ins_align.results import Attitude
+from ins_align.results import Attitude, Epoch
 import numpy as np
 
 # Number of samples kept, over which a prediction that comes late is carried.
@@ -36,26 +37,25 @@ _SMALL_ANGLE = 1e-6  # rad: sin(x / 2) / x is 1 / 2 to rounding
 
 class Prediction:
     """
-    An attitude that gyroscopes carry on from an epoch.
+    An attitude that gyroscopes carry on from an epoch that has one.
 
     The rate is ``measured - gyro_matrix @ measured - gyro_bias``, rad/s, with a constant error of
-    sigma `gyro_bias_std`, (3,), of which the largest counts; the Earth rate counts as an error,
-    too. `angle_random_walk` is in rad/sqrt(s), `rate`, (3,), is measured at the epoch, `interval`
-    is between samples, s.
+    which the largest sigma of the biases counts; the Earth rate counts as an error, too. `rate`,
+    (3,), is measured at the epoch, `interval` is between samples, s.
     """
 
-    def __init__(self, attitude: Attitude, gyro_bias: Array, gyro_matrix: Array,
-                 gyro_bias_std: Array, angle_random_walk: float, rate: Array,
-                 interval: float) -> None:
+    def __init__(self, epoch: Epoch, noise: ImuNoise, rate: Array, interval: float) -> None:
+        attitude = epoch.current
+        assert attitude is not None
         self.stamp_ns = self._epoch_ns = attitude.stamp_ns
         x, y, z, w = attitude.quaternion_xyzw.tolist()
         self._quaternion = x, y, z, w
         self._covariance = tuple(attitude.covariance.ravel().tolist())
-        self._bias = tuple(gyro_bias.tolist())
-        self._matrix = (np.eye(3) - gyro_matrix).tolist()
+        self._bias = tuple(epoch.gyro_bias.tolist())
+        self._matrix = (np.eye(3) - epoch.gyro_matrix).tolist()
         self._rate = tuple(rate.tolist())   # last measured
-        self._white_variance = angle_random_walk ** 2
-        self._rate_variance = float(np.max(gyro_bias_std)) ** 2 + EARTH_RATE ** 2
+        self._white_variance = noise.angle_random_walk ** 2
+        self._rate_variance = float(np.max(epoch.gyro_bias_std)) ** 2 + EARTH_RATE ** 2
         self._longest_step, self._gaps_variance = GAP_STEPS * interval, 0.0
 
     def propagate(self, stamp_ns: int, gyro: Sequence[float]) -> bool:

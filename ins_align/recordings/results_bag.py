@@ -131,9 +131,7 @@ class _Results:
         """Return a prediction from an epoch with this rate, rad/s; None unless it is declared."""
         if epoch.state is not State.ALIGNED or epoch.current is None:
             return None
-        return Prediction(epoch.current, epoch.gyro_bias, epoch.gyro_matrix,
-                          epoch.gyro_bias_std, self._result.config.imu_noise.angle_random_walk,
-                          rate, interval)
+        return Prediction(epoch, self._result.config.imu_noise, rate, interval)
 
     def _of_epoch(self, epoch: Epoch, time_ns: int) -> Iterator[Record]:
         """Yield the messages of an epoch: initial attitude, values for plots, status."""
