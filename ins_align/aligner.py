@@ -415,10 +415,10 @@ class Aligner:
         epoch = self._epoch
         if epoch is None or epoch.current is None:
             return None
-        stamps, rates, rate, usual = self._imu.rates_since(epoch.stamp_ns)
+        stamps, rates, before, usual = self._imu.rates_since(epoch.stamp_ns)
         if stamps.size and self._imu.silence(epoch.stamp_ns, int(stamps[-1])):
             return None
-        prediction = Prediction(epoch, self.config.imu_noise, rate, usual)
+        prediction = Prediction(epoch, self.config.imu_noise, before, usual)
         carried = all(prediction.propagate(*sample)
                       for sample in zip(stamps.tolist(), rates.tolist()))
         return prediction if carried else None

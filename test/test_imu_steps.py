@@ -51,10 +51,15 @@ def test_noise_is_the_stated_one_where_nothing_is_wrong():
     assert not counts['imu_gap'] and not counts['imu_spike'] and not counts['imu_saturated']
 
 
-def test_a_gap_has_the_noise_of_what_the_motion_may_do_in_it():
-    """An angular acceleration a in it is worth a h^2 of angle: that squared over h, the root."""
+@pytest.mark.parametrize('varies, differs', [(0.0, 0.0), (0.3, 0.0), (0.0, 0.6), (0.3, 0.6)])
+def test_a_gap_has_the_noise_of_what_the_motion_may_do_in_it(varies, differs):
+    """Its noise density squared is the variance of the mean rate in it, times its length."""
     stamps, samples = steady()
+    seconds = stamps / SECOND
+    samples += (varies * np.sin(20 * np.pi * seconds) + differs * (seconds >= 2.6))[:, None]
     kept = (stamps <= 2.5 * SECOND) | (stamps >= 2.6 * SECOND)
+    around = np.var(samples[kept & (seconds >= EPOCHS[0] / SECOND - 0.5)
+                            & (seconds <= EPOCHS[1] / SECOND)], axis=0)[0]
     steps, noise, counts = cut(stamps[kept], samples[kept])
     gap = np.isclose(steps.dt, 0.1)
     assert np.count_nonzero(gap) == counts['imu_gap'] == 1
@@ -63,8 +68,8 @@ def test_a_gap_has_the_noise_of_what_the_motion_may_do_in_it():
             (noise.velocity_random_walk, STATED[1], GAP_JERK)):
         density = np.broadcast_to(density, gap.shape)
         assert np.allclose(density[~gap], stated)
-        variance = (most * 0.1 ** 2) ** 2 / 0.1
-        assert density[gap] == pytest.approx(np.sqrt(stated ** 2 + variance))
+        variance = (most * 0.1) ** 2 + around + 0.25 * differs ** 2
+        assert density[gap] == pytest.approx(np.sqrt(stated ** 2 + 0.1 * variance), rel=0.02)
 
 
 def test_stamps_that_jitter_have_the_noise_of_what_changes_meanwhile():

@@ -35,11 +35,12 @@ START = Rotation.from_rotvec([0.3, -0.2, 2.5])
 COVARIANCE = np.array([[4.0, 0.5, 0.2], [0.5, 3.0, -0.1], [0.2, -0.1, 9.0]]) * 1e-6
 
 
-def predicted(stamp_ns, C_nb, bias, matrix, bias_std, noise, rate):
+def predicted(stamp_ns, C_nb, bias, matrix, bias_std, noise, rates):
     attitude, zero = Attitude(stamp_ns, C_nb, COVARIANCE), np.zeros(3)
     epoch = Epoch(stamp_ns, 0.0, State.ALIGNED, attitude, attitude, zero, bias, zero,
                   np.full(3, bias_std), matrix)
-    return Prediction(epoch, ImuNoise(noise, 0.0, 0.0, 0.0), rate, 1e-9 * STEP_NS)
+    return Prediction(epoch, ImuNoise(noise, 0.0, 0.0, 0.0),
+                      np.atleast_2d(rates), 1e-9 * STEP_NS)
 
 
 def prediction():
@@ -99,14 +100,16 @@ def test_covariance_grows_with_the_noise_of_the_gyros():
 
 
 def test_what_it_may_have_turned_in_a_gap_is_not_known():
-    carried = prediction()
-    stamps = STEP_NS * np.array([1, 2, 3, 63, 64])
+    """Rates of 0.4 and 0.6 rad/s before it, of 0.5 and 1.1 at its ends."""
+    carried = predicted(0, np.eye(3), np.zeros(3), np.zeros((3, 3)), 0.0, 1e-4,
+                        [[0.0, 0.0, 0.4], [0.0, 0.0, 0.6]] * 50)
     sigmas = []
-    for stamp_ns in stamps.tolist():
-        assert carried.propagate(stamp_ns, (0.0, 0.0, 0.5))
+    for step, rate in ((1, 0.5), (2, 0.5), (3, 0.5), (63, 1.1), (64, 1.1)):
+        assert carried.propagate(STEP_NS * step, (0.0, 0.0, rate))
         sigmas.append(np.sqrt(np.diag(carried.attitude().covariance)))
-    may_have_turned = GAP_ANGULAR_ACCELERATION * 0.3 ** 2       # rad, 10 deg
-    assert np.max(sigmas[2]) < 0.02 * may_have_turned
+    rate = np.sqrt((0.1 ** 2 + 0.3 ** 2) / 3)
+    may_have_turned = 0.3 * np.hypot(rate, 0.3 * GAP_ANGULAR_ACCELERATION)      # rad, 3.3 deg
+    assert np.max(sigmas[2]) < 0.06 * may_have_turned
     assert np.array(sigmas[3:]) == pytest.approx(may_have_turned, rel=0.01)
 
 

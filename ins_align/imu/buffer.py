@@ -20,8 +20,8 @@ from typing import NamedTuple
 from ins_align.config import ImuNoise
 from ins_align.geometry.rotation import Array, Index
 from ins_align.imu.noise import (
-    gap_and_jitter, GAP_ANGULAR_ACCELERATION, GAP_JERK, RangeCheck, SPIKE_BEFORE, stuck,
-    white_noise, without_spikes)
+    gap_and_jitter, GAP_ANGULAR_ACCELERATION, GAP_JERK, gap_noise, RangeCheck, SPIKE_BEFORE,
+    stuck, white_noise, without_spikes)
 from ins_align.imu.preintegration import Noise, split_at_epochs, Steps
 from ins_align.imu.recent import AGES, Recent, recent_motion
 import numpy as np
@@ -230,14 +230,14 @@ class ImuBuffer:
         """
         Return stamps, (N,), and rates, (N, 3), rad/s, after a stamp, without spikes.
 
-        Also the rate at the stamp itself, (3,), and the median interval between samples, s.
+        Also the rates before the stamp, the last one at it, and the median interval of samples, s.
         """
         self.consolidate()
         first = int(np.searchsorted(self.stamps, stamp_ns, side='right'))
         rates = without_spikes(self.stamps, self.samples)[0][:, :3]
-        rate = np.array([np.interp(0.0, self.stamps - stamp_ns, axis) for axis in rates.T])
+        rate = [np.interp(0.0, self.stamps - stamp_ns, axis) for axis in rates.T]
         usual = 1e-9 * float(np.median(np.diff(self.stamps)))
-        return self.stamps[first:], rates[first:], rate, usual
+        return self.stamps[first:], rates[first:], np.vstack([rates[:first], rate]), usual
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop the samples that no epoch at or after a stamp needs."""
@@ -310,11 +310,14 @@ class ImuBuffer:
             measured ** 2 - self._stated ** 2, 0.0)), 0.0)
         gap, jitter = gap_and_jitter(stamps, first, ends[1:], steps.dt)
         self._counts['imu_gap'] += int(np.count_nonzero(gap))
+        lost = [gap_noise(gap, at_ends, samples[:, triad], first, ends[1:], most)
+                for at_ends, triad, most in (
+                    (steps.omega, slice(0, 3), GAP_ANGULAR_ACCELERATION),
+                    (steps.f, slice(3, 6), GAP_JERK))]
         beyond = self._range.beyond(stamps, ends_ns, steps.dt)
         noise = Noise(
-            _combined(self._stated[0], GAP_ANGULAR_ACCELERATION * gap,
-                      jitter * _rms(steps.omega_dot), beyond[0]),
-            _combined(self._stated[1], GAP_JERK * gap, jitter * _rms(steps.f_dot), beyond[1],
+            _combined(self._stated[0], lost[0], jitter * _rms(steps.omega_dot), beyond[0]),
+            _combined(self._stated[1], lost[1], jitter * _rms(steps.f_dot), beyond[1],
                       np.array(gravity_drift)[:, None]),
             excess[:, :1], excess[:, 1:])
         self.used_ns = epochs_ns[-1]

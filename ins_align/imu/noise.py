@@ -40,10 +40,12 @@ END_TIMES, END_CHANGING, PILED_UP = 5, 3, 4
 BEYOND_END = 0.5
 # The attitude is lost when the gyros may have missed this angle (rad).
 BLIND_ANGLE = 0.35
-# A step this many times the usual one holds lost samples; the motion that they may have missed
-# (angular acceleration, rad/s^2, and jerk, m/s^3) is added to its noise.
+# A step this many times the usual one holds lost samples. In it the rate may have differed from
+# the mean of both ends by half of their difference, by as much as it varies around the step, and
+# by what this angular acceleration makes (rad/s^2); so may the specific force, with this jerk
+# (m/s^3). Where samples of the recordings are left out, rotations err by 0.3 to 0.7 sigma.
 GAP_STEPS = 2.5
-GAP_ANGULAR_ACCELERATION, GAP_JERK = 2.0, 20.0
+GAP_ANGULAR_ACCELERATION, GAP_JERK = 0.2, 2.0
 # Samples come in bunches, stamped on arrival, where the median step is less than this share of
 # this quantile of the steps, which then is the usual pause between bunches.
 BUNCHED, PAUSES = 0.2, 0.95
@@ -222,11 +224,10 @@ def white_noise(stamps_ns: Index, samples: Array, first: Index, last: Index) -> 
 
 def gap_and_jitter(stamps_ns: Index, first: Index, last: Index, dt: Array) -> tuple[Array, Array]:
     """
-    Return two factors, (K, n), for the noise of steps, `dt`: of lost samples and of jitter.
+    Return the steps with lost samples, (K, n), s, the others as 0, and factors for jitter, (K, n).
 
-    A noise density is the first times an angular acceleration or jerk, and the second times the
-    change of the samples per second. K windows of the stamps, as in `white_noise`, show the usual
-    step and jitter.
+    The noise density of jitter is the factor times the change of the samples per second. K windows
+    of the stamps, as in `white_noise`, show the usual step and jitter.
     """
     steps, last = np.diff(stamps_ns) * 1e-9, last - 1
     count = (last - first)[:, None]
@@ -243,8 +244,24 @@ def gap_and_jitter(stamps_ns: Index, first: Index, last: Index, dt: Array) -> tu
     # In bunches the pause is the usual step, and errors of the stamps are uniform over it.
     gap = np.where(dt > GAP_STEPS * np.where(bunched, pause, usual), dt, 0.0)
     jitter = JITTER_OF_MEDIAN * np.where(bunched, 0.3 * pause, deviation)
-    # An error of acceleration * dt^2 over the step, as a density: squared, over dt.
-    return gap ** 1.5, jitter * np.sqrt(dt)
+    return gap, jitter * np.sqrt(dt)
+
+
+def gap_noise(gap: Array, ends: Array, samples: Array, first: Index, last: Index,
+              most: float) -> Array:
+    """
+    Return the noise densities of the steps with lost samples, (K, n).
+
+    `gap`, (K, n), are these steps, s, the others 0; `ends`, (K, n + 1, 3), the rates or forces at
+    the ends of all steps; the samples, (N, 3), have K windows as in `white_noise`; `most` is the
+    angular acceleration or jerk.
+    """
+    if not gap.any():
+        return gap
+    varies = np.array([np.var(samples[window], axis=0).mean()
+                       for window in map(slice, first, last)])
+    differs = np.mean(np.square(np.diff(ends, axis=1)), axis=2)
+    return np.sqrt(gap * (varies[:, None] + 0.25 * differs + np.square(most * gap)))
 
 
 def force_fault(mean: float) -> str:

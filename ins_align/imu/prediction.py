@@ -40,11 +40,12 @@ class Prediction:
     An attitude that gyroscopes carry on from an epoch that has one.
 
     The rate is ``measured - gyro_matrix @ measured - gyro_bias``, rad/s, with a constant error of
-    which the largest sigma of the biases counts; the Earth rate counts as an error, too. `rate`,
-    (3,), is measured at the epoch, `interval` is between samples, s.
+    which the largest sigma of the biases counts; the Earth rate counts as an error, too. `rates`,
+    (N, 3), are measured in a time before the epoch, and the last one at it; `interval` is between
+    samples, s.
     """
 
-    def __init__(self, epoch: Epoch, noise: ImuNoise, rate: Array, interval: float) -> None:
+    def __init__(self, epoch: Epoch, noise: ImuNoise, rates: Array, interval: float) -> None:
         attitude = epoch.current
         assert attitude is not None
         self.stamp_ns = self._epoch_ns = attitude.stamp_ns
@@ -53,7 +54,8 @@ class Prediction:
         self._covariance = tuple(attitude.covariance.ravel().tolist())
         self._bias = tuple(epoch.gyro_bias.tolist())
         self._matrix = (np.eye(3) - epoch.gyro_matrix).tolist()
-        self._rate = tuple(rate.tolist())   # last measured
+        self._rate = tuple(rates[-1].tolist())  # last measured
+        self._varies = float(np.mean(np.var(rates, axis=0)))
         self._white_variance = noise.angle_random_walk ** 2
         self._rate_variance = float(np.max(epoch.gyro_bias_std)) ** 2 + EARTH_RATE ** 2
         self._longest_step, self._gaps_variance = GAP_STEPS * interval, 0.0
@@ -72,7 +74,7 @@ class Prediction:
             return False
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         if dt > self._longest_step:
-            self._gaps_variance += (GAP_ANGULAR_ACCELERATION * dt * dt) ** 2
+            self._gaps_variance += self._lost(dt, gyro)
         last_x, last_y, last_z = self._rate
         self._rate = x, y, z
         x, y, z = 0.5 * (last_x + x), 0.5 * (last_y + y), 0.5 * (last_z + z)
@@ -91,6 +93,11 @@ class Prediction:
         self._quaternion = x / size, y / size, z / size, w / size
         self.stamp_ns = stamp_ns
         return True
+
+    def _lost(self, dt: float, gyro: Sequence[float]) -> float:
+        """Return the variance of what it may have turned in a gap, as `gap_noise`, rad^2."""
+        differs = sum((now - last) ** 2 for now, last in zip(gyro, self._rate)) / 3
+        return dt ** 2 * (self._varies + 0.25 * differs + (GAP_ANGULAR_ACCELERATION * dt) ** 2)
 
     @property
     def quaternion_xyzw(self) -> tuple[float, float, float, float]:

@@ -41,6 +41,7 @@ TOPICS = {'imu': IMU_TYPE, 'initial_attitude': 'geometry_msgs/msg/QuaternionStam
 STATUS_PERIOD_NS = 1_000_000_000  # a change of the state is written at once
 # Without GNSS there is an epoch every 2 s; the gyros carry no older attitude forward.
 MAX_AGE_NS = 2_500_000_000
+RECENT = 100  # IMU samples that show how much the rate varies
 
 Record = tuple[str, int, Any]  # topic without its namespace, recorded time, message
 
@@ -90,7 +91,7 @@ class _Results:
         """Yield IMU messages with the attitude, and between them the messages of the epochs."""
         epochs = deque(self._result.epochs)
         prediction: Prediction | None = None
-        last_ns, last_gyro = 0, np.zeros(3)
+        last_ns, recent = 0, deque([np.zeros(3)], maxlen=RECENT)
         time_ns = epoch_ns = 0
         for time_ns, data, stamp_ns, gyro, accel, good in self._samples():
             # Not all epochs up to the stamp: it may be far ahead, or the clock is set back later.
@@ -99,11 +100,13 @@ class _Results:
                 yield from self._of_epoch(epoch, time_ns)
                 share = ((epoch.stamp_ns - last_ns) / (stamp_ns - last_ns)
                          if last_ns < stamp_ns else 1.0)
-                rate = last_gyro + max(share, 0.0) * (gyro - last_gyro) if good else last_gyro
-                prediction = self._prediction(epoch, rate, 1e-9 * (stamp_ns - last_ns))
+                rate = recent[-1] + (max(share, 0.0) * (gyro - recent[-1]) if good else 0.0)
+                prediction = self._prediction(epoch, np.array([*recent, rate]),
+                                              1e-9 * (stamp_ns - last_ns))
                 epoch_ns = epoch.stamp_ns
             if good:
-                last_ns, last_gyro = stamp_ns, gyro
+                last_ns = stamp_ns
+                recent.append(gyro)
             if prediction is None:
                 if not epochs:
                     break
@@ -127,11 +130,11 @@ class _Results:
                         samples.gyro, samples.accel, good.tolist()):
                     yield int(block.times_ns[place]), block.messages[0][place], *numbers
 
-    def _prediction(self, epoch: Epoch, rate: Any, interval: float) -> Prediction | None:
-        """Return a prediction from an epoch with this rate, rad/s; None unless it is declared."""
+    def _prediction(self, epoch: Epoch, rates: Any, interval: float) -> Prediction | None:
+        """Return a prediction from an epoch with these rates; None unless it is declared."""
         if epoch.state is not State.ALIGNED or epoch.current is None:
             return None
-        return Prediction(epoch, self._result.config.imu_noise, rate, interval)
+        return Prediction(epoch, self._result.config.imu_noise, rates, interval)
 
     def _of_epoch(self, epoch: Epoch, time_ns: int) -> Iterator[Record]:
         """Yield the messages of an epoch: initial attitude, values for plots, status."""
