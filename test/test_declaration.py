@@ -342,11 +342,17 @@ def test_doubt_about_the_signs_holds_the_heading_back_and_not_the_level():
     ({'gnss_delay': 0.5, 'gnss_delay_std': 0.05}, 0.7, False),
     ({'gnss_delay_std': 0.3}, 0.8, True), ({'gnss_delay_std': 0.3}, 1.0, False),
     ({'gnss_delay': 0.5, 'gnss_delay_std': 0.0}, 0.5, True)])
-def test_delay_far_from_what_was_told_is_a_contradiction(told, delay, believed):
+@pytest.mark.parametrize('declared', (False, True))
+def test_delay_far_from_what_was_told_is_a_contradiction(declared, told, delay, believed):
+    """What is declared is withdrawn at twice the distance: it does not come and go with noise."""
     declaration = Declaration(Config(**told))
     usual = declaration.config.gnss_delay
-    assert judge(declaration, 0.0, 2.0, GOOD, delay=usual).state is State.ALIGNED
-    verdict = judge(declaration, 2.2, 2.0, GOOD, delay=delay)
+    if declared:
+        assert judge(declaration, 0.0, 2.0, GOOD, delay=usual).state is State.ALIGNED
+        verdict = judge(declaration, 2.2, 2.0, GOOD, delay=delay)
+        assert verdict.state is State.ALIGNED
+        delay = usual + 2 * (delay - usual)
+    verdict = judge(declaration, 2.4, 4.4, GOOD, delay=delay)
     assert (verdict.state is State.ALIGNED) == believed
     if not believed:
         assert 'set gnss_delay' in verdict.reason and f'{delay:.2f}' in verdict.reason

@@ -31,7 +31,8 @@ import numpy as np
 MAX_MISFIT = 4.0
 # Share of epochs that may be rejected as outliers.
 REJECTED_SHARE = 0.25
-# What was declared is withdrawn when its sigma is so many times the threshold.
+# What was declared is withdrawn when its sigma is so many times the threshold, or the delay so many
+# times as far from the configured one as a delay may be for a declaration.
 WITHDRAWN_AT = 2.0
 # Redundant rows before anything is declared.
 MIN_ROWS = 12
@@ -183,7 +184,8 @@ class Declaration:
             return ''
         config = self.config
         unexplained = abs(fit.delay - config.gnss_delay)
-        if unexplained > DELAY_SIGMAS * max(config.gnss_delay_std, fit.delay_std) > 0:
+        most = DELAY_SIGMAS * max(config.gnss_delay_std, fit.delay_std)
+        if unexplained > most * (WITHDRAWN_AT if self.levelled or self.aligned else 1.0) > 0:
             digits = 2 if unexplained >= 0.02 else 3
             return (f'the GNSS stamps seem to be {fit.delay:.{digits}f} s late, gnss_delay is '
                     f'{config.gnss_delay:g} and gnss_delay_std {config.gnss_delay_std:g}: check '
