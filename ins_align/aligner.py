@@ -41,7 +41,8 @@ __all__ = ['Aligner', 'Attitude', 'Epoch', 'State', 'Status']
 
 # Interval of epochs without measurement in a GNSS outage, which bounds the queues (ns).
 DRY_INTERVAL_NS = 2_000_000_000
-# An alignment starts with positions alone if no velocity came for this long after the first (ns).
+# An alignment starts with positions alone if no velocity came for this long after the first (ns);
+# later the reason says so.
 NO_VELOCITY_NS = 2_000_000_000
 MAX_WARNINGS = 100      # different texts about messages that could not be used
 MAX_EVENTS = 1000       # the latest, kept for `Aligner.take_events`
@@ -102,7 +103,7 @@ class Aligner:
         self._queued: list[AntennaEpoch] = []       # epochs that wait for steps 4 to 8
         self._last_ns: int | None = None            # stamp of the last epoch; None before t0
         self._start_ns = self._measured_ns = 0      # first epoch; last one with a measurement
-        self._without_velocity = False              # although velocity messages came
+        self._velocity_ns: int | None = None        # stamp of the last epoch with a velocity
         since = 'since it started over' if self._started_over else 'yet'
         self._verdict = Verdict(State.WAITING_FOR_IMU, f'no IMU sample {since}')
         self._time_to_align_s: float | None = None
@@ -275,8 +276,7 @@ class Aligner:
             self._start_ns, method.restarted = epoch.stamp_ns, ''
         # 7. The declaration decides on the state and words the reason.
         attitudes = method.attitudes()
-        if epoch.v_n is not None or (
-                epoch.position_measured and self.config.use_position is not False):
+        if fit.measured:
             self._measured_ns = epoch.stamp_ns
         verdict = self._declaration.update(
             (epoch.stamp_ns - self._start_ns) * 1e-9, (epoch.stamp_ns - self._measured_ns) * 1e-9,
@@ -285,12 +285,10 @@ class Aligner:
             method.move_t0()
             attitudes = method.attitudes()
         initial, current = attitudes or (None, None)
-        if epoch.v_n is not None:
-            self._without_velocity = False
         if fault := self._force_check.fault or epoch.fault:
             self._declaration.withdraw()
             verdict = Verdict(State.FAULT, fault)
-        if self._without_velocity and (why := self._unused_velocities()):
+        if why := self._no_velocity(epoch):
             verdict = Verdict(verdict.state,
                               f'{verdict.reason}; no GNSS velocity is used: {why}')
         if verdict.state is State.ALIGNED and self.declared is None:
@@ -319,12 +317,10 @@ class Aligner:
             return
         config = self.config
         alone = epoch.v_n is None
-        wanted = config.use_velocity is not False
-        no_velocity = self._unused_velocities()
-        if alone and wanted and (
+        if alone and config.use_velocity is not False and (
                 config.use_velocity is True or config.method == 'vif'
                 or epoch.stamp_ns - self._first_fix_ns < NO_VELOCITY_NS):
-            self._wait(State.WAITING_FOR_GNSS, 'no GNSS velocity yet', no_velocity)
+            self._wait(State.WAITING_FOR_GNSS, 'no GNSS velocity yet', self._unused_velocities())
             return
         if alone and config.use_position is False:
             self._wait(State.WAITING_FOR_GNSS, 'no GNSS velocity yet, and use_position is false')
@@ -337,7 +333,6 @@ class Aligner:
         self._last_ns = self._start_ns = epoch.stamp_ns
         if self._first_t0_ns is None:
             self._first_t0_ns = epoch.stamp_ns
-        self._without_velocity = bool(no_velocity) and wanted and alone
         imu = preintegrate(*self._imu.start(epoch.stamp_ns))
         # A method starts with positions where the first epoch has no velocity.
         self._method = (Bank(config, epoch, imu, self._learnt, self._base)
@@ -357,6 +352,19 @@ class Aligner:
             self._announce_restart('restarts', why)
             learnt = self._method.learnt()
         self._forget(learnt)
+
+    def _no_velocity(self, epoch: AntennaEpoch) -> str:
+        """Return in words why an epoch with a position is one of many without velocity, or ''."""
+        if epoch.v_n is not None:
+            self._velocity_ns = epoch.stamp_ns
+        if not epoch.position_measured or self.config.use_velocity is False:
+            return ''
+        if self._velocity_ns is None:
+            return self._unused_velocities() or 'none comes'
+        silent_ns = epoch.stamp_ns - self._velocity_ns
+        if silent_ns <= NO_VELOCITY_NS:
+            return ''
+        return self._unused_velocities() or f'none came for {silent_ns * 1e-9:.0f} s'
 
     def _unused_velocities(self) -> str:
         """Return in words why velocity messages could not be used, or ''."""

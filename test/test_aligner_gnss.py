@@ -62,7 +62,7 @@ def test_how_far_the_clocks_are_apart_is_said(flight, off_s, words):
     assert f'{words} {abs(off_s - behind_s):.1f} s)' in reason
 
 
-@pytest.mark.parametrize('without', ('numbers', 'axes'))
+@pytest.mark.parametrize('without', ('numbers', 'axes', 'velocities'))
 def test_velocities_of_no_use_are_told_also_where_positions_do(flight, without):
     aligner = Aligner(config_for(flight))
     for part in (slice(600), slice(600, 1200)):
@@ -70,15 +70,16 @@ def test_velocities_of_no_use_are_told_also_where_positions_do(flight, without):
             aligner.add_fix(flight.fix(k))
             if without == 'axes':
                 aligner.reject('velocity_body_frame', 'in the wrong axes')
-            else:
+            elif without == 'numbers':
                 aligner.add_velocity(flight.velocity_measurement(k)._replace(
                     velocity=np.full(3, np.nan)))
         aligner.add_imu(flight.imu_stamps_ns[part], flight.gyro[part], flight.accel[part])
         aligner.update()
     status = aligner.status()
     assert status.state is State.ALIGNING and status.counts['epochs_used'] > 20
-    assert '; no GNSS velocity is used: ' + (
-        'in the wrong axes' if without == 'axes' else '60 without numbers') in status.reason
+    assert '; no GNSS velocity is used: ' + {
+        'axes': 'in the wrong axes', 'numbers': '60 without numbers',
+        'velocities': 'none comes'}[without] in status.reason
     for k in range(60, 100):
         aligner.add_fix(flight.fix(k))
         aligner.add_velocity(flight.velocity_measurement(k))
@@ -191,6 +192,20 @@ def test_positions_take_over_where_velocities_stop(use_position):
     assert (epochs[-1].state is State.ALIGNED) == (use_position == 'auto')
     assert (epochs[-1].current.sigma_deg[2] < 1.0) == (use_position == 'auto')
     assert ('no GNSS for 60 s' in epochs[-1].reason) == (use_position is False)
+    assert 'no GNSS velocity is used: none came for 60 s' in epochs[-1].reason
+
+
+def test_what_is_not_used_declares_nothing():
+    """Positions go on and are used 10 s after the last velocity: the hold time waits for them."""
+    s = simulated('flight', imu_grade='mems', duration=60.0, seed=1)
+    start_ns, states = int(s.gnss_stamps_ns[0]), {}
+    for alone in (False, True):
+        aligner = Aligner(config_for(s, hold_time=4.0))
+        epochs = give_all(aligner, s, change=lambda k, kind, message: None if alone and (
+            kind == 'velocity' and message.stamp_ns - start_ns > 18_500_000_000) else message)
+        states[alone] = [epoch.state for epoch in epochs
+                         if 18.5 < (epoch.stamp_ns - start_ns) * 1e-9 < 28.0]
+    assert State.ALIGNED in states[False] and State.ALIGNED not in states[True]
 
 
 @pytest.mark.parametrize('until_s', (

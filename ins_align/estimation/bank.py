@@ -125,6 +125,7 @@ class Bank:
         self._start = Start(self._config)
         self._last = epoch                          # the last epoch that was processed
         self._offered = self._rejected = 0          # epochs with a measurement; with an outlier
+        self._measured = False                      # whether the last epoch has one that is used
         self._C_nn0 = np.eye(3)
         self._innovation = NO_INNOVATION
         self._receiver = ReceiverNoise()
@@ -240,6 +241,7 @@ class Bank:
         self._seconds += model.duration[k]
         self._innovation = NO_INNOVATION
         kinds = [kind for kind, present in enumerate(measured.present[k]) if present]
+        self._measured = bool(kinds)
         due = vehicle is not None and vehicle.is_due(model.duration[k], bool(kinds))
         if not kinds:
             return
@@ -294,6 +296,7 @@ class Bank:
     def _wait(self, epoch: AntennaEpoch, imu: Intervals) -> None:
         """Add an epoch to those from which the filters start, and start them if they suffice."""
         start = self._start
+        self._measured = any(epoch.measured)
         start.add(epoch, imu)
         rough = start.solve(self._use_position)
         for name, count in zip(REJECTED, start.rejected):
@@ -343,7 +346,7 @@ class Bank:
         """Return how well the data fit, and what speaks against a declaration."""
         filters, receiver = self._filters, self._receiver
         if filters is None:
-            return Fit(self._offered, waiting=self._start.measured,
+            return Fit(self._offered, self._measured, waiting=self._start.measured,
                        delay=self._config.gnss_delay, doubt=self._start.lacks)
         x, P = self._body()
         likeliest = self._rivals.table[filters.ids[filters.best]]
@@ -351,7 +354,7 @@ class Bank:
             likeliest, self._config, x, P)
         if self._vehicle is not None:
             remarks += self._vehicle.in_words(filters)
-        return Fit(self._offered, rows=3 * (self._offered - self._rejected),
+        return Fit(self._offered, self._measured, rows=3 * (self._offered - self._rejected),
                    misfit=receiver.misfit, innovation=self._innovation, rejected=self._rejected,
                    delay=self._config.gnss_delay + float(x[DELAY]),
                    delay_std=likeliest.gnss_delay_std,

@@ -31,8 +31,8 @@ import numpy as np
 MAX_MISFIT = 4.0
 # Share of epochs that may be rejected as outliers.
 REJECTED_SHARE = 0.25
-# What was declared is withdrawn when its sigma is so many times the threshold, or the delay so many
-# times as far from the configured one as a delay may be for a declaration.
+# What was declared is withdrawn when its sigma is so many times the threshold, or the delay so
+# many times as far from the configured one as a delay may be for a declaration.
 WITHDRAWN_AT = 2.0
 # Redundant rows before anything is declared.
 MIN_ROWS = 12
@@ -49,6 +49,7 @@ class Fit:
     """How well the data fit the model of a method."""
 
     offered: int  #: epochs with a measurement since the start, rejected ones included
+    measured: bool = True  #: whether a measurement of the present epoch is used, or rejected
     waiting: int = 0  #: epochs that wait for a start, not offered yet
     rows: int = 0  #: redundant rows; 0 before there is a solution
     misfit: float = math.nan  #: mean square of normalised residuals

@@ -104,7 +104,7 @@ class NoteMethod:
         self._known = np.array([self._vectors(epoch, kind) for kind in kinds]).reshape(-1, 6)
         self._nuisance = 1 + self._kind - len(kinds)
         self._moments = np.zeros((6 + self._nuisance, 6 + self._nuisance))
-        self._offered = 0
+        self._offered, self._measured = 0, True     # pairs; whether the last epoch has one
         self._variance = 0.0                # of the receiver, summed over pairs
         self._start_variance = self._receiver_variance(epoch)
         self._solution: tuple[Array, Array] | None = None
@@ -138,7 +138,8 @@ class NoteMethod:
 
     def _pair(self, epoch: AntennaEpoch) -> None:
         """Add the pair of vectors of an epoch, without the known start, and solve."""
-        if not epoch.measured[self._from_positions]:
+        self._measured = bool(epoch.measured[self._from_positions])
+        if not self._measured:
             return
         time = float(self._track.time)
         known, free = np.split(time ** np.arange(1 + self._kind), [len(self._known)])
@@ -189,8 +190,8 @@ class NoteMethod:
     def fit(self) -> Fit:
         """Return how well the data fit."""
         if self._solution is None:
-            return Fit(self._offered, delay=self._config.gnss_delay)
-        return Fit(self._offered, rows=self._rows, delay=self._config.gnss_delay,
+            return Fit(self._offered, self._measured, delay=self._config.gnss_delay)
+        return Fit(self._offered, self._measured, rows=self._rows, delay=self._config.gnss_delay,
                    misfit=self._residual / sum(self._noise()) / self._rows)
 
     @property
