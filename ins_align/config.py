@@ -104,7 +104,7 @@ class Config:
         'messages (/tf_static); auto: if there is one and lever_arm is not set or zero; true: '
         'always, and wait for it', choices=AUTO_OR_BOOL)
     base_frame: str = _parameter(
-        '', 'frame whose attitude status and JSON give as well, from TF; empty: none')
+        '', 'frame whose attitude status, JSON and ~/base_imu give as well, from TF; empty: none')
     vehicle: str = _parameter(
         'none', 'type of vehicle: base_frame (the IMU if that is empty) has x forward and z up, '
         'and its origin, for a car at the rear axle, moves along x. This gives a heading on a '

@@ -19,7 +19,8 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from ins_align.config import Config, ConfigError
-from ins_align.geometry.rotation import Array, matrix_from_quaternion, Transform
+from ins_align.geometry.rotation import (
+    Array, matrix_from_quaternion, quaternion_from_matrix, Transform)
 from ins_align.results import Event, Severity
 import numpy as np
 
@@ -42,6 +43,27 @@ def transform_from_msg(msg: Any) -> Transform:
     with np.errstate(invalid='ignore'):
         quaternion /= np.linalg.norm(quaternion)
     return Transform(matrix_from_quaternion(quaternion), np.array([way.x, way.y, way.z]))
+
+
+def turn_to_base(msg: Any, base: Transform, base_frame: str) -> None:
+    """
+    Turn a sensor_msgs/Imu with an orientation in ENU into the axes of the base, in place.
+
+    `base` is from the base to the IMU. The covariance of the orientation is about east, north, up
+    and stays the same.
+    """
+    turn, C_imu_base = msg.orientation, base.rotation
+    C_nb = matrix_from_quaternion(np.array([turn.x, turn.y, turn.z, turn.w])) @ C_imu_base
+    turn.x, turn.y, turn.z, turn.w = quaternion_from_matrix(C_nb).tolist()
+    for name in ('angular_velocity', 'linear_acceleration'):
+        vector = getattr(msg, name)
+        vector.x, vector.y, vector.z = (
+            np.array([vector.x, vector.y, vector.z]) @ C_imu_base).tolist()
+        covariance = getattr(msg, f'{name}_covariance')
+        if covariance[0] != -1.0:  # which means that the message has no such vector
+            setattr(msg, f'{name}_covariance',
+                    (C_imu_base.T @ np.reshape(covariance, (3, 3)) @ C_imu_base).ravel())
+    msg.header.frame_id = base_frame
 
 
 class FixedFrames:

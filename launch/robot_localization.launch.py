@@ -20,29 +20,30 @@ where the vehicle was aligned, on /odometry/filtered and as the transform odom -
 
     ros2 launch ins_align robot_localization.launch.py params_file:=my_robot.yaml
 
-All nodes may start at once: before the alignment there is no message on ~/imu, and both nodes of
-robot_localization wait for the first one. navsat_transform_node keeps the heading of the last
+All nodes may start at once: before the alignment there is no message on ~/base_imu, and both nodes
+of robot_localization wait for the first one. navsat_transform_node keeps the heading of the last
 message before it computes its transform.
 """
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 # Without a leading slash: relative to the namespace in which everything is started.
-ALIGNED_IMU = 'ins_align/imu'
+ALIGNED_IMU = 'ins_align/base_imu'
+BASE_FRAME = 'base_link'
 
 NAVSAT_TRANSFORM = {
     'frequency': 30.0,
     # s. There is no compass that has to settle: the first heading that arrives is good.
     'delay': 0.0,
-    # The heading of ~/imu is true: it comes from GNSS and from the Earth's axis, not from a
+    # The heading of ~/base_imu is true: it comes from GNSS and from the Earth's axis, not from a
     # magnetometer. There is no declination to add.
     'magnetic_declination_radians': 0.0,
-    # The yaw of ~/imu is 0 facing east and grows to the left (REP-103), as this node wants it.
-    # pi/2, the value in many examples, is for compasses that read 0 facing north.
+    # The yaw of ~/base_imu is 0 facing east and grows to the left (REP-103), as this node wants
+    # it. pi/2, the value in many examples, is for compasses that read 0 facing north.
     'yaw_offset': 0.0,
     # Take the heading from the IMU, which has it before the odometry has.
     'use_odometry_yaw': False,
@@ -61,7 +62,7 @@ EKF = {
     'two_d_mode': False,
     'publish_tf': True,
     'odom_frame': 'odom',
-    'base_link_frame': 'base_link',
+    'base_link_frame': BASE_FRAME,
     # A single filter of absolute measurements broadcasts odom -> base_link itself. With wheel
     # odometry take robot_localization's example of two filters; this one then has the map frame.
     'world_frame': 'odom',
@@ -90,10 +91,15 @@ def generate_launch_description() -> LaunchDescription:
         'use_sim_time': 'false',
     }
     given = {name: LaunchConfiguration(name) for name in arguments}
-    alignment = IncludeLaunchDescription(
-        PathJoinSubstitution([FindPackageShare('ins_align'), 'launch', 'ins_align.launch.xml']),
-        launch_arguments=given.items())
     sim_time = {'use_sim_time': given['use_sim_time']}
+    # As in ins_align.launch.xml, with a base_frame instead of that in the file.
+    alignment = Node(
+        package='ins_align', executable='ins_align_node', name='ins_align',
+        namespace=given['namespace'], output='screen',
+        ros_arguments=['--params-file', given['params_file']],
+        parameters=[sim_time, {'base_frame': BASE_FRAME}],
+        remappings=[('imu/data_raw', given['imu_topic']), ('fix', given['fix_topic']),
+                    ('fix_velocity', given['velocity_topic'])])
     navsat_transform = Node(
         package='robot_localization', executable='navsat_transform_node',
         name='navsat_transform', namespace=given['namespace'], output='screen',

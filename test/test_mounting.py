@@ -23,11 +23,13 @@ from ins_align.geometry.rotation import log_so3, matrix_from_quaternion, matrix_
 from ins_align.mounting import find_mounting, FixedFrames
 from ins_align.offline import replay
 from ins_align.recordings import BagError
+from ins_align.recordings.results_bag import write_results
 from ins_align.results import Severity
 from ins_align.simulation.simulate import simulate, write_bag
 import numpy as np
 import pytest
 from recordings import FIX, IMU, make_fix, make_header, make_imu, START_NS
+from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
@@ -130,7 +132,7 @@ def recording(drive, tmp_path_factory):
     return path
 
 
-def test_recording_with_tf_gives_the_numbers_of_the_parameter(recording, drive):
+def test_recording_with_tf_gives_the_numbers_of_the_parameter(recording, drive, tmp_path):
     from_tf = replay(recording, Config(imu_grade='tactical', base_frame='base_link'))
     given = replay(recording, Config(imu_grade='tactical', lever_arm=LEVER_ARM))
     without = replay(recording, Config(imu_grade='tactical', lever_arm_from_tf=False))
@@ -150,6 +152,20 @@ def test_recording_with_tf_gives_the_numbers_of_the_parameter(recording, drive):
     error = np.degrees(log_so3(C_base @ matrix_from_quaternion(final['quaternion_xyzw']).T))
     assert np.all(np.abs(error) < 5 * np.array(final['sigma_deg']))
     assert abs(final['yaw_deg'] - found['final_attitude']['yaw_deg']) > 45.0
+
+    write_results(from_tf, tmp_path / 'out')
+    with AnyReader([tmp_path / 'out']) as reader:
+        messages = {connection.topic: reader.deserialize(data, connection.msgtype)
+                    for connection, _, data in reader.messages()}  # the last of each
+    imu, base = messages['/ins_align/imu'], messages['/ins_align/base_imu']
+    assert (imu.header.frame_id, base.header.frame_id) == ('imu', 'base_link')
+    assert imu.header.stamp == base.header.stamp
+    turns, forces = ([np.array([getattr(vector, name) for name in names])
+                      for vector in (getattr(imu, part), getattr(base, part))]
+                     for part, names in (('orientation', 'xyzw'), ('linear_acceleration', 'xyz')))
+    C_nb, C_base = map(matrix_from_quaternion, turns)
+    assert C_nb.T @ C_base == pytest.approx(matrix_from_rpy(np.radians(MOUNT_DEG)).T, abs=1e-12)
+    assert C_base @ forces[1] == pytest.approx(C_nb @ forces[0])
 
 
 def test_recording_with_tf_that_says_otherwise_or_nothing(recording, drive, tmp_path):

@@ -16,15 +16,19 @@
 import os
 
 from ins_align.config import Config, ConfigError
-from ins_align.geometry.rotation import Transform
+from ins_align.geometry.rotation import matrix_from_quaternion, Transform
 from ins_align.gnss.messages import Fix
 from ins_align.mounting import MountingSearch
 from ins_align.ros.inputs import ImuSample
 from ins_align.simulation.simulate import simulate, write_bag
-from node_harness import bag_script, Listener, playing, RELIABLE, replayed, running_node
+from node_harness import (
+    bag_script, Listener, playing, RELIABLE, replayed, running_node, script_of, simulated_messages,
+    stamp_ns)
 import numpy as np
 import pytest
+from sensor_msgs.msg import Imu
 from test_node import double, set_parameter
+from test_node_topics import PARAMETERS
 
 SAMPLE = (1, ImuSample(10, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), 'imu'))
 FIX = (2, Fix(10, 48.0, 11.0, 300.0, None, 0))
@@ -41,7 +45,7 @@ class Buffer:
 
     def can_transform(self, target, source, time):
         self.asked += 1
-        return target == 'imu' and source in ('gnss', 'base_link') and self.asked > 3
+        return target.startswith('imu') and source in ('gnss', 'base_link') and self.asked > 3
 
     def lookup_transform(self, target, source, time):
         found = TransformStamped()
@@ -58,6 +62,16 @@ class TransformListener:
     def __init__(self, buffer, node):
         self.tf_sub = node.create_subscription(Empty, '/tf', print, 1)
 """
+
+
+@pytest.fixture
+def stand_in(tmp_path_factory, monkeypatch):
+    """Let nodes find the stand-in as tf2_ros."""
+    package = tmp_path_factory.mktemp('path') / 'tf2_ros'
+    package.mkdir()
+    (package / '__init__.py').write_text(STAND_IN)
+    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
+        [str(package.parent), os.environ.get('PYTHONPATH', '')]))
 
 
 def search(translations, **parameters):
@@ -137,16 +151,36 @@ def test_a_base_alone_does_not_wait_for_the_antenna(lever_arm_from_tf, antenna_f
     assert mounting.config.lever_arm == (1.0, 2.0, 3.0)
 
 
+def test_base_imu_is_imu_in_the_axes_of_the_base(tmp_path, stand_in):
+    flight = simulate('flight', imu_grade='tactical', seed=1, duration=16.0)
+    bases, imus = [], []
+    with Listener() as listener, running_node(
+            [*PARAMETERS, 'lever_arm_from_tf:=false', 'base_frame:=base_link']):
+        def subscribe(topic, store):
+            listener.node.create_subscription(Imu, f'/ins_align/{topic}', store.append, 5000)
+
+        subscribe('base_imu', bases)
+        listener.wait_for(lambda: listener.statuses)
+        with playing(script_of(simulated_messages(flight)), tmp_path, 8.0):
+            listener.wait_for(lambda: bases)  # also if nobody listens to the other
+            subscribe('imu', imus)
+    base_of = {stamp_ns(msg): msg for msg in bases}
+    pairs = [(msg, base_of[stamp_ns(msg)]) for msg in imus]
+    assert len(pairs) > 100
+    for imu, base in pairs[::20]:
+        assert base.header.frame_id == 'base_link'
+        # The IMU is turned to the left by 90 deg.
+        C_nb, C_base = (matrix_from_quaternion(np.array([turn.x, turn.y, turn.z, turn.w]))
+                        for turn in (imu.orientation, base.orientation))
+        assert C_base[:, 1] == pytest.approx(C_nb[:, 0])
+        assert base.angular_velocity.y == pytest.approx(imu.angular_velocity.x)
+        assert np.array_equal(base.orientation_covariance, imu.orientation_covariance)
+
+
 @pytest.mark.campaign
 @pytest.mark.parametrize('base_frame, vehicle', [
     ('', 'none'), ('base_link', 'none'), ('base_link', 'car')])
-def test_node_with_tf_gives_the_numbers_of_the_parameter(tmp_path, monkeypatch, base_frame,
-                                                         vehicle):
-    package = tmp_path / 'path' / 'tf2_ros'
-    package.mkdir(parents=True)
-    (package / '__init__.py').write_text(STAND_IN)
-    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
-        [str(package.parent), os.environ.get('PYTHONPATH', '')]))
+def test_node_with_tf_gives_the_numbers_of_the_parameter(tmp_path, stand_in, base_frame, vehicle):
     drive = simulate('car', seed=2, duration=40.0, imu_grade='tactical',
                      lever_arm=(1.5, -0.4, 0.8), mount_rpy_deg=(0.0, 0.0, 90.0))
     write_bag(drive, tmp_path / 'drive')

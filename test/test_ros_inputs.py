@@ -17,10 +17,13 @@ import sys
 from types import SimpleNamespace
 
 from ins_align.config import Config
+from ins_align.geometry.rotation import Transform
+from ins_align.mounting import turn_to_base
 from ins_align.ros.inputs import open_static_tf, read_imu, with_orientation
 import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
 FRAMES = ('', 'i', 'imu', 'imu_link', 'imu_link/é')
@@ -67,6 +70,31 @@ def test_nothing_but_the_orientation_changes(frame_id, way):
     changed = deserialize_message(with_orientation(data, quaternion, covariance), Imu)
     assert changed == expected
     assert deserialize_message(data, Imu) == message(frame_id)
+
+
+@pytest.mark.parametrize('mount_deg', [(0, 0, 90), (90, 0, 0), (0, 90, 0), (20, -35, 130)])
+def test_the_base_turns_as_scipy_says(mount_deg):
+    vehicle = Rotation.from_euler('ZYX', [130.0, -8.0, 5.0], degrees=True)  # base to ENU
+    mount = Rotation.from_euler('xyz', mount_deg, degrees=True)  # IMU to base
+    msg = message('imu')
+    turn = msg.orientation
+    turn.x, turn.y, turn.z, turn.w = (vehicle * mount).as_quat()
+    msg.linear_acceleration_covariance[0] = -1.0
+    turn_to_base(msg, Transform(mount.inv().as_matrix(), np.ones(3)), 'base_link')
+    assert (Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+            * vehicle.inv()).magnitude() == pytest.approx(0.0, abs=1e-12)
+    expected, M = message('base_link'), mount.as_matrix()
+    for vector, values in ((msg.angular_velocity, [14.0, 15.0, 16.0]),
+                           (msg.linear_acceleration, [26.0, 27.0, 28.0])):
+        assert [vector.x, vector.y, vector.z] == pytest.approx(mount.apply(values))
+    assert msg.angular_velocity_covariance.reshape(3, 3) == pytest.approx(
+        M @ np.reshape(expected.angular_velocity_covariance, (3, 3)) @ M.T)
+    # About east, north, up as before; and what is not stated stays so.
+    assert np.array_equal(msg.orientation_covariance, expected.orientation_covariance)
+    assert np.array_equal(msg.linear_acceleration_covariance[1:],
+                          expected.linear_acceleration_covariance[1:])
+    assert msg.linear_acceleration_covariance[0] == -1.0
+    assert msg.header == expected.header
 
 
 def test_tf_is_asked_for_frames_without_a_slash(monkeypatch):

@@ -25,6 +25,7 @@ from typing import Any
 
 from ins_align.imu.buffer import MAX_GAP_NS, MAX_RATE
 from ins_align.imu.prediction import Prediction
+from ins_align.mounting import turn_to_base
 from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import decode_imu, deserialize, IMU_TYPE, VECTOR_TYPE
@@ -57,6 +58,9 @@ def write_results(result: Result, path: str | os.PathLike[str]) -> None:
     path = Path(path)
     if path.exists():
         raise BagError(f'{path} exists already: choose another name for the results or remove it')
+    topics = dict(TOPICS)
+    if result.topics is not None and result.topics.base is not None:
+        topics['base_imu'] = IMU_TYPE
     store = get_typestore(Stores.ROS2_JAZZY)
     ros = SimpleNamespace(**{name.split('/')[-1]: kind for name, kind in store.types.items()})
     with tempfile.TemporaryDirectory(prefix=f'.{path.name}.', dir=path.parent) as directory:
@@ -64,10 +68,10 @@ def write_results(result: Result, path: str | os.PathLike[str]) -> None:
         with Writer(unfinished, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
             connections = {name: writer.add_connection(f'{NAMESPACE}/{name}', msgtype,
                                                        typestore=store)
-                           for name, msgtype in TOPICS.items()}
+                           for name, msgtype in topics.items()}
             for name, time_ns, message in _Results(result, ros).records():
                 writer.write(connections[name], time_ns,
-                             store.serialize_cdr(message, TOPICS[name]))
+                             store.serialize_cdr(message, topics[name]))
         unfinished.rename(path)
 
 
@@ -114,6 +118,10 @@ class _Results:
                     prediction.propagate(stamp_ns, gyro.tolist())
                     or (good and stamp_ns == epoch_ns)):
                 yield 'imu', time_ns, self._imu(prediction, data, gyro, accel)
+                if self._base is not None:
+                    message = self._imu(prediction, data, gyro, accel)
+                    turn_to_base(message, self._base, self._result.config.base_frame)
+                    yield 'base_imu', time_ns, message
         for epoch in epochs:
             yield from self._of_epoch(epoch, time_ns)
         yield 'status', time_ns, self._status(self._result.status)

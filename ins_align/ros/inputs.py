@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 """
-What the node reads: IMU messages as bytes, the GNSS topics and their faults, /tf_static.
+What the node reads: IMU messages as bytes, GNSS topics and their faults, /tf_static, parameters.
 
 Turning every IMU sample into a Python message and back costs several times as much as aligning.
 """
@@ -25,11 +25,12 @@ from importlib import import_module
 import struct
 from typing import Any, NamedTuple
 
-from ins_align.config import Config, ConfigError
+from ins_align.config import Config, ConfigError, listed_choices
 from ins_align.geometry.rotation import Transform
 from ins_align.gnss.drivers import LIVE_TYPES, RECEIVERS, type_in_words, VELOCITY_TYPES
 from ins_align.gnss.messages import imu_from_msg
 from ins_align.mounting import Lookup, transform_from_msg
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
@@ -197,3 +198,17 @@ def open_static_tf(node: Node, config: Config) -> Lookup | None:
         return transform_from_msg(buffer.lookup_transform(target, source, Time()).transform)
 
     return lookup
+
+
+def parameter_descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
+    """Return the description of a field of `Config` for ROS."""
+    line = field.metadata
+    unit = f' [{line["unit"]}]' if line['unit'] else ''
+    descriptor = ParameterDescriptor(
+        description=line['description'] + unit, read_only=line['read_only'])
+    if line['choices']:
+        descriptor.additional_constraints = f'one of: {listed_choices(line["choices"])}'
+    if line['maximum'] is not None:
+        descriptor.floating_point_range = [FloatingPointRange(
+            from_value=line['minimum'], to_value=line['maximum'])]
+    return descriptor

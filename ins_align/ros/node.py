@@ -30,17 +30,18 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Quaternion, QuaternionStamped, Vector3, Vector3Stamped
 from ins_align.aligner import Aligner, Attitude, Epoch, State, Status
 from ins_align.config import (
-    Config, config_from_mapping, ConfigError, listed_choices, NODE_NAME, RCLPY_PARAMETERS,
-    without_unknown)
+    Config, config_from_mapping, ConfigError, NODE_NAME, RCLPY_PARAMETERS, without_unknown)
+from ins_align.geometry.rotation import Transform
 from ins_align.gnss.drivers import gnss_from_msg
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
-from ins_align.mounting import Mounting, MountingSearch
+from ins_align.mounting import Mounting, MountingSearch, turn_to_base
 from ins_align.results import FOR_PLOTS, level_of, Severity, status_values, WARN
 from ins_align.ros.inputs import (
     FIX_TOPIC, Gate, gnss_topics, ImuSample, inputs_in_words, message_class, open_static_tf,
-    queued, read_imu, REJECTED_AS, topic_faults, VELOCITY_TOPIC, with_orientation)
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+    parameter_descriptor, queued, read_imu, REJECTED_AS, topic_faults, VELOCITY_TOPIC,
+    with_orientation)
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -49,6 +50,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Header, UInt8
@@ -90,29 +92,16 @@ class ReasonLog:
         return True
 
 
-def parameter_descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
-    """Return the description of a field of `Config` for ROS."""
-    line = field.metadata
-    unit = f' [{line["unit"]}]' if line['unit'] else ''
-    descriptor = ParameterDescriptor(
-        description=line['description'] + unit, read_only=line['read_only'])
-    if line['choices']:
-        descriptor.additional_constraints = f'one of: {listed_choices(line["choices"])}'
-    if line['maximum'] is not None:
-        descriptor.floating_point_range = [FloatingPointRange(
-            from_value=line['minimum'], to_value=line['maximum'])]
-    return descriptor
-
-
 class AlignmentNode(Node):
     """
     Feeds an `Aligner` from topics and publishes the attitude that it declares.
 
-    The executor's thread puts messages into an inbox. While somebody listens to `~/imu`, it takes
-    each IMU message at once and publishes it with the worker's latest attitude, carried on with
-    the gyros; otherwise it takes them several times a second, which costs half. The worker, a
-    thread that no callback waits for, aligns. A parameter that is wrong is a ConfigError.
-    `options` are those of `rclpy.node.Node`, as ``namespace`` or ``parameter_overrides``.
+    The executor's thread puts messages into an inbox. While somebody listens to `~/imu` or
+    `~/base_imu`, it takes each IMU message at once and publishes it with the worker's latest
+    attitude, carried on with the gyros; otherwise it takes them several times a second, which
+    costs half. The worker, a thread that no callback waits for, aligns. A parameter that is wrong
+    is a ConfigError. `options` are those of `rclpy.node.Node`, as ``namespace`` or
+    ``parameter_overrides``.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -131,8 +120,9 @@ class AlignmentNode(Node):
         # From the executor to the worker: time of reception, ns, and a message or a request.
         self._inbox: deque[tuple[int, Any]] = deque()
         # From the worker to the executor, replaced as a whole: the attitude that ~/imu carries on,
-        # if there is one, and the frame_id of its IMU.
-        self._prediction: tuple[Prediction | None, str | None] = None, None
+        # if there is one, the frame_id of its IMU, and the base if somebody listens to ~/base_imu.
+        self._prediction: tuple[Prediction | None, str | None, Transform | None] = (
+            None, None, None)
         # The executor's:
         self._follower = Follower()
         self._followed = self._prediction
@@ -169,24 +159,33 @@ class AlignmentNode(Node):
 
     def _on_imu(self, data: bytes, info: dict[str, int]) -> None:
         self._take_imu([(data, info['received_timestamp']), *queued(self._imu_subscription)])
-        self._gate.is_open = self._imu_publisher.get_subscription_count() > 0
+        self._gate.is_open = self._is_listened_to()
+
+    def _is_listened_to(self) -> bool:
+        return (self._imu_publisher.get_subscription_count() > 0
+                or self._base_imu_publisher.get_subscription_count() > 0)
 
     def _take_imu(self, messages: list[tuple[bytes, int]]) -> None:
         if self._followed is not self._prediction:
             self._followed = self._prediction
             self._follower.adopt(self._followed[0])
+        _, imu_frame, base = self._followed
         for data, received_ns in messages:
             sample = read_imu(data)
             self._inbox.append((received_ns, sample))
             # The attitude is that of another IMU if the frame_id differs.
-            if self._followed[1] not in (None, sample.frame_id):
+            if imu_frame not in (None, sample.frame_id):
                 continue
             now = self._follower.follow(sample.stamp_ns, sample.gyro)
             # Without an attitude nothing is published: navsat_transform keeps the heading of a
             # message for good, whatever its covariance.
             if now is not None:
-                self._imu_publisher.publish(
-                    with_orientation(data, now.quaternion_xyzw, now.covariance))
+                data = with_orientation(data, now.quaternion_xyzw, now.covariance)
+                self._imu_publisher.publish(data)
+                if base is not None:
+                    msg = deserialize_message(data, Imu)
+                    turn_to_base(msg, base, self._config.base_frame)
+                    self._base_imu_publisher.publish(msg)
 
     def _on_gnss(self, topic: str, msg: Any, info: dict[str, int]) -> None:
         self._take_imu(queued(self._imu_subscription))  # those that came before this message
@@ -317,10 +316,13 @@ class AlignmentNode(Node):
 
     def _update_prediction(self) -> None:
         """Hand over the attitude for ~/imu; None if nobody listens or nothing is declared."""
-        listened = self._imu_publisher.get_subscription_count() > 0
-        prediction = self._aligner.prediction() if listened and self._declared else None
+        prediction = (self._aligner.prediction() if self._declared and self._is_listened_to()
+                      else None)
         if prediction is not None or self._prediction[0] is not None:
-            self._prediction = prediction, self._imu_frame
+            mounting = self._search.mounting
+            listened = self._base_imu_publisher.get_subscription_count() > 0
+            base = mounting.base if mounting and listened else None
+            self._prediction = prediction, self._imu_frame, base
 
     def _publish_declared(self, attitude: Attitude | None) -> None:
         """Publish the initial attitude once, or withdraw it."""
@@ -403,6 +405,7 @@ class AlignmentNode(Node):
     def _open_topics(self) -> None:
         self._attitude_publisher = self._open_attitude_topic()
         self._imu_publisher = self._publish_on(Imu, '~/imu', 100)
+        self._base_imu_publisher = self._publish_on(Imu, '~/base_imu', 100)
         self._status_publishers = [self._publish_on(DiagnosticArray, topic, 10)
                                    for topic in ('~/status', '/diagnostics')]
         self._numbers_publishers = {name: self._publish_on(Vector3Stamped, f'~/{name}', 100)
