@@ -37,8 +37,10 @@ MAX_REFERENCE_GAP_NS = 1_500_000_000  # the reference is not interpolated over l
 
 # Estimates other than the attitude, with the unit as written in names of outputs.
 ESTIMATES = {'gyro_bias': 'rad_s', 'accel_bias': 'm_s2', 'lever_arm': 'm', 'gnss_delay': 's'}
-# Properties of an attitude that also have topics of these names, for plotting.
+# Properties of an attitude and of an epoch that also have topics of these names: angles for
+# plots, and estimates in the axes of the IMU for those who start a filter of their own.
 FOR_PLOTS = 'roll_pitch_yaw_deg', 'sigma_deg'
+BIASES = 'gyro_bias', 'accel_bias'
 _ATTITUDE_COLUMNS = 'qx,qy,qz,qw,sigma_e_deg,sigma_n_deg,sigma_u_deg'
 CSV_HEADER = 'stamp_ns,t_s,state,' + ','.join(
     prefix + name for prefix in ('', 'current_') for name in _ATTITUDE_COLUMNS.split(','))

@@ -94,12 +94,14 @@ def test_who_listens_gets_the_heading_whenever_it_joins(gnss_rate, tmp_path):
     assert max(errors) < TOLERANCE_DEG, errors
 
 
-def test_numbers_for_plots(tmp_path):
+def test_numbers_of_each_epoch(tmp_path):
     simulation = simulate('flight', imu_grade='tactical', seed=1, duration=16.0)
-    angles, sigmas, states = [], [], []
+    angles, sigmas, gyro, accel, states = [], [], [], [], []
     with Listener() as listener, running_node(PARAMETERS):
         for msg_type, topic, store in ((Vector3Stamped, 'roll_pitch_yaw_deg', angles),
                                        (Vector3Stamped, 'sigma_deg', sigmas),
+                                       (Vector3Stamped, 'gyro_bias', gyro),
+                                       (Vector3Stamped, 'accel_bias', accel),
                                        (UInt8, 'state', states)):
             listener.node.create_subscription(msg_type, f'/ins_align/{topic}', store.append, 100)
         listener.wait_for(lambda: states)               # the two have found each other
@@ -108,6 +110,12 @@ def test_numbers_for_plots(tmp_path):
         listener.wait_for_next_status()
     assert [stamp_ns(msg) for msg in angles] == [stamp_ns(msg) for msg in sigmas]
     assert len(angles) > 20
+    for name, biases in (('gyro_bias_rad_s', gyro), ('accel_bias_m_s2', accel)):
+        assert [stamp_ns(msg) for msg in biases] == [stamp_ns(msg) for msg in angles]
+        assert biases[-1].header.frame_id == 'imu_link'
+        last = biases[-1].vector
+        assert [last.x, last.y, last.z] == pytest.approx(
+            [float(number) for number in listener.status[name].split()], rel=1e-5)
     now = angles[-1].vector
     truth = np.degrees(roll_pitch_yaw(simulation.attitude_at(stamp_ns(angles[-1]))))
     difference = np.array([now.x, now.y, now.z]) - truth

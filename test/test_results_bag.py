@@ -64,7 +64,8 @@ def test_same_topics_stamps_and_values_as_the_result(drive):
     folder, simulation, result = drive
     found, original = read(folder / 'out'), read(folder / 'drive')
     assert {topic.removeprefix('/ins_align/') for topic in found} == {
-        'imu', 'initial_attitude', 'status', 'roll_pitch_yaw_deg', 'sigma_deg'}
+        'imu', 'initial_attitude', 'status', 'roll_pitch_yaw_deg', 'sigma_deg', 'gyro_bias',
+        'accel_bias'}
 
     declared = next(epoch for epoch in result.epochs if epoch.state is State.ALIGNED)
     (time_ns, attitude), = found['/ins_align/initial_attitude']
@@ -78,6 +79,10 @@ def test_same_topics_stamps_and_values_as_the_result(drive):
     yaw, sigma = (found[f'/ins_align/{name}'] for name in ('roll_pitch_yaw_deg', 'sigma_deg'))
     assert [message.vector.z for _, message in yaw] == [e.current.yaw_deg for e in epochs]
     assert [message.vector.x for _, message in sigma] == [e.current.sigma_deg[0] for e in epochs]
+    for name in ('gyro_bias', 'accel_bias'):
+        biases = [message for _, message in found[f'/ins_align/{name}']]
+        assert [message.vector.z for message in biases] == [getattr(e, name)[2] for e in epochs]
+        assert {message.header.frame_id for message in biases} == {'imu'}
     assert [stamp_from_msg(message) for _, message in yaw] == [e.current.stamp_ns for e in epochs]
 
     # Each input sample from the declaration on, recorded when the input was.

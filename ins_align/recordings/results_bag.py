@@ -30,7 +30,8 @@ from ins_align.recordings import BagError
 from ins_align.recordings.bag import Bag
 from ins_align.recordings.decode import decode_imu, deserialize, IMU_TYPE, VECTOR_TYPE
 from ins_align.recordings.reader import frame_id_of
-from ins_align.results import Epoch, FOR_PLOTS, level_of, Result, State, Status, status_values
+from ins_align.results import (
+    BIASES, Epoch, FOR_PLOTS, level_of, Result, State, Status, status_values)
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
@@ -38,7 +39,7 @@ from rosbags.typesys import get_typestore, Stores
 NAMESPACE = '/ins_align'
 TOPICS = {'imu': IMU_TYPE, 'initial_attitude': 'geometry_msgs/msg/QuaternionStamped',
           'status': 'diagnostic_msgs/msg/DiagnosticArray',
-          **dict.fromkeys(FOR_PLOTS, VECTOR_TYPE)}
+          **dict.fromkeys((*FOR_PLOTS, *BIASES), VECTOR_TYPE)}
 STATUS_PERIOD_NS = 1_000_000_000  # a change of the state is written at once
 # Without GNSS there is an epoch every 2 s; the gyros carry no older attitude forward.
 MAX_AGE_NS = 2_500_000_000
@@ -145,7 +146,7 @@ class _Results:
         return Prediction(epoch, self._result.config.imu_noise, rates, interval)
 
     def _of_epoch(self, epoch: Epoch, time_ns: int) -> Iterator[Record]:
-        """Yield the messages of an epoch: initial attitude, values for plots, status."""
+        """Yield the messages of an epoch: initial attitude, angles, sigmas and biases, status."""
         first, now = epoch.initial, epoch.current
         declared = epoch.state is State.ALIGNED and self._state is not State.ALIGNED
         if declared and first is not None:
@@ -155,6 +156,10 @@ class _Results:
             for name in FOR_PLOTS:
                 yield name, time_ns, self._ros.Vector3Stamped(
                     self._header(now.stamp_ns), self._ros.Vector3(*getattr(now, name)))
+            for name in BIASES:
+                header = dataclasses.replace(self._header(now.stamp_ns), frame_id=self._imu_frame)
+                yield name, time_ns, self._ros.Vector3Stamped(
+                    header, self._ros.Vector3(*getattr(epoch, name).tolist()))
         since_ns = abs(epoch.stamp_ns - self._status_ns)  # the clock may have been set back
         if epoch.state is not self._state or since_ns >= STATUS_PERIOD_NS:
             self._status_ns = epoch.stamp_ns

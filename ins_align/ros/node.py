@@ -36,7 +36,7 @@ from ins_align.gnss.drivers import gnss_from_msg
 from ins_align.gnss.messages import Fix, MessageError, Velocity
 from ins_align.imu.prediction import Follower, Prediction
 from ins_align.mounting import Mounting, MountingSearch, turn_to_base
-from ins_align.results import FOR_PLOTS, level_of, Severity, status_values, WARN
+from ins_align.results import BIASES, FOR_PLOTS, level_of, Severity, status_values, WARN
 from ins_align.ros.inputs import (
     FIX_TOPIC, Gate, gnss_topics, ImuSample, inputs_in_words, message_class, open_static_tf,
     parameter_descriptor, queued, read_imu, REJECTED_AS, topic_faults, VELOCITY_TOPIC,
@@ -345,15 +345,18 @@ class AlignmentNode(Node):
         return Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=self._config.world_frame_id)
 
     def _publish_numbers(self, epoch: Epoch) -> None:
-        """Publish angles and sigmas of an epoch, for plots."""
+        """Publish angles, sigmas and biases of an epoch."""
         now = epoch.current
         if now is None:
             return
         for name, publisher in self._numbers_publishers.items():
             if publisher.get_subscription_count() > 0:
-                vector = dict(zip('xyz', map(float, getattr(now, name))))
-                publisher.publish(Vector3Stamped(
-                    header=self._header(now.stamp_ns), vector=Vector3(**vector)))
+                header = self._header(now.stamp_ns)
+                if name in BIASES:
+                    header.frame_id = self._imu_frame or ''
+                of = epoch if name in BIASES else now
+                vector = dict(zip('xyz', map(float, getattr(of, name))))
+                publisher.publish(Vector3Stamped(header=header, vector=Vector3(**vector)))
 
     def _publish_status(self) -> None:
         now = time.monotonic()
@@ -409,7 +412,7 @@ class AlignmentNode(Node):
         self._status_publishers = [self._publish_on(DiagnosticArray, topic, 10)
                                    for topic in ('~/status', '/diagnostics')]
         self._numbers_publishers = {name: self._publish_on(Vector3Stamped, f'~/{name}', 100)
-                                    for name in FOR_PLOTS}
+                                    for name in (*FOR_PLOTS, *BIASES)}
         self._state_publisher = self._publish_on(UInt8, '~/state', 10)
         gnss = gnss_topics(self._config)
         self._inputs = {IMU_TOPIC: 'sensor_msgs/msg/Imu', **gnss}
