@@ -140,6 +140,12 @@ class Listener:
         """Return the newest status as a dict, empty before the first."""
         return values_of(self.statuses[-1]) if self.statuses else {}
 
+    @property
+    def heard_state(self):
+        """Return the newest state that is not due to an IMU that has fallen silent."""
+        return next(values['state'] for values in map(values_of, reversed(self.statuses))
+                    if 'no IMU sample for' not in values['reason'])
+
     def count(self, name):
         return int(self.status.get(name, 0))
 

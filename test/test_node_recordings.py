@@ -64,6 +64,7 @@ def test_recording(name, start, duration, parameters, tmp_path):
         if row is not None and row['sigma_u_deg']:
             sigma = float(values['initial_sigma_east_north_up_deg'].split()[2])
             assert sigma == pytest.approx(float(row['sigma_u_deg']), abs=TOLERANCE_DEG)
-            assert values['state'] == row['state']
+            if 'no IMU sample for' not in values['reason']:
+                assert values['state'] == row['state']
             compared += 1
     assert compared >= 2

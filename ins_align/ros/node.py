@@ -369,8 +369,11 @@ class AlignmentNode(Node):
                   else now - self._imu_heard)
         faults = [] if first else self._input_faults(status, silent > IMU_SILENT)
         if silent > IMU_SILENT:
-            # The aligner goes by stamps: it notices a gap only when the next sample comes.
+            # The aligner goes by stamps: it notices a gap only when the next sample comes. Until
+            # then it keeps everything, because there is no gap if samples are only late.
             faults.append(f'no IMU sample for {silent:.0f} s')
+            if status.state is not State.FAULT:
+                status = dataclasses.replace(status, state=State.WAITING_FOR_IMU)
         if self._search.waits_for:
             faults.append(f'waits for {self._search.waits_for}')
         if faults:
