@@ -19,6 +19,7 @@ from types import SimpleNamespace
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TwistStamped, TwistWithCovarianceStamped
+from ins_align.config import Config
 from ins_align.geometry.rotation import Transform
 from ins_align.gnss.messages import Fix, Velocity
 from ins_align.ros.inputs import ImuSample
@@ -69,7 +70,7 @@ class StillNode(AlignmentNode):
 def still_node(monkeypatch):
     """Return a context manager of a StillNode, with parameters and the transforms of TF."""
     @contextmanager
-    def running(transforms=None, **parameters):
+    def running(transforms=None, arguments=(), **parameters):
         def lookup(target, source):
             if source != 'gnss' or target not in transforms:
                 return None
@@ -78,7 +79,8 @@ def still_node(monkeypatch):
         monkeypatch.setattr('ins_align.ros.node.open_static_tf',
                             lambda *_: None if transforms is None else lookup)
         given = [word for override in overrides(parameters) for word in ('-p', override)]
-        rclpy.init(args=['--ros-args', *given], signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=['--ros-args', *given, *arguments],
+                   signal_handler_options=SignalHandlerOptions.NO)
         node = None
         try:
             node = StillNode()
@@ -112,6 +114,22 @@ def test_a_program_may_host_nodes_with_options_of_its_own(still_node):
         assert other.get_fully_qualified_name() == '/robot1/ins_align'
         assert node._config.hold_time == 2.0 and other._config.hold_time == 3.0
         other.destroy_node()
+
+
+@pytest.mark.parametrize('section, is_read', [
+    ('ins_align_node', False), ('ins_align', True), ('robot1/ins_align', False), ('/**', True)])
+def test_a_section_for_another_node_is_told(still_node, tmp_path, monkeypatch, capfd, section,
+                                            is_read):
+    file = tmp_path / 'parameters.yaml'
+    # With what is the default in any case.
+    file.write_text(f'{section}:\n  ros__parameters:\n    hold_time: {Config().hold_time}\n')
+    arguments = ['--params-file', str(file)]
+    monkeypatch.setattr('sys.argv', ['ins_align_node', '--ros-args', *arguments])
+    with still_node(arguments=arguments):
+        pass
+    told = ('no parameter file sets a parameter of this node: the section for it must be named '
+            '"ins_align:" or "/**:"' in capfd.readouterr().err)
+    assert told == (not is_read)
 
 
 @pytest.mark.parametrize('samples, pieces, used, left_out', [

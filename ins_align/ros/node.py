@@ -21,6 +21,7 @@ import dataclasses
 from functools import partial
 from operator import itemgetter
 import re
+import sys
 import threading
 import time
 from typing import Any
@@ -456,6 +457,11 @@ class AlignmentNode(Node):
                     for name, parameter in self.get_parameters_by_prefix('').items()}
         given, warnings = without_unknown(declared)
         config = config_from_mapping(given)
+        if not given and not warnings and '--params-file' in sys.argv:
+            # ROS passes over sections for other nodes without a word.
+            name = self.get_fully_qualified_name().lstrip('/')
+            warnings.append(f'no parameter file sets a parameter of this node: the section for it '
+                            f'must be named "{name}:" or "/**:", with "ros__parameters:" below')
         for warning in warnings:
             self.get_logger().warning(warning)
         for name in declared:
