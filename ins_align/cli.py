@@ -68,8 +68,8 @@ exit status:
   1  read to the end and not aligned; table and JSON say why
   2  bad usage or a recording that cannot be read
 
-With several recordings --json writes an array with an object for each, and --csv and --plot put
-the recording's name before the suffix: out.csv becomes out_first.csv, out_second.csv.
+With several recordings --json writes an array with an object for each, and --csv, --plot and --bag
+put the recording's name before the suffix: out.csv becomes out_first.csv, out_second.csv.
 
 examples:
   ins_align replay flight_1 --lever-arm 1.2 0.0 0.4 --json flight_1.json

@@ -14,9 +14,10 @@
 """
 Example: the alignment gives robot_localization its attitude and true heading.
 
-Needs robot_localization and a transform from base_link to the IMU's frame_id (a URDF, or tf2_ros
-static_transform_publisher). The result is the pose of base_link in an ENU frame with its origin
-where the vehicle was aligned, on /odometry/filtered and as the transform odom -> base_link.
+Needs robot_localization and, in /tf_static, the transforms from base_link to the frame_id of the
+IMU and to that of the fix (a URDF, or a static_transform_publisher of tf2_ros for each). The
+result is the pose of base_link in an ENU frame with its origin where the vehicle was aligned, on
+/odometry/filtered and as the transform odom -> base_link.
 
     ros2 launch ins_align robot_localization.launch.py params_file:=my_robot.yaml
 
