@@ -222,7 +222,7 @@ def _other_delay(stamps_ns: Index, samples: Array, gnss: Sequence[Fix | Velocity
     motion = velocities if velocities.times.size else differences(track(positions))
     found = fit_motion(series_of((stamps_ns[good] - start_ns) * 1e-9, samples[good]), motion,
                        STANDARD_GRAVITY)
-    if found.get('gnss_delay_std', MAX_DELAY_STD) >= MAX_DELAY_STD:
+    if 'gnss_delay' not in found:
         return ''
     delay = found['gnss_delay']
     if abs(delay - config.gnss_delay) < 3.0 * max(config.gnss_delay_std, MAX_DELAY_STD):

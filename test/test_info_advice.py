@@ -168,6 +168,20 @@ def test_clocks_that_drift_apart_have_no_delay_of_their_own(tmp_path, scenario):
     assert 'gnss_delay' not in settings_of(info)
 
 
+@pytest.mark.parametrize('offset, drift', [(0.0, 0.3), (-4.8, 0.7)])
+def test_no_delay_is_told_where_it_is_not_known_to_a_twentieth_of_a_second(
+        tmp_path, offset, drift):
+    """Nor one of a clock that is right, if the motion is seconds off; the noise is that there."""
+    truth = simulate('car', seed=4, duration=150.0)
+    offsets = 1e9 * (offset + np.linspace(0.5 * drift, -0.5 * drift, truth.gnss_stamps_ns.size))
+    late_ns = offsets.astype(np.int64)
+    info = inspected(truth, tmp_path / 'a', gnss_stamps_ns=truth.gnss_stamps_ns + late_ns,
+                     gnss_arrival_ns=truth.gnss_arrival_ns + late_ns)
+    assert 'delay of the GNSS' not in describe(info)
+    assert not {'gnss_delay', 'gnss_delay_std'} & set(info.figures)
+    assert info.figures['velocity_noise'] == pytest.approx(0.1, abs=0.03)
+
+
 @pytest.mark.parametrize('scenario', ['straight', 'static', 'swing', 'car'])
 def test_no_delay_is_told_where_there_is_none_or_no_motion(tmp_path, scenario):
     """The antenna of a boat that yaws on its course moves, and its heading is open."""

@@ -103,18 +103,29 @@ def fit_motion(samples: Series, velocities: Series, gravity: float,
     axis), ``velocity_noise_vertical``.
     """
     found = _fit_motion(samples, velocities, gravity, offsets, MAX_FITTED_TIME)
-    if 'gnss_delay' in found and (
-            abs(found['gnss_delay']) + 3.0 * found['gnss_delay_std'] < USUAL_DELAY):
+    if 'gnss_delay' in found and found['gnss_delay_std'] < min(
+            MAX_DELAY_STD, (USUAL_DELAY - abs(found['gnss_delay'])) / 3.0):
         return found
     reach = MAX_OFFSET_SHARE * np.ptp(velocities.times) if velocities.times.size else 0.0
     wrong = [offset for offset in WRONG_CLOCKS if abs(offset) < reach]
     far = _fit_motion(samples, velocities, gravity, (*offsets, *wrong), FIRST_MINUTES)
-    return far if far.get('gnss_delay_std', math.inf) < MAX_DELAY_STD else found
+    (delay, std), (far_delay, far_std) = (
+        [fit.get(name, math.inf) for name in ('gnss_delay', 'gnss_delay_std')]
+        for fit in (found, far))
+    if abs(far_delay - delay) > DELAY_STEP and far_std < max(std, MAX_DELAY_STD):
+        found = far     # otherwise `found` is of more data
+    if found.get('gnss_delay_std', 0.0) >= MAX_DELAY_STD:
+        del found['gnss_delay'], found['gnss_delay_std']
+    return found
 
 
 def _fit_motion(samples: Series, velocities: Series, gravity: float, offsets: tuple[float, ...],
                 longest: float) -> dict[str, float]:
-    """Fit as `fit_motion`, around these offsets only, `longest` s from the first motion on."""
+    """
+    Fit as `fit_motion`, around these offsets only, `longest` s from the first motion on.
+
+    The delay is returned if it shows at all; its sigma is infinite at an end of what was tried.
+    """
     delays = np.concatenate([offset + DELAYS for offset in offsets])
     moving = np.flatnonzero(np.hypot(*velocities.vectors[:, :2].T) > MOVING)
     start = velocities.times[moving[0]] - 2.0 * FIT_WINDOW if moving.size else 0.0
@@ -145,13 +156,14 @@ def _fit_motion(samples: Series, velocities: Series, gravity: float, offsets: tu
     free = np.maximum(3.0 * good.sum(axis=1) - PRIOR_STD.size, 1.0)
     likelihood = (-0.5 * free * np.log(costs))[:, telling]
     delay, std = _maximum(near, likelihood.sum(axis=1))
-    known = (std < MAX_DELAY_STD and np.count_nonzero(telling) >= MIN_WINDOWS
-             and 0 < place % DELAYS.size < DELAYS.size - 1)
+    if not 0 < place % DELAYS.size < DELAYS.size - 1:
+        std = math.inf      # it may be further off
     # If the clocks drift, the two halves of the recording show different delays.
     halves = [_maximum(near, half.sum(axis=1))[0]
               for half in np.array_split(likelihood, 2, axis=1)]
+    shown = np.count_nonzero(telling) >= MIN_WINDOWS
     figures = {'gnss_delay': delay,
-               'gnss_delay_std': max(std, 0.5 * abs(halves[1] - halves[0]))} if known else {}
+               'gnss_delay_std': max(std, 0.5 * abs(halves[1] - halves[0]))} if shown else {}
     # Noise in motion, if enough windows have it: at rest, receivers look better than they are.
     chosen = np.hypot(v_n[..., 0], v_n[..., 1]).mean(axis=1) > MOVING
     chosen |= np.count_nonzero(chosen) < MIN_WINDOWS
