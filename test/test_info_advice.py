@@ -117,6 +117,18 @@ def test_accelerometers_in_another_unit(tmp_path):
         describe(info))
 
 
+@pytest.mark.parametrize('scale', [0.79, 0.97])
+def test_accelerometers_that_read_too_little(tmp_path, scale):
+    """No motion does that, and it is no noise of the GNSS."""
+    truth = simulate('flight', seed=1, duration=80.0)
+    mean = np.linalg.norm(truth.accel, axis=1).mean()
+    info = inspected(truth, tmp_path / 'a', accel=truth.accel * scale * 9.81 / mean,
+                     velocity_covariance=NO_COVARIANCE)
+    said = f'the accelerometers read {1.0 - scale:.0%} too little' in describe(info)
+    assert said == (scale < 0.9)
+    assert ('velocity_std' in settings_of(info)) != said
+
+
 def test_a_setting_beyond_its_limits_is_a_fault(tmp_path):
     truth = drive(duration=240.0)
     info = inspected(truth, tmp_path / 'a', gnss_stamps_ns=truth.gnss_stamps_ns + 60_100_000_000,

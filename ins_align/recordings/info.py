@@ -270,7 +270,9 @@ def _add_timing(info: Info, imu: Recorded, gnss: list[Recorded], motion: Series,
         info.add(f'the stamps of GNSS messages are {ahead:.1f} s ahead of those of the IMU: their '
                  'clocks differ, which gnss_delay corrects as far as messages were recorded at '
                  'once', {'gnss_delay': round(ahead, 1)})
-    if source.kind == 'velocity' and 'velocity_noise' in found:
+    # A fit with wrong forces shows their error as noise of the velocity.
+    if (source.kind == 'velocity' and 'velocity_noise' in found
+            and 'force_lacks' not in imu.figures):
         _add_velocity_noise(info, source)
     if Config.gnss_lateness < lateness + behind < MAX_LATENESS:
         text, value = lateness_advice(lateness + behind, behind)

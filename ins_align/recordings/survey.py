@@ -46,6 +46,9 @@ BIAS_SIGMAS = 2.5  # times a preset's sigma of a bias that the preset still cove
 REST_SPEED = 0.3  # m/s by GNSS, below which a vehicle may be at rest
 REST_RATE, REST_FORCE = math.radians(1.0), 0.3  # rad/s, m/s^2: scatter of GRID means at rest
 MIN_REST = 5.0  # s
+# The mean of |f| over a time is at least gravity less the change of velocity over that time: s,
+# m/s^2.
+WEAK_TIME, WEAK_FORCE = 60.0, 0.5
 MAX_FORCE_ERROR = 3.0  # m/s^2: no accelerometer at rest is so far off gravity
 ON_LATTICE = 0.1  # quanta that a step between values may be off a multiple of the quantum
 MIN_REPEATS = 3  # samples per value: with fewer, the quantum may be that of digits in a text
@@ -272,6 +275,11 @@ def survey_imu(imu: Surveyed, samples: Series, velocities: Series, gravity: floa
             f'({x:+.2f}, {y:+.2f}, {z:+.2f})', mean_force=force, up=[x, y, z])
     if imu.faults:
         return  # the other findings would have wrong units
+    if np.ptp(times) > WEAK_TIME and force < gravity - WEAK_FORCE:
+        imu.add(f'gravity is {gravity:.2f} m/s^2, and no motion takes so much off the average: '
+                f'the accelerometers read {1.0 - force / gravity:.0%} too little: check scale '
+                'and unit',
+                force_lacks=gravity - force)
     if z < 0.5:
         imu.add('on average the specific force does not point along the z axis of the IMU: the '
                 'attitude will be that of the axes as they are, however the IMU is mounted')
