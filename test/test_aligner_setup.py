@@ -225,6 +225,33 @@ def test_noise_that_the_receiver_overstates_is_found(scenario, longer):
     assert normalised_error(overstated[-1].current, s) < 16
 
 
+@pytest.mark.parametrize('stated', [True, False])
+@pytest.mark.parametrize('scenario, std, seed, within', [
+    ('hover', 0.05, 3, 10.0), ('hover', 0.05, 5, 10.0), ('robot', 0.1, 5, math.inf)])
+def test_a_receiver_that_holds_its_course_when_it_is_slow(scenario, std, seed, within, stated):
+    """Below 1 m/s: otherwise a hover is not declared in time and a robot 150 deg wrong."""
+    s = simulated(scenario, imu_grade='mems', duration=60.0, seed=seed, velocity_std=std,
+                  velocity_std_vertical=std)
+    held = s.velocity.copy()
+    for before, now in zip(held, held[1:]):
+        speed = np.hypot(*now[:2])
+        if speed < 1.0:
+            now[:2] = before[:2] * speed / np.hypot(*before[:2])
+    sent = dict(zip(s.gnss_stamps_ns.tolist(), held))
+    aligner = Aligner(config_for(
+        s, imu_grade='mems', tilt_std_threshold=2.0, heading_std_threshold=4.0))
+    for kind, payload in s.messages():
+        if kind == 'velocity':
+            payload = payload._replace(velocity=sent[payload.stamp_ns],
+                                       covariance=payload.covariance if stated else None)
+        give(aligner, kind, payload)
+    done = [epoch for epoch in aligner.flush() if epoch.state is State.ALIGNED]
+    assert aligner.status().counts['velocity_course_held'] > 150
+    assert within == math.inf or first_aligned(done) < within
+    errors = [normalised_error(epoch.current, s) for epoch in done]
+    assert not errors or (np.quantile(errors, 0.9) < 16 and max(errors) < 40)
+
+
 def test_errors_that_last_are_not_taken_for_a_quiet_receiver():
     """Of a receiver that filters, at 10 Hz: in the first 0.3 s they do not show."""
     s = simulated('car', imu_grade='mems', gnss_rate=10.0, velocity_std=0.01, duration=30.0,

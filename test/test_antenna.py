@@ -132,6 +132,28 @@ def test_a_vertical_velocity_that_is_told_to_be_absent_counts_for_nothing(vertic
         assert np.array_equal(epoch.covariances[0][:, 2], [0.0, 0.0, 1e6])
 
 
+def test_the_course_of_a_slow_receiver_is_held_where_the_speed_alone_changes():
+    """Not at rest, not where the velocity repeats, and not in a turn of 0.1 deg or at 2 m/s."""
+    default = np.diag([Config.velocity_std ** 2] * 2 + [Config.velocity_std_vertical ** 2])
+    speeds = [0.0, 0.2, 0.1, 0.1, 0.8, 0.8, 2.0, 2.5, 1.0]
+    turns = [0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 180.0]
+    variances = [0.0, 0.0, 0.09, 0.0, 0.64, 0.0, 0.0, 0.0, 0.0]
+    for stated in (CORRELATED, None):
+        counts = Counter()
+        antenna = Antenna(Config(), counts)
+        for k, (speed, course, variance) in enumerate(zip(speeds, 70.0 + np.cumsum(turns),
+                                                          variances)):
+            course = math.radians(course)
+            v_n = np.array([speed * math.sin(course), speed * math.cos(course), 0.3])
+            epoch = antenna.epoch(told(k * SECOND, 0.0)._replace(
+                velocity=Velocity(k * SECOND, v_n, stated)))
+            usual = default if stated is None else stated
+            assert epoch.stated[0] == (stated is not None or variance > 0.0)
+            assert np.allclose(epoch.covariances[0],
+                               usual + np.diag([variance, variance, 0.0]))
+        assert counts['velocity_course_held'] == 2
+
+
 def test_a_receiver_that_has_measured_the_vertical_may_say_zero():
     antenna = Antenna(Config(), Counter())
     for k, up in enumerate((0.5, 0.0, -0.5, 0.0)):

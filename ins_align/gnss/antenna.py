@@ -39,6 +39,10 @@ _UNKNOWN_VERTICAL_STD = 1e3     # m/s
 # In the first epoch 1 mm (1 mm/s) and more is believed.
 BETTER_THAN_USUAL, USUAL_EPOCHS = 100.0, 11
 BEST_VARIANCE = 1e-6
+# Receivers that are slower than this (m/s) hold their course: where the speed changes, by more
+# than this (m/s), and the course does not (rad), a velocity is wrong by as much as itself, or this
+# (m/s).
+SLOW, OTHER_SPEED, SAME_COURSE, LEAST_HELD = 1.5, 1e-3, math.radians(0.02), 0.3
 # Velocity and position are compared over `least_distance`, and at least so many sigmas.
 DISTANCE_SIGMAS = 8.0
 # A mismatch of more than this share of the distance is not noise, if this many fixes in a row
@@ -101,6 +105,7 @@ class Antenna:
             fix is None or fix.vertical)
         if v_n is not None or believed:
             self._measured_ns = message.stamp_ns
+        held = v_n is not None and self._holds_course(v_n)
         if v_n is not None:
             self._v_n, self._velocity_ns = v_n, message.stamp_ns
             self._speed = math.hypot(*v_n.tolist())
@@ -112,13 +117,26 @@ class Antenna:
         velocity_covariance = self._velocity_noise.covariance(
             None if velocity is None else velocity.covariance,
             self._vertical and (velocity is None or velocity.vertical))
+        if v_n is not None and held:
+            self._counts['velocity_course_held'] += 1
+            velocity_covariance = velocity_covariance + np.diag(
+                [max(v_n[:2] @ v_n[:2], LEAST_HELD ** 2)] * 2 + [0.0])
         return AntennaEpoch(message.stamp_ns, *self._place, v_n, believed,
                             (velocity_covariance, position_covariance),
                             self.gravity_drift(message.stamp_ns),
                             fault='' if self._v_n is None else self._check.fault,
                             dry=fix is None and velocity is None,
-                            stated=(velocity is None or velocity.covariance is not None,
+                            stated=(velocity is None or velocity.covariance is not None or held,
                                     fix is None or fix.covariance is not None))
+
+    def _holds_course(self, v_n: Array) -> bool:
+        """Return whether a slow receiver repeats the course, at another speed."""
+        if self._v_n is None:
+            return False
+        before, now = (complex(*velocity[:2].tolist()) for velocity in (self._v_n, v_n))
+        turned = before.conjugate() * now
+        return (abs(turned.imag) < SAME_COURSE * turned.real and abs(now) < SLOW
+                and abs(abs(now) - abs(before)) > OTHER_SPEED)
 
     def _look_for_vertical(self, v_n: Array, measured: bool) -> None:
         """Detect a receiver that does not measure the vertical: it moves and states only 0."""
