@@ -17,7 +17,8 @@ from dataclasses import replace
 import math
 import re
 
-from alignment import aligned, config_for, error_of, feed, normalised_error, simulated
+from alignment import (
+    aligned, config_for, error_of, feed, give_all, normalised_error, simulated)
 from ins_align.aligner import Aligner, State
 from ins_align.config import Config, ImuNoise
 from ins_align.gnss.messages import Fix, Velocity
@@ -223,6 +224,27 @@ def test_noise_that_the_receiver_overstates_is_found(scenario, longer):
     sigmas = [epochs[-1].current.sigma_deg for epochs in (right, overstated)]
     assert np.all(sigmas[1] < 1.4 * sigmas[0])
     assert normalised_error(overstated[-1].current, s) < 16
+
+
+@pytest.mark.parametrize('stated', [True, False])
+def test_one_uncertain_velocity_among_the_first_does_not_make_the_others_look_quiet(stated):
+    """Neither does it tell of a receiver that states nothing otherwise."""
+    s = simulated('flight', imu_grade='mems', duration=30.0, seed=1)
+
+    def sent(uncertain):
+        def change(k, kind, message):
+            if kind != 'velocity':
+                return message
+            if k == 1 and uncertain:
+                return message._replace(covariance=90.0 * message.covariance)
+            return message if stated else message._replace(covariance=None)
+
+        return give_all(Aligner(config_for(s, velocity_std=0.1, velocity_std_vertical=0.1)), s,
+                        change=change)
+
+    plain, one = sent(False), sent(True)
+    assert abs(first_aligned(one) - first_aligned(plain)) < 2.0
+    assert one[-1].current.sigma_deg == pytest.approx(plain[-1].current.sigma_deg, rel=0.1)
 
 
 @pytest.mark.parametrize('stated', [True, False])

@@ -125,6 +125,9 @@ class Start:
         measured = np.array([epoch.measured for epoch in epochs])
         kind = 0 if np.count_nonzero(measured[:, 0]) >= FIRST_EPOCHS else 1
         use = measured[:, kind]
+        states = np.array([epoch.stated[kind] for epoch in epochs])
+        stated = bool(2 * np.count_nonzero(states[use]) > np.count_nonzero(use))
+        use &= states == stated         # one estimate of the noise serves either
         variance = self._variance(kind)
         use &= variance <= UNCERTAIN ** 2 * np.min(variance[use], initial=np.inf)
         if np.count_nonzero(use) < FIRST_EPOCHS + kind or (kind and not use_position):
@@ -135,14 +138,12 @@ class Start:
             used = pairs[places]
             total = used.T @ used
             C, residual, moments = solve_moments(total)
-            usual = float(np.mean(variance[places]))
+            usual = float(np.median(variance[places]))      # some may be far less certain
             rows = 3 * (len(places) - 2 - kind)
             noise = float(residual) / (rows * usual)
             values, vectors = np.linalg.eigh(moments)
-            states = [epochs[k].stated[kind] for k in places]
-            stated = any(states)
             chance = math.sqrt(2 / rows)            # relative sigma of `noise`
-            quiet = (kind == 0 and all(states) and noise * (1 + 3 * chance) < QUIET
+            quiet = (kind == 0 and stated and noise * (1 + 3 * chance) < QUIET
                      and np.any(np.linalg.norm(velocities_of(epochs)[places], axis=1) > MOVING))
             noise = (max(noise * (1 + chance), LEAST_NOISE) if quiet or not stated
                      else max(noise, 1.0))
