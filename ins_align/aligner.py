@@ -278,6 +278,8 @@ class Aligner:
         attitudes = method.attitudes()
         if fit.measured:
             self._measured_ns = epoch.stamp_ns
+        if epoch.v_n is not None:
+            self._velocity_ns = epoch.stamp_ns
         verdict = self._declaration.update(
             (epoch.stamp_ns - self._start_ns) * 1e-9, (epoch.stamp_ns - self._measured_ns) * 1e-9,
             [attitude.covariance for attitude in attitudes or ()], fit)
@@ -354,9 +356,7 @@ class Aligner:
         self._forget(learnt)
 
     def _no_velocity(self, epoch: AntennaEpoch) -> str:
-        """Return in words why an epoch with a position is one of many without velocity, or ''."""
-        if epoch.v_n is not None:
-            self._velocity_ns = epoch.stamp_ns
+        """Return in words why no velocity is used while positions go on, or ''."""
         if not epoch.position_measured or self.config.use_velocity is False:
             return ''
         if self._velocity_ns is None:

@@ -127,7 +127,7 @@ class Start:
         use = measured[:, kind]
         states = np.array([epoch.stated[kind] for epoch in epochs])
         stated = bool(2 * np.count_nonzero(states[use]) > np.count_nonzero(use))
-        use &= states == stated         # one estimate of the noise serves either
+        use &= states == stated     # the noise is estimated of the stated or of the others
         variance = self._variance(kind)
         use &= variance <= UNCERTAIN ** 2 * np.min(variance[use], initial=np.inf)
         if np.count_nonzero(use) < FIRST_EPOCHS + kind or (kind and not use_position):

@@ -105,7 +105,7 @@ class Antenna:
             fix is None or fix.vertical)
         if v_n is not None or believed:
             self._measured_ns = message.stamp_ns
-        held = v_n is not None and self._holds_course(v_n)
+        held = 0.0 if v_n is None else self._held_variance(v_n)
         if v_n is not None:
             self._v_n, self._velocity_ns = v_n, message.stamp_ns
             self._speed = math.hypot(*v_n.tolist())
@@ -117,26 +117,28 @@ class Antenna:
         velocity_covariance = self._velocity_noise.covariance(
             None if velocity is None else velocity.covariance,
             self._vertical and (velocity is None or velocity.vertical))
-        if v_n is not None and held:
+        if held:
             self._counts['velocity_course_held'] += 1
-            velocity_covariance = velocity_covariance + np.diag(
-                [max(v_n[:2] @ v_n[:2], LEAST_HELD ** 2)] * 2 + [0.0])
+            velocity_covariance = velocity_covariance + np.diag([held, held, 0.0])
         return AntennaEpoch(message.stamp_ns, *self._place, v_n, believed,
                             (velocity_covariance, position_covariance),
                             self.gravity_drift(message.stamp_ns),
                             fault='' if self._v_n is None else self._check.fault,
                             dry=fix is None and velocity is None,
-                            stated=(velocity is None or velocity.covariance is not None or held,
+                            stated=(velocity is None or velocity.covariance is not None
+                                    or held > 0.0,
                                     fix is None or fix.covariance is not None))
 
-    def _holds_course(self, v_n: Array) -> bool:
-        """Return whether a slow receiver repeats the course, at another speed."""
+    def _held_variance(self, v_n: Array) -> float:
+        """Return the variance of a slow velocity that repeats the course, or 0; m^2/s^2."""
         if self._v_n is None:
-            return False
+            return 0.0
         before, now = (complex(*velocity[:2].tolist()) for velocity in (self._v_n, v_n))
         turned = before.conjugate() * now
-        return (abs(turned.imag) < SAME_COURSE * turned.real and abs(now) < SLOW
-                and abs(abs(now) - abs(before)) > OTHER_SPEED)
+        if (abs(turned.imag) < SAME_COURSE * turned.real and abs(now) < SLOW
+                and abs(abs(now) - abs(before)) > OTHER_SPEED):
+            return max(float(v_n[:2] @ v_n[:2]), LEAST_HELD ** 2)
+        return 0.0
 
     def _look_for_vertical(self, v_n: Array, measured: bool) -> None:
         """Detect a receiver that does not measure the vertical: it moves and states only 0."""

@@ -14,6 +14,7 @@
 """Faults of IMU samples and the noise that they add, measured white noise, wrong units."""
 
 import math
+from typing import Any
 
 from ins_align.geometry.rotation import Array, Index
 import numpy as np
@@ -261,7 +262,17 @@ def gap_noise(gap: Array, ends: Array, samples: Array, first: Index, last: Index
     varies = np.array([np.var(samples[window], axis=0).mean()
                        for window in map(slice, first, last)])
     differs = np.mean(np.square(np.diff(ends, axis=1)), axis=2)
-    return np.sqrt(gap * (varies[:, None] + 0.25 * differs + np.square(most * gap)))
+    return np.sqrt(gap * variance_in_gap(gap, varies[:, None], differs, most))
+
+
+def variance_in_gap(gap: Any, varies: Any, differs: Any, most: float) -> Any:
+    """
+    Return the variance of the mean rate or force in a step with lost samples, as large as `gap`.
+
+    `varies` is the variance around the step, `differs` the square of the difference of both ends,
+    each a mean over the axes; `most` as in `gap_noise`. Numbers or arrays.
+    """
+    return varies + 0.25 * differs + (most * gap) ** 2
 
 
 def force_fault(mean: float) -> str:

@@ -26,7 +26,7 @@ from ins_align.config import ImuNoise
 from ins_align.geometry.earth import EARTH_RATE
 from ins_align.geometry.rotation import Array, matrix_from_quaternion
 from ins_align.imu.buffer import MAX_GAP_NS, MAX_RATE
-from ins_align.imu.noise import GAP_ANGULAR_ACCELERATION, GAP_STEPS
+from ins_align.imu.noise import GAP_ANGULAR_ACCELERATION, GAP_STEPS, variance_in_gap
 from ins_align.results import Attitude, Epoch
 import numpy as np
 
@@ -74,7 +74,9 @@ class Prediction:
             return False
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         if dt > self._longest_step:
-            self._gaps_variance += self._lost(dt, gyro)
+            differs = sum((now - last) ** 2 for now, last in zip(gyro, self._rate)) / 3
+            self._gaps_variance += dt ** 2 * variance_in_gap(
+                dt, self._varies, differs, GAP_ANGULAR_ACCELERATION)
         last_x, last_y, last_z = self._rate
         self._rate = x, y, z
         x, y, z = 0.5 * (last_x + x), 0.5 * (last_y + y), 0.5 * (last_z + z)
@@ -93,11 +95,6 @@ class Prediction:
         self._quaternion = x / size, y / size, z / size, w / size
         self.stamp_ns = stamp_ns
         return True
-
-    def _lost(self, dt: float, gyro: Sequence[float]) -> float:
-        """Return the variance of what it may have turned in a gap, as `gap_noise`, rad^2."""
-        differs = sum((now - last) ** 2 for now, last in zip(gyro, self._rate)) / 3
-        return dt ** 2 * (self._varies + 0.25 * differs + (GAP_ANGULAR_ACCELERATION * dt) ** 2)
 
     @property
     def quaternion_xyzw(self) -> tuple[float, float, float, float]:
